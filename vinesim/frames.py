@@ -1,0 +1,132 @@
+"""Poses and axes: the one convention, used everywhere.
+
+* World: REP-103, x forward (east), y left (north), z up; metres, radians, seconds.
+* Quaternions are ``(x, y, z, w)``, unit, rotating body coordinates into parent coordinates (ROS, Warp, Newton).
+  MuJoCo alone writes ``(w, x, y, z)``; :func:`to_wxyz` and :func:`from_wxyz` are the only crossing.
+* A pose is seven numbers, position then quaternion: ``body_q[i] = (x, y, z, qx, qy, qz, qw)`` (``wp.transform``).
+* A velocity is six numbers, linear velocity of the body's origin then angular velocity, both in world axes.
+* Optical frames (REP-103 suffix ``_optical``): z forward, x right, y down.
+
+All functions broadcast over leading axes and compute in the type they are given.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+"""The unit quaternion, xyzw."""
+
+OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
+"""Rotation of an optical frame seen from its camera link (x forward): xyzw."""
+
+
+def to_wxyz(q: np.ndarray) -> np.ndarray:
+    """Quaternion xyzw to MuJoCo's wxyz."""
+    return np.roll(np.asarray(q), 1, axis=-1)
+
+
+def from_wxyz(q: np.ndarray) -> np.ndarray:
+    """Quaternion from MuJoCo's wxyz to xyzw."""
+    return np.roll(np.asarray(q), -1, axis=-1)
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Quaternion product ``a b``: rotate by ``b`` first, then by ``a``."""
+    a, b = np.asarray(a), np.asarray(b)
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + np.cross(av, bv)
+    scalar = aw * bw - (av * bv).sum(-1, keepdims=True)
+    return np.concatenate([vector, scalar], axis=-1)
+
+
+def conjugate(q: np.ndarray) -> np.ndarray:
+    """Inverse rotation of a unit quaternion."""
+    q = np.asarray(q)
+    return np.concatenate([-q[..., :3], q[..., 3:]], axis=-1)
+
+
+def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vector ``v`` [..., 3] rotated by ``q`` [..., 4]."""
+    q, v = np.asarray(q), np.asarray(v)
+    t = 2.0 * np.cross(q[..., :3], v)
+    return v + q[..., 3:] * t + np.cross(q[..., :3], t)
+
+
+def normalize(q: np.ndarray) -> np.ndarray:
+    """Unit quaternion or vector; a zero one stays zero."""
+    q = np.asarray(q)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    return q / np.where(length > 0.0, length, 1.0)
+
+
+def exp(v: np.ndarray) -> np.ndarray:
+    """Rotation vector [rad] to quaternion."""
+    v = np.asarray(v, dtype=np.result_type(v, np.float32))
+    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    scale = np.where(angle > 1e-6, np.sin(0.5 * angle) / np.where(angle > 1e-6, angle, 1.0), 0.5)
+    return np.concatenate([v * scale, np.cos(0.5 * angle)], axis=-1)
+
+
+def log(q: np.ndarray) -> np.ndarray:
+    """Quaternion to rotation vector [rad], the short way round."""
+    q = np.asarray(q)
+    q = np.where(q[..., 3:] < 0.0, -q, q)
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., 3:])
+    return q[..., :3] * np.where(sine > 1e-9, angle / np.where(sine > 1e-9, sine, 1.0), 2.0)
+
+
+def matrix(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4]."""
+    q = np.asarray(q)
+    return np.swapaxes(rotate(q[..., None, :], np.eye(3, dtype=q.dtype)), -1, -2)
+
+
+def from_matrix(r: np.ndarray) -> np.ndarray:
+    """Quaternions [..., 4] of rotation matrices [..., 3, 3] (the largest component has a positive sign)."""
+    r = np.asarray(r, float)
+    m = [[r[..., i, j] for j in range(3)] for i in range(3)]
+    x = np.stack([1 + m[0][0] - m[1][1] - m[2][2], m[1][0] + m[0][1], m[2][0] + m[0][2], m[2][1] - m[1][2]], -1)
+    y = np.stack([m[1][0] + m[0][1], 1 - m[0][0] + m[1][1] - m[2][2], m[2][1] + m[1][2], m[0][2] - m[2][0]], -1)
+    z = np.stack([m[2][0] + m[0][2], m[2][1] + m[1][2], 1 - m[0][0] - m[1][1] + m[2][2], m[1][0] - m[0][1]], -1)
+    w = np.stack([m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1], 1 + m[0][0] + m[1][1] + m[2][2]], -1)
+    rows = np.stack([x, y, z, w], -2)
+    best = np.argmax(np.stack([x[..., 0], y[..., 1], z[..., 2], w[..., 3]], -1), -1)
+    return normalize(np.take_along_axis(rows, best[..., None, None], -2)[..., 0, :])
+
+
+def yaw(angle: float | np.ndarray) -> np.ndarray:
+    """Quaternion of a turn about z by ``angle`` [rad], counter-clockwise from above."""
+    half = 0.5 * np.asarray(angle, float)
+    zero = np.zeros_like(half)
+    return np.stack([zero, zero, np.sin(half), np.cos(half)], -1)
+
+
+def aligned(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np.ndarray:
+    """Quaternion whose x axis points along ``x`` and whose z axis leans to ``up`` (to y if they are parallel)."""
+    ex = normalize(np.asarray(x, float))
+    side = np.cross(np.broadcast_to(up, ex.shape), ex)
+    degenerate = np.linalg.norm(side, axis=-1, keepdims=True) < 1e-6
+    side = np.where(degenerate, np.cross(np.broadcast_to([0.0, 1.0, 0.0], ex.shape), ex), side)
+    ey = normalize(side)
+    return from_matrix(np.stack([ex, ey, np.cross(ex, ey)], -1))
+
+
+def pose(position: np.ndarray, quaternion: np.ndarray = IDENTITY) -> np.ndarray:
+    """Seven numbers from position and quaternion."""
+    position, quaternion = np.asarray(position, float), np.asarray(quaternion, float)
+    lead = np.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1])
+    return np.concatenate([np.broadcast_to(position, (*lead, 3)), np.broadcast_to(quaternion, (*lead, 4))], -1)
+
+
+def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Pose ``b``, given in the frame ``a``, seen from the parent of ``a``."""
+    a, b = np.asarray(a), np.asarray(b)
+    return np.concatenate([a[..., :3] + rotate(a[..., 3:], b[..., :3]), multiply(a[..., 3:], b[..., 3:])], axis=-1)
+
+
+def inverse(p: np.ndarray) -> np.ndarray:
+    """The pose of the parent seen from ``p``."""
+    back = conjugate(np.asarray(p)[..., 3:])
+    return np.concatenate([-rotate(back, np.asarray(p)[..., :3]), back], axis=-1)

@@ -1,0 +1,1 @@
+"""Robots: descriptions, drives and motions."""

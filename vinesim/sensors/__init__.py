@@ -1,0 +1,1 @@
+"""Cameras, lidars and exact truth."""

@@ -1,0 +1,41 @@
+"""Names and numbers that stay the same on every client: organs, and ids of things.
+
+The scene hash and these ids are all that clients share of the vineyard; tree 17 is tree 17 everywhere,
+because generation from (scene file, seed) is deterministic.
+"""
+
+from __future__ import annotations
+
+import enum
+
+
+class Organ(enum.IntEnum):
+    """What a piece of matter is: the class of label images, COCO categories and the material table."""
+
+    NOTHING = 0
+    GROUND = 1
+    POLE = 2
+    WIRE = 3
+    TRUNK = 4
+    ARM = 5
+    CANE = 6
+    LEAF = 7
+    PEDUNCLE = 8
+    BUNCH = 9
+    BOX = 10
+    ROBOT = 11
+    HUMAN = 12
+
+
+LABEL_STRIDE = 1 << 20
+"""Label images hold ``organ * LABEL_STRIDE + index``: organ and instance in one int32."""
+
+
+def label(organ: Organ, index: int) -> int:
+    """The label of one thing in a label image; index counts bunches, boxes, trees or actors from 0."""
+    return int(organ) * LABEL_STRIDE + index
+
+
+def unlabel(value: int) -> tuple[Organ, int]:
+    """Organ and index of a label."""
+    return Organ(value // LABEL_STRIDE), value % LABEL_STRIDE

@@ -1,0 +1,27 @@
+"""Where the files that ship with vinesim lie."""
+
+from __future__ import annotations
+
+import pathlib
+
+
+class NotFoundInData(FileNotFoundError):
+    """A scene, robot, camera or lidar that neither is a file nor ships with vinesim; the text says what there is."""
+
+
+def data_dir() -> pathlib.Path:
+    """The folder ``data``: inside the installed package, or beside it in a checkout."""
+    package = pathlib.Path(__file__).resolve().parent.parent
+    return next(d for d in (package / "data", package.parent / "data") if d.is_dir())
+
+
+def find(kind: str, name: str, suffix: str) -> pathlib.Path:
+    """The file ``name`` if it exists, else ``data/<kind>/<name><suffix>``; :class:`NotFoundInData` otherwise."""
+    given = pathlib.Path(name)
+    if given.is_file():
+        return given
+    shipped = data_dir() / kind / (name if name.endswith(suffix) else name + suffix)
+    if shipped.is_file():
+        return shipped
+    known = ", ".join(sorted(p.stem for p in (data_dir() / kind).glob(f"*{suffix}"))) or "none"
+    raise NotFoundInData(f"no file {name!r} and none of that name in data/{kind}; give a path or one of: {known}")

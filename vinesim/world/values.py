@@ -1,0 +1,199 @@
+"""What rooms hand each other: small frozen values, so that siblings never import one another.
+
+Times are simulation seconds. Arrays are numpy, poses and velocities as in :mod:`vinesim.frames`.
+A value that leaves the physics thread owns its arrays: nobody writes them afterwards.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.world.ids import Organ
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Shape:
+    """One visible or touchable primitive, in the frame of the link or body that carries it.
+
+    ``kind`` is ``"capsule"`` (size: radius, half length along z), ``"sphere"`` (radius), ``"ellipsoid"``
+    (half axes), ``"box"`` (half edges), ``"cylinder"`` (radius, half length along z) or ``"mesh"`` (scale; ``file``).
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    pose: np.ndarray
+    """[7] m, 1"""
+    rgba: tuple[float, float, float, float] = (0.6, 0.6, 0.6, 1.0)
+    file: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Link:
+    """One rigid body as sensors see it: its name, what it is, and its shapes."""
+
+    name: str
+    """Full name, ``actor/link`` or ``box/3``."""
+    organ: Organ
+    index: int
+    """Which robot, human or box: the index of its label."""
+    shapes: tuple[Shape, ...]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class View:
+    """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
+
+    time: float
+    """[s]"""
+    tick: int
+    body_q: np.ndarray
+    """Plant bodies [body, 7] m, 1."""
+    bunch_attached: np.ndarray
+    """[bunch] bool"""
+    links: tuple[Link, ...]
+    """Rigid bodies; the same tuple object as long as no actor comes or goes."""
+    link_q: np.ndarray
+    """Their poses [link, 7] m, 1."""
+    moved: np.ndarray
+    """Indices of the trees that are awake [k]: only these have moved since they fell asleep."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Contact:
+    """One contact of a rigid body with a plant, as solved in one tick."""
+
+    actor: str
+    link: str
+    body: int
+    """Plant body in the model."""
+    position: np.ndarray
+    """[3] m, world"""
+    force: np.ndarray
+    """[3] N on the rigid body, world axes; the plant feels the opposite."""
+    distance: float
+    """Gap [m], negative when they overlap."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class JointSample:
+    """Joints of one robot at one instant, in the order of ``names``."""
+
+    time: float
+    names: tuple[str, ...]
+    position: np.ndarray
+    """[joint] rad or m"""
+    velocity: np.ndarray
+    """[joint] rad/s or m/s"""
+    effort: np.ndarray
+    """[joint] N m or N: what the drive transmits; at rest gravity load minus J^T f of the contacts."""
+    contact: np.ndarray
+    """[joint] N m or N: J^T f of the contacts alone."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RobotSample:
+    """What a robot knows of itself at one instant."""
+
+    actor: str
+    joints: JointSample
+    base_q: np.ndarray
+    """[7] base_footprint in the world (= ``map``)."""
+    base_qd: np.ndarray
+    """[6] its velocity, world axes."""
+    odom_q: np.ndarray
+    """[7] base_footprint as odometry believes it, in ``odom``."""
+    transforms: tuple[tuple[str, str], ...]
+    """(parent frame, child frame) of every moving joint, the same tuple object every tick."""
+    transform_q: np.ndarray
+    """[transform, 7] child in parent."""
+    contacts: tuple[Contact, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """Pinhole intrinsics (sensor_msgs/CameraInfo; plumb_bob with zero distortion)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    frame_id: str
+    """Optical frame: z forward, x right, y down."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """One RGB-D picture."""
+
+    time: float
+    name: str
+    info: CameraInfo
+    pose: np.ndarray
+    """[7] optical frame in the world when the picture was taken."""
+    rgb: np.ndarray
+    """[height, width, 3] uint8"""
+    depth: np.ndarray
+    """[height, width] float32 m along z; NaN no return, -Inf too near, +Inf too far (REP-118)."""
+    labels: np.ndarray
+    """[height, width] int32, :func:`vinesim.world.ids.label`; 0 is nothing."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class LidarScan:
+    """One revolution of a lidar; points that returned nothing are left out."""
+
+    time: float
+    """Time of the first firing [s]."""
+    name: str
+    frame_id: str
+    pose: np.ndarray
+    """[7] of the lidar in the world."""
+    xyz: np.ndarray
+    """[point, 3] float32 m, lidar frame (x forward, z up)."""
+    intensity: np.ndarray
+    """[point] float32 0..255"""
+    ring: np.ndarray
+    """[point] uint16"""
+    offset: np.ndarray
+    """[point] float32 s after ``time``."""
+    labels: np.ndarray
+    """[point] int32"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RobotUpdate:
+    """Pose of one robot as it crosses the network: actual joints, never commands (D6.4 section 5.2)."""
+
+    actor: str
+    time: float
+    base_q: np.ndarray
+    """[7]"""
+    base_qd: np.ndarray
+    """[6]"""
+    position: np.ndarray
+    """[joint] rad or m"""
+    velocity: np.ndarray
+    """[joint] rad/s or m/s"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class TreeUpdate:
+    """State of one touched tree as it crosses the network."""
+
+    tree: int
+    owner: str
+    ownership: int
+    """Ownership sequence, u16 with wraparound: +1 by grab, pick, cut."""
+    authority: int
+    """Authority sequence, u16 with wraparound: +1 by touch."""
+    time: float
+    resting: bool
+    """True in the last, reliable record: silence follows."""
+    joint_q: np.ndarray
+    """[body of the tree, 4]"""
+    joint_qd: np.ndarray
+    """[body of the tree, 3] rad/s"""
