@@ -42,6 +42,46 @@ class Link:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class Drive:
+    """One actuated joint of a robot: a servo with limits."""
+
+    joint: str
+    stiffness: float
+    """Position gain [N m/rad or N/m]."""
+    damping: float
+    """Velocity gain [N m s/rad or N s/m]."""
+    effort: float
+    """Largest effort [N m or N]."""
+    velocity: float
+    """Largest speed [rad/s or m/s]."""
+    lower: float
+    upper: float
+    """Limits of the joint [rad or m]."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RobotSpec:
+    """A robot as physics needs it. ``robot/description.py`` makes one from a URDF."""
+
+    name: str
+    """The actor's name: prefix of everything it owns."""
+    index: int
+    """Index of its label."""
+    urdf: str
+    """URDF as text, every mesh by absolute path."""
+    base: str
+    """Name of the root link, whose origin stands on the ground (base_footprint)."""
+    pose: np.ndarray
+    """[7] start pose of the base in the world."""
+    drives: tuple[Drive, ...]
+    """In the order of joint arrays everywhere else (commands, samples, updates)."""
+    home: np.ndarray
+    """[joint] start position."""
+    base_effort: tuple[float, float] = (800.0, 400.0)
+    """Largest force [N] and moment [N m] with which the tracks hold or drive the base."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class View:
     """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
 
@@ -197,3 +237,17 @@ class TreeUpdate:
     """[body of the tree, 4]"""
     joint_qd: np.ndarray
     """[body of the tree, 3] rad/s"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Measurement:
+    """One line of ``vinesim bench``: ours beside a peer that ran in the same process on the same scene."""
+
+    bench: str
+    case: str
+    value: float
+    unit: str
+    peer: str = ""
+    peer_value: float | None = None
+    ratio: float | None = None
+    """How many times better than the peer (above 1 is better), whatever the unit."""
