@@ -1,0 +1,23 @@
+# The README's two commands. Each does all of its own set-up in .venv (see tools/setup).
+PYTHON ?= python3
+SECONDS = 20
+SEED = 7
+OUT = out
+
+.PHONY: demo test setup lint clean
+demo:
+	@PYTHON=$(PYTHON) tools/setup run
+	@.venv/bin/vinesim demo --seconds $(SECONDS) --seed $(SEED) --out $(OUT) $(ARGS)
+
+test: lint
+	@.venv/bin/python -m pytest
+
+lint:
+	@PYTHON=$(PYTHON) tools/setup test
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/lint-imports
+	@.venv/bin/basedpyright --level error
+
+clean:
+	rm -rf .venv out
