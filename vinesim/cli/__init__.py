@@ -1,1 +1,176 @@
-"""The command line. ``main`` imports only what the named command needs."""
+"""The command line: ``vinesim``.
+
+This module knows the commands and their options and nothing else; a command imports its engine when it runs,
+so that ``vinesim --help`` opens at once.
+
+Exit codes: 0 done; 2 wrong use or bad input; 3 a part is missing on this machine; 4 the network or the server;
+130 stopped by Ctrl-C where stopping is not the ordinary end.
+"""
+
+from __future__ import annotations
+
+import logging
+import pathlib
+import sys
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False,
+    help="Soft vines and grapes, where robots and people meet: simulated at 100 Hz by every client, no GPU needed.",
+    epilog="Start with: vinesim demo",
+)  # fmt: skip
+scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Vineyards: what a scene file says.")
+ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: set-up and state.")
+app.add_typer(scene_app, name="scene")
+app.add_typer(ros_app, name="ros")
+
+Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
+Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, tendone, vsp.")]
+Robot = Annotated[str, typer.Option(help="A URDF file, or the name of one that ships: vinebot.")]
+
+
+@app.command()
+def demo(
+    seconds: Annotated[float, typer.Option(min=6.0, help="How long the robots work [s].")] = 20.0,
+    seed: Seed = None,
+    scene: Scene = "demo",
+    robot: Robot = "vinebot",
+    headless: Annotated[bool, typer.Option(help="No live table; one line a second.")] = False,
+    out: Annotated[pathlib.Path, typer.Option(help="Folder for pictures, plot and summary.json.")] = pathlib.Path("out"),
+) -> None:
+    """A robot pushes a bunch, another client sees it move, ROS topics carry it.
+
+    Starts a server, two robot clients and a plain rclpy listener, each a process of its own, on free ports.
+
+    \b
+    Examples:
+      vinesim demo
+      vinesim demo --seconds 30 --seed 3 --out /tmp/run
+      vinesim demo --scene my-block.toml --robot my-robot.urdf --headless
+    """
+    from vinesim.cli.demo import run
+
+    raise typer.Exit(run(seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out))
+
+
+@app.command()
+def server(
+    listen: Annotated[str, typer.Option(help="Where to listen; port 0 takes a free one.")] = "tcp/0.0.0.0:7447",
+) -> None:
+    """Carry messages between clients. The server simulates nothing.
+
+    \b
+    Examples:
+      vinesim server
+      vinesim server --listen tcp/127.0.0.1:0
+    """
+    from vinesim.cli.serve import run
+
+    raise typer.Exit(run(listen))
+
+
+@app.command()
+def client(
+    role: Annotated[str, typer.Option(help="robot. (human and spectator are not built yet.)")] = "robot",
+    name: Annotated[str | None, typer.Option(help="The actor's name, one of a kind; robot-PID unless given.")] = None,
+    connect: Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")] = None,
+    scene: Scene = "demo",
+    seed: Seed = None,
+    robot: Robot = "vinebot",
+    spawn: Annotated[int, typer.Option(min=0, help="Which of the scene's start places.")] = 0,
+    back: Annotated[float, typer.Option(help="Start this far behind the place and drive to it [m].")] = 0.0,
+    namespace: Annotated[str, typer.Option(help="Prefix of all ROS topics.")] = "",
+    ros: Annotated[bool, typer.Option(help="Talk ROS 2, if it is installed.")] = True,
+    push: Annotated[int | None, typer.Option(help="Reach for this bunch and push it, again and again.")] = None,
+    watch: Annotated[int | None, typer.Option(help="Record force and displacement of this bunch.")] = None,
+    near: Annotated[float, typer.Option(min=0.1, help="Others nearer than this to a thing hear of it [m].")] = 6.0,
+    seconds: Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")] = None,
+    out: Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")] = None,
+    status: Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")] = "text",
+    device: Annotated[str, typer.Option(help="Where plants are simulated: cpu or cuda:0.")] = "cpu",
+) -> None:
+    """Join the vineyard as one actor, with a simulation of its own.
+
+    \b
+    Examples:
+      vinesim client --role robot
+      vinesim client --role robot --connect tcp/127.0.0.1:7447 --name picker --spawn 1
+      vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
+    """
+    from vinesim.cli.join import run
+
+    raise typer.Exit(run(**locals()))
+
+
+@scene_app.command("show")
+def scene_show(
+    file: Annotated[str, typer.Argument(help="A scene file, or demo, tendone, vsp.")],
+    seed: Seed = None,
+    out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; NAME.png unless given.")] = None,
+) -> None:
+    """Print what a scene holds, and draw it.
+
+    \b
+    Examples:
+      vinesim scene show demo
+      vinesim scene show my-block.toml --seed 4 --out block.png
+    """
+    from vinesim.cli.scene import show
+
+    raise typer.Exit(show(file, seed, out))
+
+
+@app.command()
+def bench(
+    names: Annotated[list[str], typer.Argument(help="plants, camera; several are run one after the other.")],
+    json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
+) -> None:
+    """Measure, beside a peer that runs in the same process on the same scene.
+
+    \b
+    Examples:
+      vinesim bench plants --json
+      vinesim bench plants camera
+    """
+    from vinesim.cli.bench import run
+
+    raise typer.Exit(run(names, json))
+
+
+@ros_app.command("build-interfaces")
+def ros_build(
+    quiet: Annotated[bool, typer.Option(help="Say nothing if all is well, or if ROS is not installed.")] = False,
+) -> None:
+    """Build the ROS message packages that have no wheel (once; cached). Needs g++.
+
+    \b
+    Examples:
+      vinesim ros build-interfaces
+    """
+    from vinesim.cli.ros import build
+
+    raise typer.Exit(build(quiet))
+
+
+@app.callback()
+def options(
+    verbose: Annotated[int, typer.Option("--verbose", "-v", count=True, help="Log more; twice for everything.")] = 0,
+) -> None:
+    """Log level for every command."""
+    level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+
+def main() -> None:
+    """Entry point. An error that vinesim raises itself is one line in words; any other is a defect with a traceback."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        if not type(error).__module__.startswith("vinesim."):
+            raise
+        print(f"vinesim: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(getattr(error, "exit_code", 2))

@@ -1,0 +1,5 @@
+"""``python -m vinesim.cli``: the command line without its entry point."""
+
+from vinesim.cli import main
+
+main()

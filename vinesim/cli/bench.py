@@ -1,0 +1,43 @@
+"""``vinesim bench``: measurements beside a peer, one JSON object a line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+
+from vinesim.world.values import Measurement
+
+
+def _plants() -> Iterator[Measurement]:
+    from vinesim.physics.bench_plants import plants
+
+    return plants()
+
+
+def _camera() -> Iterator[Measurement]:
+    from vinesim.sensors.bench_camera import camera
+
+    return camera()
+
+
+BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {"plants": _plants, "camera": _camera}
+
+
+class NoSuchBench(ValueError):
+    """The text says which there are."""
+
+
+def run(names: list[str], as_json: bool) -> int:
+    """Run the named benches in order and print their measurements as they come."""
+    for name in names:
+        if name not in BENCHES:
+            raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
+    for name in names:
+        for m in BENCHES[name]():
+            if as_json:
+                print(json.dumps(dataclasses.asdict(m)), flush=True)
+            else:
+                beside = f"   {m.peer} {m.peer_value:.4g} {m.unit}, ratio {m.ratio:.3g}" if m.ratio is not None else ""
+                print(f"{m.bench:10s} {m.case:44s} {m.value:10.4g} {m.unit}{beside}", flush=True)
+    return 0

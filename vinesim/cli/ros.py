@@ -1,0 +1,20 @@
+"""``vinesim ros``."""
+
+from __future__ import annotations
+
+from vinesim.ros import environment
+
+
+def build(quiet: bool) -> int:
+    """Build what has no wheel. Without ROS there is nothing to build, which is an error only if one asks aloud."""
+    reason = environment.available()
+    if reason is not None:
+        if not quiet:
+            print(f"ROS 2 is not usable here: {reason}")
+        return 0 if quiet else 3
+    from vinesim.ros import interfaces
+
+    built = interfaces.ensure()
+    if not quiet:
+        print(f"ROS message packages ready: {', '.join(built)}")
+    return 0
