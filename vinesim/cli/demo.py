@@ -1,0 +1,277 @@
+"""``vinesim demo``: a server, two robot clients and a listening stranger, each a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import pathlib
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from vinesim.client import plot
+from vinesim.client.trace import Rows, remote_error
+from vinesim.ros import environment
+
+PUSHER, VISITOR = "picker", "visitor"
+GRACE = 1.6
+"""How long a process may take to end after SIGINT before it is killed [s]."""
+
+
+class DemoFailed(RuntimeError):
+    """A process of the demo ended before its time; the text says which, and what it said."""
+
+    exit_code = 4
+
+
+@dataclasses.dataclass
+class Process:
+    """A child, its last words and its newest status."""
+
+    name: str
+    child: subprocess.Popen[str]
+    lines: queue.Queue[str]
+    words: list[str]
+
+    @classmethod
+    def start(cls, name: str, *arguments: str, **environ: str) -> Process:
+        """Run ``python ARGUMENTS`` in a session of its own, so that Ctrl-C reaches it only through us."""
+        child = subprocess.Popen(
+            [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True, start_new_session=True, env={**os.environ, **environ},
+        )  # fmt: skip
+        process = cls(name, child, queue.Queue(), [])
+        threading.Thread(target=process._read, daemon=True).start()
+        threading.Thread(target=process._listen, daemon=True).start()
+        return process
+
+    def _read(self) -> None:
+        assert self.child.stdout is not None
+        for line in self.child.stdout:
+            self.lines.put(line.rstrip("\n"))
+        self.lines.put("")
+
+    def _listen(self) -> None:
+        assert self.child.stderr is not None
+        for line in self.child.stderr:
+            self.words = [*self.words[-40:], line.rstrip("\n")]
+
+    def line(self, timeout: float) -> str:
+        """The next line of output; :class:`DemoFailed` if it ended or stayed silent."""
+        try:
+            line = self.lines.get(timeout=timeout)
+        except queue.Empty:
+            raise DemoFailed(f"{self.name} said nothing for {timeout:.0f} s; {self._said()}") from None
+        if not line:
+            raise self.failed()
+        return line
+
+    def failed(self) -> DemoFailed:
+        """Why it ended too early."""
+        self.child.wait(GRACE)
+        return DemoFailed(f"{self.name} ended with exit code {self.child.returncode}; {self._said()}")
+
+    def _said(self) -> str:
+        last = [word for word in self.words if word.strip()]
+        return f"it said: {last[-1]}" if last else "it said nothing"
+
+    def stop(self) -> None:
+        """Ask it to end; :meth:`reap` waits."""
+        if self.child.poll() is None:
+            self.child.send_signal(signal.SIGINT)
+
+    def reap(self, timeout: float) -> None:
+        """Wait for its end, or end it."""
+        try:
+            self.child.wait(max(timeout, 0.0))
+        except subprocess.TimeoutExpired:
+            self.child.kill()
+            self.child.wait()
+
+
+@contextlib.contextmanager
+def company() -> Iterator[list[Process]]:
+    """Processes that end with the block, all within :data:`GRACE`, however it is left."""
+    processes: list[Process] = []
+    try:
+        yield processes
+    finally:
+        deadline = time.monotonic() + GRACE
+        for process in processes:
+            process.stop()
+        for process in processes:
+            process.reap(deadline - time.monotonic())
+
+
+def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
+    """Run the demo and write ``out``; 0 if all went well."""
+    from vinesim.client.places import bunch_in_reach, spawn_pose
+    from vinesim.robot.description import load as load_robot
+    from vinesim.world.generate import generate
+    from vinesim.world.scene import load as load_scene
+    from vinesim.world.scene import reseeded
+
+    console = Console(stderr=True)
+    plan = reseeded(load_scene(scene), seed)
+    load_robot(robot)  # say now, and once, what is wrong with it
+    model = generate(plan)
+    bunch = bunch_in_reach(model, spawn_pose(plan, 0))
+    for folder in (out, out / PUSHER, out / VISITOR):
+        folder.mkdir(parents=True, exist_ok=True)
+    (out / "summary.json").unlink(missing_ok=True)
+    no_ros = environment.available()
+    if no_ros:
+        console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
+
+    common = ["-m", "vinesim.cli", "client", "--role", "robot", "--scene", scene, "--robot", robot, "--status", "json"]
+    common += ["--watch", str(bunch)] + ([] if seed is None else ["--seed", str(seed)])
+    quiet_ros = {} if "ROS_AUTOMATIC_DISCOVERY_RANGE" in os.environ else {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with company() as processes:
+
+        def start(name: str, *arguments: str) -> Process:
+            processes.append(Process.start(name, *arguments, **quiet_ros))
+            return processes[-1]
+
+        server = start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0")
+        endpoint = server.line(20.0).removeprefix("listening on ")
+        stranger = None if no_ros else start("stranger", "-m", "vinesim.ros.witness")
+        console.print(f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (the first run compiles kernels)")
+        pusher = start(
+            PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
+            "--seconds", str(seconds), "--out", str(out / PUSHER),
+        )  # fmt: skip
+        newest = {PUSHER: json.loads(pusher.line(300.0))}
+        visitor = start(
+            VISITOR, *common, "--name", VISITOR, "--connect", endpoint, "--spawn", "1", "--back", "8",
+            "--namespace", VISITOR, "--out", str(out / VISITOR),
+        )  # fmt: skip
+        watch(pusher, visitor, server, newest, console, headless)
+        visitor.stop()
+        visitor.reap(GRACE)
+        if visitor.child.returncode:
+            raise visitor.failed()
+        heard = {}
+        if stranger is not None:
+            stranger.child.communicate("", timeout=None) if False else _close(stranger)
+            heard = json.loads(stranger.line(10.0))
+    summary = summarise(out, bunch, heard, no_ros, scene, plan.seed, seconds)
+    console.print(_result(summary))
+    console.print(f"pictures, plot and summary.json are in {out}/")
+    return 0
+
+
+def _close(process: Process) -> None:
+    assert process.child.stdin is not None
+    process.child.stdin.close()
+
+
+def watch(
+    pusher: Process, visitor: Process, server: Process, newest: dict[str, Any], console: Console, headless: bool
+) -> None:
+    """Show what both clients report until the pusher is done."""
+    live = contextlib.nullcontext() if headless or not console.is_terminal else Live(console=console, transient=True)
+    with live as view:
+        while True:
+            with contextlib.suppress(queue.Empty):
+                while line := visitor.lines.get_nowait():
+                    newest[VISITOR] = json.loads(line)
+            try:
+                line = pusher.lines.get(timeout=0.5)
+            except queue.Empty:
+                line = None
+            if line == "":
+                if pusher.child.wait(GRACE):
+                    raise pusher.failed()
+                return
+            for process in (visitor, server):
+                if process.child.poll() is not None:
+                    raise process.failed()
+            if line is not None:
+                newest[PUSHER] = json.loads(line)
+                if view is not None:
+                    view.update(_table(newest))
+                else:
+                    console.print(_line(newest[PUSHER]), highlight=False, soft_wrap=True)
+
+
+def _line(status: dict[str, Any]) -> str:
+    return (
+        f"{status['time']:6.1f} s  {status['tick_hz']:6.2f} Hz  p99 {status['tick_p99_ms']:5.2f} ms  "
+        f"awake {status['awake']:3d}  force {status['force']:6.2f} N  moved {status['displacement_mm']:6.1f} mm  "
+        f"out {status['bytes_out']:7d} B  env {status['environment_bytes_out']:6d} B"
+    )
+
+
+def _table(newest: dict[str, dict[str, Any]]) -> Table:
+    table = Table(title="vinesim demo", title_justify="left")
+    table.add_column("")
+    for name in newest:
+        table.add_column(name, justify="right", min_width=14)
+    rows = (
+        ("time [s]", "time", ".1f"), ("tick rate [Hz]", "tick_hz", ".2f"), ("tick p99 [ms]", "tick_p99_ms", ".2f"),
+        ("real-time factor", "real_time_factor", ".4f"), ("awake plants", "awake", "d"),
+        ("contact force [N]", "force", ".2f"), ("bunch moved [mm]", "displacement_mm", ".1f"),
+        ("bytes in", "bytes_in", "d"), ("bytes out", "bytes_out", "d"),
+        ("of these environment", "environment_bytes_out", "d"),
+    )  # fmt: skip
+    for label, key, form in rows:
+        table.add_row(label, *(format(status[key], form) for status in newest.values()))
+    for topic in sorted({topic for status in newest.values() for topic in status["topics"]}):
+        table.add_row(topic, *(f"{status['topics'].get(topic, 0.0):.1f} Hz" for status in newest.values()))
+    return table
+
+
+def summarise(
+    out: pathlib.Path, bunch: int, heard: dict[str, Any], no_ros: str | None, scene: str, seed: int, seconds: float
+) -> dict[str, Any]:
+    """Put the clients' reports together; writes ``summary.json``, ``touch.png`` and the pusher's pictures into ``out``."""
+    report = {name: json.loads((out / name / "report.json").read_text()) for name in (PUSHER, VISITOR)}
+    traces = {name: Rows.load(out / name / "trace.npz") for name in (PUSHER, VISITOR)}
+    plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PUSHER}, seen by {VISITOR}")
+    for picture in (out / PUSHER).glob("*.png"):
+        shutil.copyfile(picture, out / picture.name)
+    mine, other = report[PUSHER], report[VISITOR]
+    summary = {
+        "scene": scene, "seed": seed, "seconds": seconds, "bunch": bunch,
+        **{key: mine[key] for key in (
+            "tick_hz", "tick_p50_ms", "tick_p99_ms", "overruns", "real_time_factor", "touch_to_motion_ticks",
+            "force_peak_n", "environment_bytes_when_far", "ticks_touching_when_far", "environment_bytes_out",
+        )},
+        "remote_displacement_error_mm": remote_error(traces[PUSHER], traces[VISITOR]),
+        "ros": no_ros or "used",
+        "ros_received": {topic: entry["count"] for topic, entry in sorted(heard.items())},
+        "ros_detail": heard,
+        "clients": {PUSHER: mine, VISITOR: other},
+    }  # fmt: skip
+    partial = out / "summary.json.part"
+    partial.write_text(json.dumps(summary, indent=2) + "\n")
+    partial.replace(out / "summary.json")
+    return summary
+
+
+def _result(summary: dict[str, Any]) -> Table:
+    error = summary["remote_displacement_error_mm"]
+    table = Table(title="what was measured", title_justify="left", show_header=False)
+    for label, text in (
+        ("tick rate", f"{summary['tick_hz']:.2f} Hz, p99 {summary['tick_p99_ms']:.2f} ms of 10"),
+        ("real-time factor", f"{summary['real_time_factor']:.4f}"),
+        ("touch to motion", f"{summary['touch_to_motion_ticks']} ticks"),
+        ("largest force", f"{summary['force_peak_n']:.1f} N"),
+        ("remote copy off by", "never in company" if error is None else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95"),
+        ("bytes of touched plants, nobody near", f"{summary['environment_bytes_when_far']}"),
+        ("ROS messages heard by a stranger", f"{sum(summary['ros_received'].values())}"),
+    ):
+        table.add_row(label, text)
+    return table

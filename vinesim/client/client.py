@@ -1,0 +1,207 @@
+"""One client: its own copy of the vineyard, the actor it controls, and the others as the network tells of them.
+
+    client = Client(scene, model, description, bus, name="picker", pose=pose)
+    while running:
+        client.tick()
+
+A tick is five steps: receive, control, step, sense, send. Nothing in it waits: not for the network, not for a picture.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from vinesim.client.trace import Trace
+from vinesim.net.bus import Bus
+from vinesim.net.exchange import Exchange, Inbox
+from vinesim.net.messages import Hello
+from vinesim.physics.step import Physics
+from vinesim.robot import description as descriptions
+from vinesim.robot.description import Description, DescriptionError
+from vinesim.robot.drives import RemoteRobot, Robot
+from vinesim.world.model import Model
+from vinesim.world.scene import Scene
+from vinesim.world.values import TreeUpdate
+
+log = logging.getLogger(__name__)
+
+PULL = 0.2
+"""Share of the way to its owner's state by which the copy of a tree moves in one tick."""
+
+
+def label_index(name: str) -> int:
+    """The index of an actor's label, the same on every client without asking anybody."""
+    return zlib.crc32(name.encode()) % 4096
+
+
+class Client:
+    """The robot role. ``clock`` is any steady clock in seconds; tests pass their own."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: Model,
+        description: Description,
+        bus: Bus,
+        *,
+        name: str,
+        pose: np.ndarray,
+        near: float = 6.0,
+        device: str = "cpu",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name, self.model, self.scene = name, model, scene
+        self.physics = Physics(model, device=device)
+        self.robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
+        hello = Hello(
+            name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=scene.name,
+            digest=model.digest(), index=label_index(name), joints=len(description.joints),
+        )  # fmt: skip
+        self.exchange = Exchange(bus, hello, model, near=near)
+        self.others: dict[str, RemoteRobot] = {}
+        self.jobs: list[Callable[[float], None]] = []
+        """Called every tick with the simulation time, before the drives: what the robot is to do."""
+        self.senses: list[Callable[[Client], None]] = []
+        """Called every tick after the step: ROS, cameras, whoever wants to know."""
+        self.trace: Trace | None = None
+        self.far = Faraway()
+        self._clock = clock
+        self._copies: dict[int, TreeUpdate] = {}
+
+    def tick(self) -> None:
+        """Ten milliseconds of the vineyard."""
+        now = self._clock()
+        self.receive(now)
+        self.control()
+        self.physics.step()
+        self.sense()
+        self.send(now)
+
+    # ------------------------------------------------------------------ the five steps
+
+    def receive(self, now: float) -> None:
+        """Let others come and go, move their copies, and hear of the trees they touch."""
+        inbox = self.exchange.receive(now)
+        for hello in inbox.joined:
+            self._welcome(hello)
+        for name in inbox.left:
+            if (other := self.others.pop(name, None)) is not None:
+                other.leave()
+                log.info("%s left", name)
+        for name, update in inbox.robots.items():
+            if name in self.others:
+                self.others[name].follow(update)
+        self._pull(inbox)
+
+    def control(self) -> None:
+        """Do the jobs, then hand set-points to the drives."""
+        for job in self.jobs:
+            job(self.physics.time)
+        self.robot.control(self.physics.time)
+
+    def sense(self) -> None:
+        """Note the watched bunch, and tell everybody who listens."""
+        if self.trace is not None:
+            body = self.trace.body
+            force = np.zeros(3)
+            for contact in self.physics.contacts:
+                if contact.body == body:
+                    force -= contact.force
+            self.trace.add(self.physics.time, self.physics.state.body_q[body], force)
+        for sense in self.senses:
+            sense(self)
+
+    def send(self, now: float) -> None:
+        """Say where the robot is, and what it touches to those who are near."""
+        physics = self.physics
+        touched = [tree for tree, actor in physics.touched if actor == self.name]
+        settled = self.exchange.send(
+            now, self.robot.update(now), touched=touched, moving=physics.plants.awake, read=self._read,
+        )  # fmt: skip
+        for update in settled:
+            # the last word is what all copies hold: hold it too
+            physics.plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
+        self.far.note(self, bool(touched))
+
+    # ------------------------------------------------------------------ others
+
+    def _welcome(self, hello: Hello) -> None:
+        if hello.kind != "robot":
+            log.info("%s joined as %s", hello.name, hello.kind)
+            return
+        try:
+            description = _description_of(hello, self.robot.description)
+            self.others[hello.name] = RemoteRobot(
+                self.physics.rigid, description, hello.name, hello.index, np.array([0.0, 0.0, -10.0, 0, 0, 0, 1.0])
+            )
+        except ValueError as error:
+            log.warning("%s joined, but its robot cannot be shown: %s", hello.name, error)
+            return
+        log.info("%s joined with %s", hello.name, hello.robot)
+
+    def _pull(self, inbox: Inbox) -> None:
+        """Draw the copies of others' trees towards their owners' states, every tick, while their own physics goes on."""
+        plants = self.physics.plants
+        for update in inbox.trees:
+            self._copies[update.tree] = update
+        for tree in [tree for tree in self._copies if self.exchange.owner(tree) in (None, self.name)]:
+            update = self._copies.pop(tree)
+            if update.resting:
+                plants.pull(tree, update.joint_q, update.joint_qd, 1.0)
+        for tree, update in self._copies.items():
+            plants.wake(tree)
+            plants.pull(tree, update.joint_q, update.joint_qd, PULL)
+
+    def _read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
+        here = self.model.bodies_of(tree)
+        state = self.physics.state
+        return state.joint_q[here], state.joint_qd[here]
+
+
+class Faraway:
+    """Counts what this client sends of touched plants while nobody is near: nothing, if all is well."""
+
+    MARGIN = 3.0
+    """A tree is not a point: others count as far beyond ``near`` and this [m]."""
+
+    def __init__(self) -> None:
+        self.bytes = 0
+        """Environment bytes that left in ticks with nobody near."""
+        self.ticks_touching = 0
+        """Ticks in which this client touched plants with nobody near."""
+        self._seen = 0
+
+    def note(self, client: Client, touching: bool) -> None:
+        """Judge one tick by where the others' copies stand."""
+        sent = client.exchange.counters.environment.bytes_out
+        here = client.robot.rigid.base(client.name)[0][:2]
+        distance = min(
+            (float(np.hypot(*(client.physics.rigid.base(name)[0][:2] - here))) for name in client.others), default=np.inf
+        )
+        if distance > client.exchange.near + self.MARGIN:
+            self.bytes += sent - self._seen
+            self.ticks_touching += touching
+        self._seen = sent
+
+
+def _description_of(hello: Hello, own: Description) -> Description:
+    """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
+    if hello.urdf == own.urdf:
+        return own
+    try:
+        known = descriptions.load(hello.robot)
+        if known.urdf == hello.urdf:
+            return known
+    except DescriptionError:
+        pass
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"{hello.robot or 'robot'}.urdf"
+        file.write_text(hello.urdf)
+        return descriptions.load(file)
