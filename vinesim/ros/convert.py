@@ -250,7 +250,9 @@ def _cloud(time: float, frame: str, point: np.dtype, height: int, width: int) ->
 def _fields(point: np.dtype) -> tuple[PointField, ...]:
     assert point.fields is not None
     return tuple(
-        PointField(name=name, offset=point.fields[name][1], datatype=_FIELD_TYPES[point.fields[name][0].str[1:]], count=1)
+        PointField(
+            name=name, offset=point.fields[name][1], datatype=_FIELD_TYPES[point.fields[name][0].str[1:]], count=1
+        )
         for name in point.names or ()
     )
 
@@ -265,13 +267,13 @@ def _rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
 
 def _bytes(values: np.ndarray) -> array.array:
     data = array.array("B")
-    data.frombytes(values.data)
+    data.frombytes(values.reshape(-1).view(np.uint8).data)
     return data
 
 
 def _doubles(values: np.ndarray) -> array.array:
     data = array.array("d")
-    data.frombytes(np.ascontiguousarray(values, np.float64).data)
+    data.frombytes(np.ascontiguousarray(values, np.float64).view(np.uint8).data)
     return data
 
 

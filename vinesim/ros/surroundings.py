@@ -1,0 +1,37 @@
+"""Where things of the vineyard are, for those who want the truth: tf_environment, apart from the robot's own tf."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+import numpy as np
+
+from vinesim.ros.robot import MAP
+from vinesim.ros.topics import LATCHED, RELIABLE, Advertise, Offer
+from vinesim.ros.transforms import Transforms
+
+
+class Surroundings:
+    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles), children of the map."""
+
+    def __init__(self, advertise: Advertise, tf_message: type) -> None:
+        self._moving = advertise(tf_message, "tf_environment", RELIABLE)
+        self._static = advertise(tf_message, "tf_environment_static", LATCHED)
+        self._names: Sequence[str] | None = None
+        self._transforms = Transforms([])
+
+    def offers(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[Offer]:
+        """What moves; what is no longer named is gone. Pass the same tuple as long as the names stay."""
+        yield self._moving, partial(self._message, time, names, poses)
+
+    def static_offers(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[Offer]:
+        """What stands, once for all."""
+        transforms = Transforms([(MAP, name) for name in names])
+        yield self._static, partial(transforms.message, 0.0, poses)
+
+    def _message(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> bytes:
+        if names is not self._names:
+            self._transforms = Transforms([(MAP, name) for name in names])
+            self._names = names
+        return self._transforms.message(time, poses)
