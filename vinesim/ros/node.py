@@ -70,6 +70,7 @@ class Node:
         from tf2_msgs.msg import TFMessage
 
         self._topics: dict[str, Topic] = {}
+        # What the tick brings has a thread of its own, so that no picture in the making holds up the clock.
         self._urgent: dict[Topic, Build] = {}
         self._patient: dict[Topic, Build] = {}
         self._changed = threading.Condition()
@@ -97,7 +98,8 @@ class Node:
         self._executor.add_node(self._node)
         self._threads = [
             threading.Thread(target=self._receive, name=f"ros receive {name}", daemon=True),
-            threading.Thread(target=self._send, name=f"ros send {name}", daemon=True),
+            threading.Thread(target=self._send, args=(self._urgent,), name=f"ros send {name}", daemon=True),
+            threading.Thread(target=self._send, args=(self._patient,), name=f"ros send large {name}", daemon=True),
         ]
         for thread in self._threads:
             thread.start()
@@ -162,7 +164,7 @@ class Node:
         return {name: topic.dropped for name, topic in self._topics.items()}
 
     def close(self) -> None:
-        """Leave the ROS graph; returns when both threads have ended. A second call does nothing."""
+        """Leave the ROS graph; returns when its threads have ended. A second call does nothing."""
         with self._changed:
             if self._closing:
                 return
@@ -202,23 +204,13 @@ class Node:
                 waiting[topic] = build
             self._changed.notify_all()
 
-    def _send(self) -> None:
-        """The publishing thread: what is urgent first, then one large message at a time."""
-        next_count = 0.0
+    def _send(self, waiting: dict[Topic, Build]) -> None:
+        """A publishing thread: whatever waits, the oldest first."""
         while True:
-            now = wall.monotonic()
-            if now >= next_count:
-                for topic in self._topics.values():
-                    topic.count_listeners()
-                next_count = now + COUNT_PERIOD
             with self._changed:
-                if not (self._urgent or self._patient or self._closing):
-                    self._changed.wait(next_count - now)
+                self._changed.wait_for(lambda: waiting or self._closing)
                 if self._closing:
                     return
-                waiting = self._urgent or self._patient
-                if not waiting:
-                    continue
                 topic = next(iter(waiting))
                 build = waiting.pop(topic)
             try:
@@ -229,9 +221,14 @@ class Node:
                     log.exception("could not publish %s; further failures are only counted", topic.name)
 
     def _receive(self) -> None:
-        """The receiving thread: commands, and the services that every node has."""
+        """The receiving thread: commands, the services that every node has, and who listens to what."""
+        next_count = 0.0
         while not self._closing and self._context.ok():
             try:
-                self._executor.spin_once(timeout_sec=0.5)
+                self._executor.spin_once(timeout_sec=COUNT_PERIOD)
             except Exception:
                 log.exception("a ROS callback failed; the node goes on")
+            if wall.monotonic() >= next_count:
+                for topic in self._topics.values():
+                    topic.count_listeners()
+                next_count = wall.monotonic() + COUNT_PERIOD
