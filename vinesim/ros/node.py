@@ -18,10 +18,13 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
-from rclpy.exceptions import InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_namespace import validate_namespace
+from rclpy.validate_node_name import validate_node_name
+from rclpy.validate_topic_name import validate_topic_name
 
 from vinesim.ros import convert, environment, interfaces
 from vinesim.ros.camera import Camera
@@ -65,6 +68,14 @@ class Node:
         base: str = "base_footprint",
         clock: bool = True,
     ) -> None:
+        try:
+            validate_node_name(name)
+            validate_namespace(f"/{namespace}" if namespace else "/")
+            for topic in (*cameras, *lidars, *controllers):
+                validate_topic_name(topic)
+        except NameValidationException as error:
+            # rclpy points at the wrong letter in a second line.
+            raise ValueError(" ".join(str(error).replace("^", "").split())) from error
         environment.prepare()
         interfaces.ensure(["tf2_msgs"])
         from tf2_msgs.msg import TFMessage
@@ -88,9 +99,6 @@ class Node:
             self._cameras = {camera: Camera(self._advertise, camera) for camera in cameras}
             self._lidars = {lidar: Lidar(self._advertise, lidar) for lidar in lidars}
             self._commands = Commands(self._node, controllers)
-        except (InvalidNodeNameException, InvalidNamespaceException, InvalidTopicNameException) as error:
-            self._context.shutdown()
-            raise ValueError(" ".join(str(error).split())) from error
         except BaseException:
             self._context.shutdown()
             raise
@@ -162,6 +170,11 @@ class Node:
     def dropped(self) -> dict[str, int]:
         """Messages that somebody wanted and that were replaced before their turn, by topic."""
         return {name: topic.dropped for name, topic in self._topics.items()}
+
+    @property
+    def busy(self) -> bool:
+        """Does anything wait to be sent?"""
+        return bool(self._urgent or self._patient)
 
     def close(self) -> None:
         """Leave the ROS graph; returns when its threads have ended. A second call does nothing."""
