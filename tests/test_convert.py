@@ -3,6 +3,7 @@
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -25,6 +26,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from vinesim.ros import convert, interfaces
 from vinesim.ros.transforms import Transforms, split
+from vinesim.world.ids import Organ, label
 from vinesim.world.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
 INFO = CameraInfo(64, 48, 50.0, 51.0, 31.5, 23.5, "head_front_camera_optical")
@@ -146,6 +148,13 @@ def test_compressed_image_shows_the_same_colours():
     assert "jpeg" in message.format
     decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert np.abs(decoded.astype(int) - plain.rgb).max() <= 4
+
+
+def test_label_map_takes_labels_apart():
+    known = json.loads(convert.label_map().data)
+    value = label(Organ.BUNCH, 4711)
+    assert known["organs"][str(value // known["stride"])] == "bunch"
+    assert value % known["stride"] == 4711
 
 
 def test_camera_info_projects_like_the_camera():

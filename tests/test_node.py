@@ -200,10 +200,11 @@ def test_every_topic_is_heard_with_its_official_type():
     assert received["/tf"]["type_hash"] == "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
-LATCHED = ("robot_description", "tf_static", "tf_environment_static")
+LATCHED = ("robot_description", "label_map", "tf_static", "tf_environment_static")
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
+    "/label_map": "std_msgs/msg/String",
     "/joint_states": "sensor_msgs/msg/JointState",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import array
 import functools
+import json
 import sys
 from collections.abc import Mapping
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,12 +23,13 @@ from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo as CameraInfoMessage
 from sensor_msgs.msg import CompressedImage, Image, JointState, PointCloud2, PointField
-from std_msgs.msg import Float64MultiArray, Header
+from std_msgs.msg import Float64MultiArray, Header, String
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 
 from vinesim import frames
 from vinesim.ros.transforms import split
 from vinesim.ros.types import BaseVelocity, JointPositions, JointTrajectory
+from vinesim.world.ids import LABEL_STRIDE, Organ
 from vinesim.world.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
 COLOURED_POINT = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("rgb", "u4")])
@@ -124,6 +127,12 @@ def depth_image_millimetres(frame: CameraFrame) -> Image:
 def label_image(frame: CameraFrame) -> Image:
     """Label of every pixel (:func:`vinesim.world.ids.label`), 32SC1."""
     return _image(frame, frame.labels, "32SC1", np.int32)
+
+
+def label_map() -> String:
+    """What labels mean, as JSON: ``label // stride`` is an organ, ``label % stride`` which one of them."""
+    organs = {str(int(organ)): organ.name.lower() for organ in Organ}
+    return String(data=json.dumps({"stride": LABEL_STRIDE, "organs": organs}))
 
 
 def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
@@ -249,11 +258,9 @@ def _cloud(time: float, frame: str, point: np.dtype, height: int, width: int) ->
 @functools.cache
 def _fields(point: np.dtype) -> tuple[PointField, ...]:
     assert point.fields is not None
+    described = ((name, kind.str[1:], offset) for name, (kind, offset, *_) in point.fields.items())
     return tuple(
-        PointField(
-            name=name, offset=point.fields[name][1], datatype=_FIELD_TYPES[point.fields[name][0].str[1:]], count=1
-        )
-        for name in point.names or ()
+        PointField(name=name, offset=offset, datatype=_FIELD_TYPES[kind], count=1) for name, kind, offset in described
     )
 
 
@@ -277,9 +284,9 @@ def _doubles(values: np.ndarray) -> array.array:
     return data
 
 
-def _set_vector(target: object, values: np.ndarray) -> None:
+def _set_vector(target: Any, values: np.ndarray) -> None:
     target.x, target.y, target.z = map(float, values)
 
 
-def _set_quaternion(target: object, values: np.ndarray) -> None:
+def _set_quaternion(target: Any, values: np.ndarray) -> None:
     target.x, target.y, target.z, target.w = map(float, values)

@@ -12,7 +12,7 @@ import threading
 import time as wall
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 import rclpy
@@ -38,6 +38,8 @@ from vinesim.ros.types import Command
 from vinesim.world.values import CameraFrame, LidarScan, RobotSample
 
 log = logging.getLogger(__name__)
+
+Sensor = TypeVar("Sensor", Camera, Lidar)
 
 COUNT_PERIOD = 0.1
 """How often subscribers are counted [s of wall time]: so long may a new one wait for its first picture."""
@@ -201,7 +203,7 @@ class Node:
         self._topics[name] = topic
         return topic
 
-    def _named(self, kinds: Mapping[str, Camera | Lidar], kind: str, name: str) -> Camera | Lidar:
+    def _named(self, kinds: Mapping[str, Sensor], kind: str, name: str) -> Sensor:
         if name not in kinds:
             raise ValueError(f"no {kind} {name!r} in this node; it was made with: {', '.join(kinds) or 'none'}")
         return kinds[name]

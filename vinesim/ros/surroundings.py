@@ -1,4 +1,4 @@
-"""Where things of the vineyard are, for those who want the truth: tf_environment, apart from the robot's own tf."""
+"""The truth about the vineyard, for those who want it: poses apart from the robot's own tf, and what labels mean."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from functools import partial
 
 import numpy as np
 
+from std_msgs.msg import String
+
+from vinesim.ros import convert
 from vinesim.ros.robot import MAP
 from vinesim.ros.topics import LATCHED, RELIABLE, Advertise, Offer
 from vinesim.ros.transforms import Transforms
 
 
 class Surroundings:
-    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles), children of the map."""
+    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles), children of the map; ``label_map``, latched."""
 
     def __init__(self, advertise: Advertise, tf_message: type) -> None:
         self._moving = advertise(tf_message, "tf_environment", RELIABLE)
         self._static = advertise(tf_message, "tf_environment_static", LATCHED)
+        advertise(String, "label_map", LATCHED).send(convert.label_map())
         self._names: Sequence[str] | None = None
         self._transforms = Transforms([])
 

@@ -1,8 +1,8 @@
 """A stranger's ears: a process of its own that subscribes with stock rclpy and counts what arrives.
 
 ``python -m vinesim.ros.witness --seconds 10`` listens to every topic there is (``--topic`` names some) and prints one
-JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here, the
-messages lost (gaps in the publisher's numbering) and whether the stamps ever went back. Without ``--seconds`` it
+JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here (the age,
+for what was latched), the messages lost (gaps in the publisher's numbering) and whether the stamps ever went back. Without ``--seconds`` it
 listens until its standard input is closed.
 
 It takes messages in their serialised form, so that counting costs next to nothing; the first one of every topic is
@@ -148,7 +148,8 @@ class Witness:
         )
         ear = Ear(type_name, str(offered[0].topic_type_hash), message, len(offered))
         self.ears[name] = ear
-        self._node.create_subscription(message, name, ear.hear, qos, raw=True)
+        hear: Any = ear.hear  # rclpy hands over what the signature has room for, its annotations know less
+        self._node.create_subscription(message, name, hear, qos, raw=True)
 
 
 def _message_class(type_name: str) -> type | None:
@@ -178,7 +179,9 @@ class Arguments:
 
 def parse(arguments: Sequence[str] | None = None) -> Arguments:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m vinesim.ros.witness", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m vinesim.ros.witness", description="Count what arrives on ROS topics."
+    )
     parser.add_argument("--topic", action="append", default=[], help="listen to this one only (may be repeated)")
     parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
