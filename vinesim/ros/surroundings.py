@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
-
 from std_msgs.msg import String
 
 from vinesim.ros import convert
@@ -16,7 +15,7 @@ from vinesim.ros.transforms import Transforms
 
 
 class Surroundings:
-    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles), children of the map; ``label_map``, latched."""
+    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map; ``label_map``, latched."""
 
     def __init__(self, advertise: Advertise, tf_message: type) -> None:
         self._moving = advertise(tf_message, "tf_environment", RELIABLE)

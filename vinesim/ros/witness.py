@@ -2,8 +2,8 @@
 
 ``python -m vinesim.ros.witness --seconds 10`` listens to every topic there is (``--topic`` names some) and prints one
 JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here (the age,
-for what was latched), the messages lost (gaps in the publisher's numbering) and whether the stamps ever went back. Without ``--seconds`` it
-listens until its standard input is closed.
+for what was latched), the messages lost (gaps in the publisher's numbering) and whether the stamps ever went back.
+Without ``--seconds`` it listens until its standard input is closed.
 
 It takes messages in their serialised form, so that counting costs next to nothing; the first one of every topic is
 taken apart, to see that it is well-formed. It runs without vinesim's middleware profile, as a stranger would.
