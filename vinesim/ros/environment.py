@@ -1,0 +1,69 @@
+"""Can ROS 2 be used in this process, and with which middleware settings?
+
+ROS 2 comes from wheels (``pip install 'vinesim[ros]'``) or from a sourced installation, never from both: the wheels
+start Python a second time to put their libraries on ``LD_LIBRARY_PATH``, in no particular order, so that beside a
+sourced /opt/ros it is chance which library is loaded.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import pathlib
+import sys
+
+PROFILE = pathlib.Path(__file__).resolve().parent / "shared_memory.xml"
+"""Fast DDS profile with a shared-memory segment that large messages fit into."""
+
+PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+OWN_MIDDLEWARE = "rmw_fastrtps_cpp"
+"""The only middleware among the wheels."""
+
+
+class RosUnavailableError(RuntimeError):
+    """ROS 2 cannot be used in this process; the text says why and what to do."""
+
+
+def available() -> str | None:
+    """None if ROS 2 can be used here, else one line that says why not and names the remedy."""
+    wheels = importlib.util.find_spec("ros_wheels_bootstrapper") is not None
+    sourced = os.environ.get("AMENT_PREFIX_PATH", "")
+    if wheels and sourced:
+        return (
+            f"ROS 2 is installed here as wheels and sourced from {sourced.split(os.pathsep)[0]} as well, and which "
+            "libraries would be loaded is chance; start from a shell where nothing is sourced, or use an environment "
+            "without the extra vinesim[ros]"
+        )
+    if wheels and str(pathlib.Path(sys.prefix) / "lib") not in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep):
+        return (
+            "the ROS 2 wheels did not get to set LD_LIBRARY_PATH (Python was started with -S or -I, or by a program of "
+            "another environment); start Python plainly, or unset _ROS_WHEELS_BOOTSTRAP_COMPLETE"
+        )
+    chosen = os.environ.get("RMW_IMPLEMENTATION", OWN_MIDDLEWARE)
+    if wheels and chosen != OWN_MIDDLEWARE:
+        return f"RMW_IMPLEMENTATION is {chosen!r}, but the ROS 2 wheels have {OWN_MIDDLEWARE!r} only; unset it"
+    try:
+        for module in ("rclpy.node", "sensor_msgs.msg"):
+            importlib.import_module(module)
+    except ImportError as error:
+        reason = str(error).splitlines()[0]
+        return f"ROS 2 is missing ({reason}); pip install 'vinesim[ros]', or source a ROS 2 Jazzy installation"
+    return None
+
+
+def prepare() -> None:
+    """Settings that must stand before the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
+
+    A profile that the user has chosen stays.
+    """
+    reason = available()
+    if reason is not None:
+        raise RosUnavailableError(reason)
+    os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE))
+
+
+def without_profile() -> None:
+    """Forget our own profile again, as a program that knows nothing of vinesim would be started."""
+    if os.environ.get(PROFILE_VARIABLE) == str(PROFILE):
+        del os.environ[PROFILE_VARIABLE]

@@ -1,0 +1,23 @@
+"""Topics of one lidar."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+from sensor_msgs.msg import PointCloud2
+
+from vinesim.ros import convert
+from vinesim.ros.topics import SENSOR, Advertise, Offer
+from vinesim.world.values import LidarScan
+
+
+class Lidar:
+    """``<name>/points``: x y z intensity ring time."""
+
+    def __init__(self, advertise: Advertise, name: str) -> None:
+        self._points = advertise(PointCloud2, f"{name}/points", SENSOR)
+
+    def offers(self, scan: LidarScan) -> Iterator[Offer]:
+        """One revolution."""
+        yield self._points, partial(convert.lidar_cloud, scan)

@@ -1,0 +1,249 @@
+"""A robot's ROS 2 node, beside the simulation and never in its way.
+
+The simulation hands over values and goes on; the node's own threads build and publish the messages. A value that is
+replaced by a newer one before its turn comes is dropped and counted: a slow network or subscriber costs messages, not
+ticks. Nothing is built for which nobody listens, and :meth:`Node.wanted` lets sensors not even render it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time as wall
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from typing import Self, TypeVar
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
+from rclpy.exceptions import NameValidationException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_namespace import validate_namespace
+from rclpy.validate_node_name import validate_node_name
+from rclpy.validate_topic_name import validate_topic_name
+
+from vinesim.ros import convert, environment, interfaces
+from vinesim.ros.camera import Camera
+from vinesim.ros.clock import Clock
+from vinesim.ros.commands import Commands
+from vinesim.ros.lidar import Lidar
+from vinesim.ros.robot import Robot
+from vinesim.ros.surroundings import Surroundings
+from vinesim.ros.topics import RELIABLE, Build, Offer, Topic
+from vinesim.ros.types import Command
+from vinesim.world.values import CameraFrame, LidarScan, RobotSample
+
+log = logging.getLogger(__name__)
+
+Sensor = TypeVar("Sensor", Camera, Lidar)
+
+COUNT_PERIOD = 0.1
+"""How often subscribers are counted [s of wall time]: so long may a new one wait for its first picture."""
+
+CONTROLLERS = ("arm_left_controller", "arm_right_controller", "torso_controller", "head_controller")
+
+
+class Node:
+    """One robot's topics, under ``namespace``; several may live in one process, each with its own ROS context.
+
+    ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``cameras`` and ``lidars`` the names under
+    which they publish, ``controllers`` those that take trajectories. All topics but /clock stand under the namespace,
+    tf too (as Nav2 does with several robots); a second node in the process should be made with ``clock=False``.
+    :class:`environment.RosUnavailableError`, :class:`interfaces.InterfacesError` or :class:`ValueError` (a name that
+    ROS does not allow) say in one line why a node cannot be made.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        urdf: str,
+        *,
+        namespace: str = "",
+        static_transforms: Sequence[tuple[str, str, np.ndarray]] = (),
+        cameras: Sequence[str] = (),
+        lidars: Sequence[str] = (),
+        controllers: Sequence[str] = CONTROLLERS,
+        base: str = "base_footprint",
+        clock: bool = True,
+    ) -> None:
+        try:
+            validate_node_name(name)
+            validate_namespace(f"/{namespace}" if namespace else "/")
+            for topic in (*cameras, *lidars, *controllers):
+                validate_topic_name(topic)
+        except NameValidationException as error:
+            # rclpy points at the wrong letter in a second line.
+            raise ValueError(" ".join(str(error).replace("^", "").split())) from error
+        environment.prepare()
+        interfaces.ensure(["tf2_msgs"])
+        from tf2_msgs.msg import TFMessage
+
+        self._topics: dict[str, Topic] = {}
+        # What the tick brings has a thread of its own, so that no picture in the making holds up the clock.
+        self._urgent: dict[Topic, Build] = {}
+        self._patient: dict[Topic, Build] = {}
+        self._changed = threading.Condition()
+        self._closing = False
+
+        self._context = Context()
+        # No signal handlers: SIGINT belongs to the client. No arguments: sys.argv is vinesim's own.
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            self._node = rclpy.create_node(name, context=self._context, namespace=namespace or None)
+            self._clock = Clock(self._advertise) if clock else None
+            self._robot = Robot(self._advertise, TFMessage, urdf, static_transforms, base)
+            self._surroundings = Surroundings(self._advertise, TFMessage)
+            self._diagnostics = self._advertise(DiagnosticArray, "diagnostics", RELIABLE)
+            self._cameras = {camera: Camera(self._advertise, camera) for camera in cameras}
+            self._lidars = {lidar: Lidar(self._advertise, lidar) for lidar in lidars}
+            self._commands = Commands(self._node, controllers)
+        except BaseException:
+            self._context.shutdown()
+            raise
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._threads = [
+            threading.Thread(target=self._receive, name=f"ros receive {name}", daemon=True),
+            threading.Thread(target=self._send, args=(self._urgent,), name=f"ros send {name}", daemon=True),
+            threading.Thread(target=self._send, args=(self._patient,), name=f"ros send large {name}", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    # What the simulation calls: never blocks, never builds.
+
+    def publish_tick(self, time: float, sample: RobotSample) -> None:
+        """State of the robot at ``time`` [s]; call it every tick."""
+        offers = list(self._robot.offers(sample))
+        if self._clock is not None:
+            offers[:0] = self._clock.offers(time)
+        self._offer(offers)
+
+    def publish_camera(self, frame: CameraFrame) -> None:
+        """One picture of one of ``cameras``."""
+        self._offer(self._named(self._cameras, "camera", frame.name).offers(frame))
+
+    def publish_lidar(self, scan: LidarScan) -> None:
+        """One revolution of one of ``lidars``."""
+        self._offer(self._named(self._lidars, "lidar", scan.name).offers(scan))
+
+    def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
+        """True poses [name, 7] in the map of what moves: attached bunches, people. 10 to 30 Hz will do.
+
+        Pass the same tuple object as long as the names stay: the message is then patched, not built.
+        """
+        self._offer(self._surroundings.offers(time, names, poses))
+
+    def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
+        """True poses [name, 7] in the map of what stands: poles. Once; late joiners get it too."""
+        self._offer(self._surroundings.static_offers(names, poses), always=True)
+
+    def publish_diagnostics(self, time: float, values: Mapping[str, object], *, healthy: bool = True) -> None:
+        """Figures of the client (real-time factor, sync lag); the node adds what it had to drop. 1 Hz will do."""
+        own = {"ros_dropped": sum(self.dropped.values()), "ros_refused_commands": self._commands.refused}
+        build = partial(convert.diagnostics, time, self._node.get_fully_qualified_name(), {**values, **own}, healthy)
+        self._offer([(self._diagnostics, build)])
+
+    def commands(self) -> list[Command]:
+        """What peers asked for since the last call."""
+        return self._commands.drain()
+
+    def wanted(self, family: str) -> bool:
+        """Does anybody listen to a topic or to one below it? ``"head_front_camera/depth"``, ``"lidar"``, ``"tf"``.
+
+        As counted at most :data:`COUNT_PERIOD` ago; :class:`ValueError` if there is no such topic.
+        """
+        below = family.rstrip("/") + "/"
+        topics = [topic for name, topic in self._topics.items() if (name + "/").startswith(below)]
+        if not topics:
+            raise ValueError(f"no topic {family!r}; there are: {', '.join(sorted(self._topics))}")
+        return any(topic.listeners for topic in topics)
+
+    @property
+    def sent(self) -> dict[str, int]:
+        """Messages sent so far, by topic."""
+        return {name: topic.sent for name, topic in self._topics.items()}
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Messages that somebody wanted and that were replaced before their turn, by topic."""
+        return {name: topic.dropped for name, topic in self._topics.items()}
+
+    @property
+    def busy(self) -> bool:
+        """Does anything wait to be sent?"""
+        return bool(self._urgent or self._patient)
+
+    def close(self) -> None:
+        """Leave the ROS graph; returns when its threads have ended. A second call does nothing."""
+        with self._changed:
+            if self._closing:
+                return
+            self._closing = True
+            self._changed.notify_all()
+        self._executor.wake()
+        for thread in self._threads:
+            thread.join()
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.shutdown()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _advertise(self, message: type, name: str, qos: QoSProfile = RELIABLE, *, urgent: bool = False) -> Topic:
+        topic = Topic(name, self._node.create_publisher(message, name, qos), urgent)
+        self._topics[name] = topic
+        return topic
+
+    def _named(self, kinds: Mapping[str, Sensor], kind: str, name: str) -> Sensor:
+        if name not in kinds:
+            raise ValueError(f"no {kind} {name!r} in this node; it was made with: {', '.join(kinds) or 'none'}")
+        return kinds[name]
+
+    def _offer(self, offers: Iterable[Offer], *, always: bool = False) -> None:
+        with self._changed:
+            for topic, build in offers:
+                if not topic.listeners and not always:
+                    continue
+                waiting = self._urgent if topic.urgent else self._patient
+                if topic in waiting:
+                    topic.dropped += 1
+                waiting[topic] = build
+            self._changed.notify_all()
+
+    def _send(self, waiting: dict[Topic, Build]) -> None:
+        """A publishing thread: whatever waits, the oldest first."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: waiting or self._closing)
+                if self._closing:
+                    return
+                topic = next(iter(waiting))
+                build = waiting.pop(topic)
+            try:
+                topic.send(build())
+            except Exception:
+                topic.dropped += 1
+                if topic.dropped == 1:
+                    log.exception("could not publish %s; further failures are only counted", topic.name)
+
+    def _receive(self) -> None:
+        """The receiving thread: commands, the services that every node has, and who listens to what."""
+        next_count = 0.0
+        while not self._closing and self._context.ok():
+            try:
+                self._executor.spin_once(timeout_sec=COUNT_PERIOD)
+            except Exception:
+                log.exception("a ROS callback failed; the node goes on")
+            if wall.monotonic() >= next_count:
+                for topic in self._topics.values():
+                    topic.count_listeners()
+                next_count = wall.monotonic() + COUNT_PERIOD
