@@ -14,7 +14,8 @@ def build(quiet: bool) -> int:
         return 0 if quiet else 3
     from vinesim.ros import interfaces
 
-    built = interfaces.ensure()
+    for package in interfaces.known():
+        interfaces.build(package)
     if not quiet:
-        print(f"ROS message packages ready: {', '.join(built)}")
+        print(f"ROS message packages ready: {', '.join(interfaces.known())}")
     return 0
