@@ -1,0 +1,28 @@
+"""``vinesim scene``."""
+
+from __future__ import annotations
+
+import pathlib
+
+from rich.console import Console
+from rich.table import Table
+
+from vinesim.sensors.picture import portrait
+from vinesim.world.generate import generate
+from vinesim.world.scene import load, reseeded
+from vinesim.world.show import table as rows_of
+
+
+def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
+    """Print a table of the scene and write its picture."""
+    scene = reseeded(load(file), seed)
+    model = generate(scene)
+    console = Console()
+    table = Table(title=f"scene {scene.name}, seed {scene.seed}", title_justify="left", show_header=False)
+    for quantity, value, unit in rows_of(scene, model):
+        table.add_row(quantity, value, unit)
+    console.print(table)
+    target = out or pathlib.Path(f"{scene.name}.png")
+    portrait(scene, model, target)
+    console.print(f"picture: {target}")
+    return 0

@@ -1,0 +1,91 @@
+"""What a robot is to do: called every tick with the simulation time, before the drives."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.robot.drives import CommandError, Robot
+from vinesim.ros.types import BaseVelocity, Command, JointPositions, JointTrajectory
+
+log = logging.getLogger(__name__)
+
+
+class DriveTo:
+    """Drive the base to a place that lies about straight ahead, and stop there."""
+
+    ARRIVED = 0.05
+    """This near is there [m]."""
+
+    def __init__(self, robot: Robot, place: np.ndarray, *, speed: float = 1.2) -> None:
+        """``place`` [7]: pose of the base in the world."""
+        self.robot, self.speed = robot, speed
+        self.done = False
+        self._place = np.asarray(place, float)[:2]
+
+    def __call__(self, time: float) -> None:
+        if self.done:
+            return
+        base, _ = self.robot.rigid.base(self.robot.name)
+        way = frames.rotate(frames.conjugate(base[3:]), np.append(self._place - base[:2], 0.0))
+        distance = float(np.hypot(way[0], way[1]))
+        if distance < self.ARRIVED or way[0] < 0.0:
+            self.done = True
+            self.robot.command_base(0.0, 0.0, time)
+            return
+        turn = float(np.arctan2(way[1], way[0]))
+        self.robot.command_base(min(self.speed, 0.8 * distance + 0.05), np.clip(2.0 * turn, -0.6, 0.6), time)
+
+
+@dataclasses.dataclass
+class _Running:
+    trajectory: JointTrajectory
+    start: float
+    joints: np.ndarray
+    origin: np.ndarray
+
+
+class Obey:
+    """Do what ROS asks: drive the base, hold joint positions, follow trajectories (linear between their points)."""
+
+    def __init__(self, robot: Robot, commands: Callable[[], Iterable[Command]]) -> None:
+        """``commands`` returns what was asked since the last call."""
+        self.robot = robot
+        self.refused = 0
+        """Commands that no joint of this robot can take."""
+        self._commands = commands
+        self._running: dict[str, _Running] = {}
+
+    def __call__(self, time: float) -> None:
+        for command in self._commands():
+            try:
+                self._take(command, time)
+            except CommandError as error:
+                self.refused += 1
+                if self.refused == 1:
+                    log.warning("refused a command, further ones are only counted: %s", error)
+        for controller, running in list(self._running.items()):
+            t, points = time - running.start, running.trajectory
+            knots = np.concatenate([[0.0], points.times])
+            way = np.concatenate([running.origin[None], points.positions])
+            self.robot.command_position([np.interp(t, knots, column) for column in way.T], running.joints)
+            if t >= knots[-1]:
+                del self._running[controller]
+
+    def _take(self, command: Command, time: float) -> None:
+        robot = self.robot
+        if isinstance(command, BaseVelocity):
+            robot.command_base(float(command.linear[0]), float(command.angular[2]), time)
+        elif isinstance(command, JointPositions):
+            self._running.clear()
+            robot.command_position(command.positions)
+        elif not len(command.times):
+            self._running.pop(command.controller, None)
+        else:
+            joints = robot.joint_indices(command.joints)
+            start = max(command.time, time) if command.time > 0.0 else time
+            self._running[command.controller] = _Running(command, start, joints, robot.setpoint[joints].copy())

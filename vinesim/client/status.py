@@ -1,0 +1,70 @@
+"""What a client reports of itself: once a second while it runs, and at its end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vinesim.client.client import Client
+from vinesim.client.pace import Pace
+from vinesim.client.trace import touch_to_motion
+
+
+class Status:
+    """Figures of a running client. Reads what the tick leaves behind; may be asked from another thread."""
+
+    def __init__(self, client: Client, pace: Pace, sent: Any = None) -> None:
+        """``sent`` gives the number of messages sent so far by ROS topic, if there is a node."""
+        self.client, self.pace = client, pace
+        self._sent = sent or (lambda: {})
+        self._before: dict[str, int] = {}
+        self._before_time = 0.0
+
+    def now(self) -> dict[str, Any]:
+        """The state of affairs; topic rates are since the last call."""
+        client, pace = self.client, self.pace
+        sent, time = dict(self._sent()), pace.elapsed
+        span = max(time - self._before_time, 1e-9)
+        rates = {topic: (count - self._before.get(topic, 0)) / span for topic, count in sent.items() if count}
+        self._before, self._before_time = sent, time
+        traffic = self.client.exchange.counters
+        families = (traffic.actor, traffic.environment, traffic.event)
+        p50, p99 = pace.work_ms(50, 99)
+        force = np.sum([np.linalg.norm(c.force) for c in client.physics.contacts if c.actor == client.name] or [0.0])
+        return {
+            "name": client.name,
+            "time": client.physics.time,
+            "tick_hz": pace.hz,
+            "tick_p50_ms": p50,
+            "tick_p99_ms": p99,
+            "overruns": pace.overruns,
+            "real_time_factor": pace.real_time_factor,
+            "awake": len(client.physics.plants.awake),
+            "force": float(force),
+            "displacement_mm": 1e3 * client.trace.displacement if client.trace is not None else 0.0,
+            "bytes_in": sum(family.bytes_in for family in families),
+            "bytes_out": sum(family.bytes_out for family in families),
+            "environment_bytes_in": traffic.environment.bytes_in,
+            "environment_bytes_out": traffic.environment.bytes_out,
+            "others": sorted(client.others),
+            "topics": rates,
+        }
+
+    def report(self) -> dict[str, Any]:
+        """The same at the end of a run, with what the trace shows."""
+        client = self.client
+        figures = self.now()
+        figures["topics"] = dict(self._sent())
+        figures |= {
+            "environment_bytes_when_far": client.far.bytes,
+            "ticks_touching_when_far": client.far.ticks_touching,
+            "malformed": client.exchange.counters.malformed,
+            "deadlines_dropped": self.pace.dropped,
+        }
+        if client.trace is not None:
+            rows = client.trace.rows()
+            figures["touch_to_motion_ticks"] = touch_to_motion(rows)
+            figures["force_peak_n"] = float(np.linalg.norm(rows.force, axis=1).max(initial=0.0))
+            figures["displacement_peak_mm"] = 1e3 * float(np.linalg.norm(rows.displacement, axis=1).max(initial=0.0))
+        return figures
