@@ -8,6 +8,7 @@ draws from its own stream, named by (seed, row, place): no vine knows how many o
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -32,10 +33,15 @@ SIDE_NODES = 6
 ARM_PIECES = 5
 TRUNK_PIECES = 7
 
+Draw = Callable[..., np.ndarray]
+"""Random numbers [shoot, ...] of the shape asked for, each shoot's from the stream of its vine."""
+
 _SIDE = slice(PIECES, PIECES + SIDE_PIECES)
 _SLOTS = PIECES + SIDE_PIECES + BUNCHES * (STALK_PIECES + 1)
 _CLEAR = 0.02
 """Least gap between a bunch and its neighbours, poles and trunks [m]."""
+_UPRIGHT = 0.6
+"""Most m g a^2 / EI of bunches at height a above the base of their shoot; a uniform column buckles at 2.47."""
 
 
 def _stalk(which: int) -> slice:
@@ -89,7 +95,8 @@ def _old_wood(scene: Scene, parts: vine.Vine) -> _Wood:
     head = layout.height - (0.06 if tendone else 0.03)
     up = np.linspace(0.0, 1.0, TRUNK_PIECES + 1)[:, None]
     beside = parts.trunk.beside_pole.value
-    trunk = foot[:, None] + up * [0.0, 0.0, head] + [0.0, beside, 0.0] * (1.0 - 0.45 * up)
+    side = np.array([0.0, beside, 0.0] if tendone else [beside, 0.0, 0.0])
+    trunk = foot[:, None] + up * [0.0, 0.0, head] + side * (1.0 - 0.45 * up)
     trunk += np.cumsum(wobble, 1) * [0.015, 0.015, 0.0] * np.sin(np.pi * np.minimum(up, 0.5))
 
     angle = 2.0 * np.pi * np.arange(arm_count) / arm_count
@@ -229,7 +236,7 @@ def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
     side_sign = np.where(number % 2, 1.0, -1.0)
     if tendone:
         turn = np.arctan2(along[:, 1], along[:, 0]) + side_sign * (1.0 + 0.6 * uniform())
-        heading = np.stack([np.cos(turn), np.sin(turn), -0.35 + 0.15 * uniform()], -1)
+        heading = np.stack([np.cos(turn), np.sin(turn), -0.38 + 0.15 * uniform()], -1)
         ref = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
     else:
         lean = normal(2) * [0.12, 0.05]
@@ -254,8 +261,11 @@ def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
     owner = np.repeat(np.arange(vines), per_vine)
     nodes = np.floor(cane.nodes.value[0] + (cane.nodes.value[1] - cane.nodes.value[0] + 1) * uniform()).astype(int)
     nodes = np.minimum(nodes, NODES)
-    fruit, at, stalk, hang, roll = _draw_fruit(scene, parts, points, length, nodes, wood.row[owner], uniform, normal)
-    chosen = _choose_bunches(scene, wood, owner, per_vine, stalk, fruit)
+    fruit, at, stalk, hang, roll = _draw_fruit(scene, parts, points, nodes, wood.row[owner], uniform, normal)
+    rise = np.maximum(stalk[:, :, 0, 2] - points[:, :1, 2], 0.0)
+    stiffness = cane.woody_modulus.value * np.pi / 4.0 * base**4
+    burden = fruit["mass"] * -grow.GRAVITY[2] * rise**2 / stiffness[:, None]
+    chosen = _choose_bunches(scene, wood, per_vine, stalk, burden, fruit)
     luck = normal(NODES + SIDE_NODES, 12)
     return _Shoots(
         owner, ref, points, length, base, side, side_at, side_points, chosen, at, stalk, hang, roll, fruit, nodes, luck
@@ -276,11 +286,11 @@ def _main_axis(
         heading = heading + luck[:, i] * ([0.10, 0.10, 0.06] if tendone else [0.07, 0.05, 0.03])
         if tendone:
             # the bearing part droops below the net, the rest climbs over it
-            low = layout.height - 0.24 + 0.40 * min(2.0 * share, 1.0)
+            low = layout.height - 0.28 + 0.44 * min(2.0 * share, 1.0)
             heading[:, 2] += np.clip(2.2 * (low - at[:, 2]), -0.2, 0.28) * (0.5 + share)
             heading[:, 2] = np.clip(heading[:, 2], -0.42, 0.5)
         else:
-            heading[:, 1] += 0.9 * (foot[:, 1] - at[:, 1])
+            heading[:, 1] = 0.7 * heading[:, 1] + 0.9 * (foot[:, 1] - at[:, 1])
             heading[:, 2] += 0.12
         heading = frames.normalize(heading)
         points[:, i + 1] = at + heading * step
@@ -305,8 +315,10 @@ def _side_axis(
 # ---- fruit ---------------------------------------------------------------------------------------------------------
 
 
-def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # type: ignore[no-untyped-def]
-    """Two bunches for every shoot, of which :func:`_choose_bunches` keeps some."""
+def _draw_fruit(
+    scene: Scene, parts: vine.Vine, points: np.ndarray, nodes: np.ndarray, row: np.ndarray, uniform: Draw, normal: Draw
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Two bunches for every shoot, of which :func:`_choose_bunches` keeps some: fruit, at, stalk, hang, roll."""
     fruit, stalk = parts.bunch, parts.peduncle
     sigma = np.sqrt(np.log(1.0 + fruit.mass_variation.value**2))
     mass = fruit.mass.value * np.exp(sigma * normal(BUNCHES) - 0.5 * sigma**2)
@@ -322,7 +334,7 @@ def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # t
     hull = berries.hull(count, seed) * size[..., None]
     drawn = {
         "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,
-        "pull": stalk.pull.at(uniform(BUNCHES)), "thick": 0.5 * stalk.diameter.at(uniform(BUNCHES)),
+        "pull": stalk.pull.at(uniform(BUNCHES)), "thick": 0.5 * stalk.diameter.at(_share(mass, fruit.mass_range)),
     }  # fmt: skip
 
     # opposite the third to sixth leaf and one or two nodes further on, never both on one piece's tip
@@ -337,6 +349,9 @@ def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # t
     angle = 2.0 * np.pi * uniform(BUNCHES)
     level = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
     tilt = np.clip(0.10 + 0.04 * normal(BUNCHES), 0.02, 0.18)[..., None]
+    if scene.training == "vsp":  # beside its upright shoot, out of the hedge
+        level = frames.normalize(level * [0.4, 1.0, 0.0])
+        tilt = tilt + 0.10
     first = frames.normalize(level * tilt - [0.0, 0.0, 1.0])
     second = frames.normalize(level * 0.3 * tilt - [0.0, 0.0, 1.0])
     middle = top + first * long[..., None]
@@ -345,15 +360,25 @@ def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # t
     return drawn, at, np.stack([top, middle, end], 2), hang, level
 
 
+def _share(value: np.ndarray, within: vine.Range) -> np.ndarray:
+    """How far ``value`` lies between the ends of a range, 0..1."""
+    low, high = within.value
+    return (value - low) / (high - low)
+
+
 def _choose_bunches(
-    scene: Scene, wood: _Wood, owner: np.ndarray, per_vine: int, stalk: np.ndarray, fruit: dict[str, np.ndarray]
+    scene: Scene, wood: _Wood, per_vine: int, stalk: np.ndarray, burden: np.ndarray, fruit: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Thin each vine to its number of bunches, keeping none that touches a pole, a trunk, or a bunch already kept."""
+    """Thin each vine to its number of bunches.
+
+    None is kept that touches a pole, a trunk or a bunch already kept, or under which an upright shoot would buckle.
+    """
     layout = scene.layout
     low, high = scene.fruit.bunches
     slots = per_vine * BUNCHES
     top = stalk[:, :, -1].reshape(-1, slots, 3)
     length, radius = (fruit[k].reshape(-1, slots) for k in ("length", "radius"))
+    burden = burden.reshape(-1, slots)
     level = top[..., :2] - wood.foot[:, None, :2]
     inside = (
         np.abs(level) + radius[..., None] + 0.5 * _CLEAR < 0.5 * np.array([layout.vine_spacing, layout.row_spacing])
@@ -370,13 +395,16 @@ def _choose_bunches(
         order = order[(inside & clear)[number, order]]
         t, r, h = top[number, order], radius[number, order], length[number, order]
         apart = np.sqrt(((t[:, None, :2] - t[None, :, :2]) ** 2).sum(-1))
-        rise = np.abs((t[:, None, 2] - 0.5 * h[:, None]) - (t[None, :, 2] - 0.5 * h[None]))
+        middle = t[:, 2] - 0.5 * h
+        rise = np.abs(middle[:, None] - middle[None])
         touch = (apart < r[:, None] + r[None] + _CLEAR) & (rise < 0.5 * (h[:, None] + h[None]) + 0.03)
-        free = np.ones(len(order), bool)
+        load, free, shoot = burden[number, order], np.ones(len(order), bool), order // BUNCHES
+        carried = np.zeros(per_vine)
         for i in range(len(order)):
-            if wanted and free[i]:
+            if wanted and free[i] and carried[shoot[i]] + load[i] < _UPRIGHT:
                 kept[number, order[i]] = True
                 free &= ~touch[i]
+                carried[shoot[i]] += load[i]
                 wanted -= 1
     return kept.reshape(-1, BUNCHES)
 
