@@ -173,7 +173,7 @@ class Plants:
         self._tick += 1
 
     def brace(self, trees: np.ndarray) -> None:
-        """Announce a touch: the next ``ONSET`` ticks of these trees use phi = 1. ``commit()`` does it for new touches."""
+        """Use phi = 1 in the next ``ONSET`` ticks of trees about to be touched (``commit()`` sees to new touches)."""
         self._onset[trees] = ONSET + 1  # commit counts down before the next free pass reads it
 
     def kinematics(self, trees: np.ndarray | None = None) -> None:
@@ -183,7 +183,7 @@ class Plants:
         self._launch(self._place, len(trees))
 
     def pull(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
-        """Move one tree towards a state seen elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] wholly."""
+        """Move one tree towards a state seen elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
         bodies = self.model.bodies_of(tree)
         there, rates = np.asarray(joint_q, np.float32), np.asarray(joint_qd, np.float32)
         here = self.state.joint_q[bodies]
@@ -239,7 +239,7 @@ class Plants:
     # memory and launches
 
     def _weigh(self, tree: int) -> None:
-        """First mass moment of each body's subtree about its origin with all joints beyond it locked at their offsets."""
+        """Mass moment of each body about its origin, all bodies beyond it lumped where they hang on it [kg m]."""
         model, bodies = self.model, self.model.bodies_of(tree)
         subtree = self.body_mass[bodies].astype(float)
         hang = subtree[:, None] * model.body_com[bodies]
