@@ -18,7 +18,7 @@ from vinesim.physics.rigid import Rigid
 from vinesim.world.model import Model
 from vinesim.world.values import Contact
 
-STIFFNESS = 1e5
+STIFFNESS = 2e4
 """[N/m] of every contact, normal and (as the anchor of friction) tangential; its damping is 2 dt times this."""
 SWEEPS = 50
 """Gauss-Seidel sweeps at most; warm-started, ten to twenty are usual."""
