@@ -1,0 +1,595 @@
+"""Everything rigid, in one MuJoCo world: ground, poles and trunks, picking boxes, robots.
+
+A tick is split in two, with the shared contact solve of :mod:`vinesim.physics.touching` between the halves:
+:meth:`Rigid.prep` predicts the velocity at the end of the tick as if no plant were there, :meth:`Rigid.inverse`
+says how an impulse changes that prediction, and :meth:`Rigid.finish` integrates with the contact forces known.
+
+MuJoCo's integrator ``discrete`` is implicit in joint damping and in the servos: the metric of the tick is
+M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where its servos give 40 N.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.urdf import RobotError, check, shapes_of, touchable
+from vinesim.world.ids import Organ
+from vinesim.world.model import Model
+from vinesim.world.values import Link, RobotSpec, Shape
+
+FRICTION = 0.8
+"""Coulomb coefficient of rubber pads, plastic crates and bark alike."""
+CRATE_WALL = 0.012
+"""Thickness of a picking box's bottom and walls [m]."""
+GIVE = 0.01
+"""The tracks hold the base like a spring that reaches its full effort at this offset [m or rad], then they slip."""
+FOLLOW_GIVE = 0.05
+"""The same for the copy of a remote robot: how far ahead of the copy the pull starts [m or rad]."""
+TRACK_TIME = 0.05
+"""Ratio of the base servo's damping to its stiffness [s]."""
+
+# collision bits: what stands, what lies about, and one bit for each robot, so that a robot never meets itself
+_GROUND, _FIXED, _BOX, _FIRST_ROBOT, _LAST_BIT = 1 << 0, 1 << 1, 1 << 2, 3, 30
+_ALL = (1 << (_LAST_BIT + 1)) - 1
+_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
+_CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
+_PLANAR = ("x", "y", "yaw")
+
+
+@dataclasses.dataclass
+class _Robot:
+    """One robot: what it was asked for, and where its numbers lie in MuJoCo's arrays."""
+
+    spec: RobotSpec
+    bit: int
+    shapes: dict[str, tuple[Shape, ...]]
+    stiffness: np.ndarray
+    damping: np.ndarray
+    effort: np.ndarray
+    target: np.ndarray
+    """[joint] position the drives pull to."""
+    target_velocity: np.ndarray
+    base_target: np.ndarray
+    """[3] x, y, yaw where the tracks hold; moves with ``base_velocity``."""
+    base_velocity: np.ndarray
+    """[3] vx, vy, wz in the base's own axes."""
+    give: float = GIVE
+    q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    v: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    actuator: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    base_q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    base_v: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    base_actuator: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    bodies: dict[str, int] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Geoms:
+    """The shapes of robots and boxes that plants can touch, sorted by MuJoCo geom."""
+
+    id: np.ndarray
+    """[geom] index in MuJoCo's geom arrays."""
+    body: np.ndarray
+    """[geom] MuJoCo body."""
+    kind: np.ndarray
+    """[geom] MuJoCo's type: 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box (meshes stand as their box)."""
+    size: np.ndarray
+    """[geom, 3]"""
+    center: np.ndarray
+    """[geom, 3] middle of the shape in the geom's frame (not zero for meshes)."""
+    radius: np.ndarray
+    """[geom] of the bounding sphere about the middle."""
+    friction: np.ndarray
+    dof: np.ndarray
+    """[geom] last degree of freedom that moves it; its ancestors follow ``dof_parentid``."""
+    root: np.ndarray
+    """[geom] root body of its kinematic tree, about whose centre of mass MuJoCo writes ``cvel`` and ``cdof``."""
+    actor: tuple[str, ...]
+    link: tuple[str, ...]
+
+
+class Rigid:
+    """Robots, boxes and what stands, in one MuJoCo world that is compiled anew when an actor comes or goes."""
+
+    def __init__(self, model: Model, *, dt: float = 0.01) -> None:
+        self.model = model
+        self.dt = dt
+        self._robots: dict[str, _Robot] = {}
+        self.world: mujoco.MjModel
+        self.data: mujoco.MjData
+        self.generation = 0
+        """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
+        self._compile()
+
+    # ------------------------------------------------------------------ who is here
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names in the order of arrival."""
+        return tuple(self._robots)
+
+    def add_robot(self, spec: RobotSpec) -> None:
+        """Let a robot join, at ``spec.pose`` and ``spec.home``; all others go on exactly where they are.
+
+        Raises :class:`RobotError` and leaves the world as it was if the URDF does not compile.
+        """
+        if spec.name in self._robots:
+            raise RobotError(f"robot {spec.name!r} is already here; give the newcomer another name")
+        if "/" in spec.name or not spec.name:
+            raise RobotError(f"robot name {spec.name!r} must not be empty nor contain '/', which parts actor and link")
+        used = {robot.bit for robot in self._robots.values()}
+        free = [bit for bit in range(_FIRST_ROBOT, _LAST_BIT + 1) if bit not in used]
+        if not free:
+            raise RobotError(f"robot {spec.name!r} is one too many: {len(used)} robots share this world, remove one")
+        check(spec)
+        pose = np.asarray(spec.pose, float)
+        robot = _Robot(
+            spec=spec,
+            bit=free[0],
+            shapes=shapes_of(spec.urdf),
+            stiffness=np.array([d.stiffness for d in spec.drives], float),
+            damping=np.array([d.damping for d in spec.drives], float),
+            effort=np.array([d.effort for d in spec.drives], float),
+            target=np.array(spec.home, float),
+            target_velocity=np.zeros(len(spec.drives)),
+            base_target=np.array([pose[0], pose[1], _yaw(pose)]),
+            base_velocity=np.zeros(3),
+        )
+        self._robots[spec.name] = robot
+        try:
+            self._compile()
+        except ValueError as error:
+            del self._robots[spec.name]
+            raise RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {error}") from error
+        self.place(spec.name, pose, spec.home)
+
+    def remove_robot(self, name: str) -> None:
+        """Let a robot leave; all others go on exactly where they are."""
+        self._robot(name)
+        del self._robots[name]
+        self._compile()
+
+    def place(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
+        """Put a robot somewhere, at rest and asking for nothing else: base ``pose`` [7], ``position`` [joint]."""
+        robot, pose = self._robot(name), np.asarray(pose, float)
+        robot.target[:] = self.data.qpos[robot.q] = position
+        robot.base_target[:] = self.data.qpos[robot.base_q] = pose[0], pose[1], _yaw(pose)
+        self.data.qvel[robot.v] = self.data.qvel[robot.base_v] = 0.0
+        robot.target_velocity[:] = robot.base_velocity[:] = 0.0
+        for joint, (source, coefficients) in self._mimics(robot).items():
+            polynomial = np.polynomial.Polynomial(coefficients)
+            self.data.joint(joint).qpos[0] = polynomial(self.data.joint(source).qpos[0])
+        self._fresh = False
+
+    # ------------------------------------------------------------------ what they are asked to do
+
+    def command(self, name: str, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Ask the drives for ``position`` [joint] moving with ``velocity`` [joint] (standing, unless given)."""
+        robot = self._robot(name)
+        robot.target[:] = position
+        robot.target_velocity[:] = 0.0 if velocity is None else velocity
+
+    def drive_base(self, name: str, velocity: tuple[float, float, float]) -> None:
+        """Ask the tracks for (vx, vy, wz) [m/s, m/s, rad/s] in the base's axes; zero holds the place."""
+        robot = self._robot(name)
+        robot.base_velocity[:] = velocity
+        robot.give = GIVE
+
+    def follow(
+        self, name: str, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> None:
+        """Pull the copy of a remote robot to its received state; it stays dynamic, so a vine still holds it back.
+
+        ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
+        """
+        robot = self._robot(name)
+        base_q, base_qd = np.asarray(base_q, float), np.asarray(base_qd, float)
+        self.command(name, position, velocity)
+        yaw = _yaw(base_q)
+        turns = np.round((self.data.qpos[robot.base_q[2]] - yaw) / (2.0 * np.pi))
+        robot.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
+        c, s = np.cos(yaw), np.sin(yaw)
+        robot.base_velocity[:] = c * base_qd[0] + s * base_qd[1], c * base_qd[1] - s * base_qd[0], base_qd[5]
+        robot.give = FOLLOW_GIVE
+
+    def push(self, name: str, link: str, force: np.ndarray, moment: np.ndarray = np.zeros(3)) -> None:
+        """A force [N] and a moment [N m] on a link's centre of mass, world axes, until it is set anew."""
+        wrench = self.data.xfrc_applied[self._body(name, link)]
+        wrench[:3], wrench[3:] = force, moment
+
+    # ------------------------------------------------------------------ what they feel and where they are
+
+    def read(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Position, velocity, effort and contact of the drives, each [joint] in the order of ``spec.drives``.
+
+        ``effort`` is what the drive transmitted in the last tick: servo and its share of gravity compensation.
+        ``contact`` is J^T f of the contacts with plants and with rigid things; at rest the two cancel.
+        """
+        robot, d = self._robot(name), self.data
+        position, velocity = d.qpos[robot.q], d.qvel[robot.v]
+        servo = robot.stiffness * (robot.target - position) + robot.damping * (robot.target_velocity - velocity)
+        servo = np.clip(servo, -robot.effort, robot.effort)
+        # implicit servos: over the tick they gave the force of its end, not that of its start
+        effort = np.clip(servo + d.qfrc_gravcomp[robot.v], -robot.effort, robot.effort)
+        return position, velocity, effort, self._contact[robot.v]
+
+    def base(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Pose [7] and velocity [6] (world axes) of the base link."""
+        robot, d = self._robot(name), self.data
+        x, y, yaw = d.qpos[robot.base_q]
+        vx, vy, wz = d.qvel[robot.base_v]
+        half = 0.5 * yaw
+        pose = np.array([x, y, robot.spec.pose[2], 0.0, 0.0, np.sin(half), np.cos(half)])
+        return pose, np.array([vx, vy, 0.0, 0.0, 0.0, wz])
+
+    def link_pose(self, name: str, link: str) -> np.ndarray:
+        """World pose [7] of a link, whether or not it can move against its parent."""
+        body = self._body(name, link)
+        self._refresh()
+        return np.concatenate([self.data.xpos[body], frames.from_wxyz(self.data.xquat[body])])
+
+    def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
+        """[6, joint]: velocity of the world ``point`` [3] of a link, then its angular velocity, per drive's speed."""
+        robot, body = self._robot(name), self._body(name, link)
+        self._refresh()
+        jacobian = np.zeros((6, self.world.nv))
+        mujoco.mj_jac(self.world, self.data, jacobian[:3], jacobian[3:], np.asarray(point, float), body)
+        return jacobian[:, robot.v]
+
+    def links(self) -> tuple[Link, ...]:
+        """Every robot's and box's bodies that have a shape; the same object until an actor comes or goes."""
+        return self._links
+
+    def link_q(self) -> np.ndarray:
+        """Poses [link, 7] of :meth:`links`."""
+        self._refresh()
+        d, body = self.data, self._link_body
+        pose = np.empty((len(body), 7))
+        pose[:, :3] = d.xpos[body]
+        pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
+        return pose
+
+    # ------------------------------------------------------------------ the tick, in two halves
+
+    def prep(self) -> None:
+        """First half: positions, native contacts, and the velocity that the tick would end with without plants."""
+        m, d = self.world, self.data
+        self._servo()
+        d.qfrc_applied[:] = 0.0
+        mujoco.mj_step1(m, d)
+        # the whole forward pass behind the velocity stage: single calls of its parts leave out dt K v
+        mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
+
+    @property
+    def velocity_free(self) -> np.ndarray:
+        """[dof] the prediction of :meth:`prep`."""
+        return self.data.qvel + self.dt * self.data.qacc
+
+    def inverse(self, J: np.ndarray) -> np.ndarray:
+        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
+
+        H = M^ + Jc^T D Jc holds implicit servos and the stiffness of the native constraints that are active now
+        (limits, mimics, robot against pole). Only the kinematic trees concerned are factored.
+        """
+        dofs = self._coupled(J)
+        block = self._blocks.get(dofs.tobytes())
+        if block is None:
+            block = self._blocks[dofs.tobytes()] = _Block(self.world, dofs)
+        change = np.zeros((self.world.nv, len(J)))
+        change[dofs] = np.linalg.solve(block.hessian(self.data), J[:, dofs].T)
+        return change
+
+    def finish(self, force: np.ndarray | None = None) -> None:
+        """Second half: integrate with generalised contact forces of plants, ``force`` [dof]."""
+        m, d = self.world, self.data
+        if force is not None:
+            d.qfrc_applied[:] = force
+        mujoco.mj_step2(m, d)
+        self._contact[:] = 0.0 if force is None else force
+        if d.ncon:
+            native = np.where(d.efc_type >= _CONTACT, d.efc_force, 0.0)
+            out = np.zeros(m.nv)
+            mujoco.mj_mulJacTVec(m, d, out, native)
+            self._contact += out
+        self._fresh = False
+
+    # ------------------------------------------------------------------ inside
+
+    def _robot(self, name: str) -> _Robot:
+        try:
+            return self._robots[name]
+        except KeyError:
+            raise ValueError(f"no robot {name!r} here; there are: {', '.join(self._robots) or 'none'}") from None
+
+    def _body(self, name: str, link: str) -> int:
+        robot = self._robot(name)
+        try:
+            return robot.bodies[link]
+        except KeyError:
+            raise ValueError(f"robot {name!r} has no link {link!r}; it has: {', '.join(robot.bodies)}") from None
+
+    def _refresh(self) -> None:
+        """Poses of the state as it is now: after a step MuJoCo's are those of the step's start."""
+        if not self._fresh:
+            mujoco.mj_kinematics(self.world, self.data)
+            mujoco.mj_comPos(self.world, self.data)
+            self._fresh = True
+
+    def _servo(self) -> None:
+        """Turn every robot's targets into MuJoCo's controls."""
+        d = self.data
+        for robot in self._robots.values():
+            d.ctrl[robot.actuator] = robot.stiffness * robot.target + robot.damping * robot.target_velocity
+            stiffness, damping = _tracks(robot.spec)
+            q = d.qpos[robot.base_q]
+            c, s = np.cos(q[2]), np.sin(q[2])
+            vx, vy, wz = robot.base_velocity
+            velocity = np.array([c * vx - s * vy, s * vx + c * vy, wz])
+            # held back too far, the tracks slip: the place they hold comes along
+            robot.base_target[:] = np.clip(robot.base_target + self.dt * velocity, q - robot.give, q + robot.give)
+            d.ctrl[robot.base_actuator] = stiffness * robot.base_target + damping * velocity
+
+    def _mimics(self, robot: _Robot) -> dict[str, tuple[str, np.ndarray]]:
+        """Joints of a robot that copy another joint: name -> (source, polynomial)."""
+        m = self.world
+        joints = {}
+        for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+            joint, source = m.joint(m.eq_obj1id[e]).name, m.joint(m.eq_obj2id[e]).name
+            if joint.startswith(robot.spec.name + "/"):
+                joints[joint] = (source, m.eq_data[e, :5].copy())
+        return joints
+
+    def _coupled(self, J: np.ndarray) -> np.ndarray:
+        """Degrees of freedom [k] that feel an impulse along ``J``: its trees and those in constraint with them."""
+        m, d = self.world, self.data
+        touched = np.zeros(m.ntree, bool)
+        touched[m.dof_treeid[J.any(axis=0)]] = True
+        if d.nefc and d.nisland:
+            islands = np.unique(d.tree_island[touched])
+            touched |= np.isin(d.tree_island, islands[islands >= 0])
+        return np.flatnonzero(touched[m.dof_treeid])
+
+    # ------------------------------------------------------------------ building the world
+
+    def _compile(self) -> None:
+        """Build the world anew and carry every joint's and body's state over by its name."""
+        spec = _scene(self.model, self.dt)
+        for robot in self._robots.values():
+            _attach(spec, robot)
+        world = spec.compile()
+        data = mujoco.MjData(world)
+        contact = np.zeros(world.nv)
+        if self.generation:
+            data.time = self.data.time
+            _carry(self.world, self.data, self._contact, world, data, contact)
+        self.world, self.data, self._contact = world, data, contact
+        self._blocks: dict[bytes, _Block] = {}
+        self._fresh = False
+        self.generation += 1
+        for robot in self._robots.values():
+            self._locate(robot)
+        self._links, self._link_body = self._list_links()
+        self.geoms = self._list_geoms()
+
+    def _locate(self, robot: _Robot) -> None:
+        m, name = self.world, robot.spec.name
+        joints = [m.joint(f"{name}/{drive.joint}") for drive in robot.spec.drives]
+        planar = [m.joint(f"{name}:{axis}") for axis in _PLANAR]
+        robot.q = np.array([j.qposadr[0] for j in joints], int)
+        robot.v = np.array([j.dofadr[0] for j in joints], int)
+        robot.actuator = np.array([m.actuator(f"{name}/{drive.joint}").id for drive in robot.spec.drives], int)
+        robot.base_q = np.array([j.qposadr[0] for j in planar], int)
+        robot.base_v = np.array([j.dofadr[0] for j in planar], int)
+        robot.base_actuator = np.array([m.actuator(f"{name}:{axis}").id for axis in _PLANAR], int)
+        names = [m.body(i).name for i in range(m.nbody)]
+        robot.bodies = {n.removeprefix(name + "/"): i for i, n in enumerate(names) if n.startswith(name + "/")}
+
+    def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
+        links, bodies = [], []
+        for box, size in enumerate(self.model.box_size):
+            links.append(Link(f"box/{box}", Organ.BOX, box, crate(size)))
+            bodies.append(self.world.body(f"box/{box}").id)
+        for name, robot in self._robots.items():
+            for link, shapes in robot.shapes.items():
+                if shapes:
+                    links.append(Link(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
+                    bodies.append(robot.bodies[link])
+        return tuple(links), np.array(bodies, int)
+
+    def _list_geoms(self) -> Geoms:
+        m = self.world
+        owner = {m.body(f"box/{i}").id: ("box/" + str(i), "box") for i in range(len(self.model.box_size))}
+        for name, robot in self._robots.items():
+            owner.update({body: (name, link) for link, body in robot.bodies.items()})
+        ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] in owner and m.geom_contype[g]], int)
+        last = np.full(m.nbody, -1)
+        for body in range(1, m.nbody):
+            count = m.body_dofnum[body]
+            last[body] = m.body_dofadr[body] + count - 1 if count else last[m.body_parentid[body]]
+        body, kind, size = m.geom_bodyid[ids], m.geom_type[ids].copy(), m.geom_size[ids].copy()
+        mesh = kind == mujoco.mjtGeom.mjGEOM_MESH
+        kind[mesh], size[mesh] = mujoco.mjtGeom.mjGEOM_BOX, m.geom_aabb[ids][mesh, 3:]
+        center = np.where(mesh[:, None], m.geom_aabb[ids, :3], 0.0)
+        radius = np.where(mesh, np.linalg.norm(size, axis=1), m.geom_rbound[ids])
+        names = [owner[int(b)] for b in body]
+        return Geoms(
+            id=ids,
+            body=body,
+            kind=kind.astype(np.int32),
+            size=size,
+            center=center,
+            radius=radius,
+            friction=m.geom_friction[ids, 0].copy(),
+            dof=last[body].astype(np.int32),
+            root=m.body_rootid[body].astype(np.int32),
+            actor=tuple(actor for actor, _ in names),
+            link=tuple(link for _, link in names),
+        )
+
+
+class _Block:
+    """The metric of one tick for some degrees of freedom, gathered from MuJoCo's sparse arrays."""
+
+    def __init__(self, world: mujoco.MjModel, dofs: np.ndarray) -> None:
+        self.count = len(dofs)
+        self.at = np.full(world.nv, -1)
+        self.at[dofs] = np.arange(len(dofs))
+        self.dofs = dofs
+        row, column = np.repeat(np.arange(world.nv), world.M_rownnz), world.M_colind
+        self.entry = np.flatnonzero(self.at[row] >= 0)
+        self.row, self.column = self.at[row[self.entry]], self.at[column[self.entry]]
+
+    def hessian(self, d: mujoco.MjData) -> np.ndarray:
+        """[k, k]: M^ and the tangent of the active constraints."""
+        H = np.zeros((self.count, self.count))
+        diagonal = d.qHDiagInv[self.dofs]
+        if diagonal.all():
+            H[self.row, self.column] = d.qH[self.entry]
+            np.fill_diagonal(H, 1.0)
+            H = H.T @ (H / diagonal[:, None])
+        else:  # nothing implicit in the whole world: MuJoCo leaves the factor unset and M^ is M
+            H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]
+        if d.nefc:
+            state = d.efc_state
+            stiff = (state == _QUADRATIC) | (state == _CONE)
+            row = np.repeat(np.arange(d.nefc), d.efc_J_rownnz)
+            column = self.at[d.efc_J_colind[: len(row)]]
+            entry = np.flatnonzero(stiff[row] & (column >= 0))
+            if len(entry):
+                J = np.zeros((d.nefc, self.count))
+                J[row[entry], column[entry]] = d.efc_J[: len(row)][entry]
+                H += J.T @ (d.efc_D[:, None] * J)
+        return H
+
+
+def _yaw(pose: np.ndarray) -> float:
+    """Heading of a pose [7] [rad]."""
+    x, y, z, w = pose[3:]
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def _scene(model: Model, dt: float) -> mujoco.MjSpec:
+    """Ground, poles, trunks and boxes."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = dt
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    spec.option.impratio = 10.0
+    friction = [FRICTION, 0.005, 0.0001]
+    spec.worldbody.add_geom(
+        name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=_GROUND, conaffinity=_BOX,
+        friction=friction,
+    )  # fmt: skip
+    for piece in np.flatnonzero(np.isin(model.fixed_organ, [Organ.POLE, Organ.TRUNK])):
+        spec.worldbody.add_geom(
+            name=f"fixed/{piece}", type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=np.concatenate([model.fixed_start[piece], model.fixed_end[piece]]).astype(float),
+            size=[float(model.fixed_radius[piece].mean()), 0, 0], contype=_FIXED, conaffinity=0, friction=friction,
+        )  # fmt: skip
+    for box, pose in enumerate(model.box_pose.astype(float)):
+        body = spec.worldbody.add_body(name=f"box/{box}", pos=pose[:3], quat=frames.to_wxyz(frames.normalize(pose[3:])))
+        body.add_freejoint(name=f"box/{box}")
+        walls = crate(model.box_size[box])
+        volume = [float(np.prod(wall.size)) for wall in walls]
+        for wall, share in zip(walls, volume, strict=True):
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX, size=wall.size, pos=wall.pose[:3], friction=friction,
+                mass=float(model.box_mass[box]) * share / sum(volume), contype=_BOX, conaffinity=_ALL,
+            )  # fmt: skip
+    return spec
+
+
+def crate(size: np.ndarray) -> tuple[Shape, ...]:
+    """Bottom and four walls of an open box of outer ``size`` [3] m, origin in the middle of its underside."""
+    length, width, height = (float(s) / 2 for s in size)
+    t = CRATE_WALL / 2
+    walls = [
+        ((length, width, t), (0.0, 0.0, t)),
+        ((length, t, height - t), (0.0, width - t, height + t)),
+        ((length, t, height - t), (0.0, t - width, height + t)),
+        ((t, width - 2 * t, height - t), (length - t, 0.0, height + t)),
+        ((t, width - 2 * t, height - t), (t - length, 0.0, height + t)),
+    ]
+    return tuple(Shape("box", half, frames.pose(np.array(at)), (0.75, 0.15, 0.12, 1.0)) for half, at in walls)
+
+
+def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
+    """Set a robot on a planar base and give it its servos."""
+    given, name = robot.spec, robot.spec.name
+    child = mujoco.MjSpec.from_string(touchable(given.urdf, {drive.joint for drive in given.drives}))
+    bit = 1 << robot.bit
+    for geom in child.geoms:
+        geom.contype, geom.conaffinity = bit, _ALL & ~bit & ~_GROUND
+        geom.friction = [FRICTION, 0.005, 0.0001]
+    for body in child.bodies[1:]:
+        body.gravcomp = 1.0
+    driven = {drive.joint: drive for drive in given.drives}
+    for joint in child.joints:
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if joint.name in driven:
+            joint.actgravcomp = True
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
+    base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, float(given.pose[2])])
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    axes = zip(_PLANAR, (slide, slide, hinge), np.eye(3), strict=True)
+    for axis, kind, direction in axes:
+        base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
+    spec.attach(child, prefix=f"{name}/", frame=base.add_frame())
+    for drive in given.drives:
+        _add_servo(spec, f"{name}/{drive.joint}", drive.stiffness, drive.damping, drive.effort)
+    stiffness, damping = _tracks(given)
+    for i, axis in enumerate(_PLANAR):
+        _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
+
+
+def _tracks(spec: RobotSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness and damping [3] of the base's servos along x, y and about z."""
+    force, moment = spec.base_effort
+    stiffness = np.array([force, force, moment]) / GIVE
+    return stiffness, TRACK_TIME * stiffness
+
+
+def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, effort: float) -> None:
+    """Effort = control - stiffness q - damping v, cut off at ``effort``; the control carries both targets."""
+    bias = np.zeros(10)
+    bias[1:3] = -stiffness, -damping
+    gain = np.zeros(10)
+    gain[0] = 1.0
+    spec.add_actuator(
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED, gainprm=gain, biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=bias,
+        forcelimited=True, forcerange=[-effort, effort], ctrllimited=False,
+    )  # fmt: skip
+
+
+_OF_DOFS = ("qvel", "qacc", "qacc_warmstart", "qfrc_applied", "qfrc_gravcomp", "qfrc_actuator")
+
+
+def _carry(
+    old: mujoco.MjModel, old_data: mujoco.MjData, old_contact: np.ndarray,
+    new: mujoco.MjModel, new_data: mujoco.MjData, contact: np.ndarray,
+) -> None:  # fmt: skip
+    """Copy the state of every joint and body that is in both worlds, bit by bit."""
+    before = {old.joint(i).name: i for i in range(old.njnt)}
+    for i in range(new.njnt):
+        j = before.get(new.joint(i).name)
+        if j is None:
+            continue
+        q, v = (7, 6) if new.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE else (1, 1)
+        to_q, from_q, to_v, from_v = new.jnt_qposadr[i], old.jnt_qposadr[j], new.jnt_dofadr[i], old.jnt_dofadr[j]
+        new_data.qpos[to_q : to_q + q] = old_data.qpos[from_q : from_q + q]
+        for name in _OF_DOFS:
+            getattr(new_data, name)[to_v : to_v + v] = getattr(old_data, name)[from_v : from_v + v]
+        contact[to_v : to_v + v] = old_contact[from_v : from_v + v]
+    bodies = {old.body(i).name: i for i in range(1, old.nbody)}
+    for i in range(1, new.nbody):
+        if (j := bodies.get(new.body(i).name)) is not None:
+            new_data.xfrc_applied[i] = old_data.xfrc_applied[j]
