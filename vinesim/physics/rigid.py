@@ -79,7 +79,9 @@ class Geoms:
     kind: np.ndarray
     """[geom] MuJoCo's type: 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box (meshes stand as their box)."""
     size: np.ndarray
-    """[geom, 3]"""
+    """[geom, 3] as MuJoCo writes it for the kind."""
+    half: np.ndarray
+    """[geom, 3] half edges of the box around the shape, in its own axes."""
     center: np.ndarray
     """[geom, 3] middle of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
@@ -270,6 +272,15 @@ class Rigid:
         """[dof] the prediction of :meth:`prep`."""
         return self.data.qvel + self.dt * self.data.qacc
 
+    @property
+    def group(self) -> np.ndarray:
+        """[MuJoCo geom] a label that two geoms share if a force on one may move the other in this tick."""
+        m, d = self.world, self.data
+        label = np.arange(m.ntree + 1)
+        if d.nefc and d.nisland:
+            label[:-1] = np.where(d.tree_island >= 0, m.ntree + 1 + d.tree_island, label[:-1])
+        return label[m.body_treeid[m.geom_bodyid]]
+
     def inverse(self, J: np.ndarray) -> np.ndarray:
         """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
 
@@ -416,12 +427,18 @@ class Rigid:
         kind[mesh], size[mesh] = mujoco.mjtGeom.mjGEOM_BOX, m.geom_aabb[ids][mesh, 3:]
         center = np.where(mesh[:, None], m.geom_aabb[ids, :3], 0.0)
         radius = np.where(mesh, np.linalg.norm(size, axis=1), m.geom_rbound[ids])
+        half = size.copy()
+        round_ = (kind == mujoco.mjtGeom.mjGEOM_SPHERE) | (kind == mujoco.mjtGeom.mjGEOM_CAPSULE)
+        half[round_] = size[round_, :1] + size[round_, 1:2] * [0.0, 0.0, 1.0]
+        cylinder = kind == mujoco.mjtGeom.mjGEOM_CYLINDER
+        half[cylinder] = size[cylinder][:, [0, 0, 1]]
         names = [owner[int(b)] for b in body]
         return Geoms(
-            id=ids,
-            body=body,
+            id=ids.astype(np.int32),
+            body=body.astype(np.int32),
             kind=kind.astype(np.int32),
             size=size,
+            half=half,
             center=center,
             radius=radius,
             friction=m.geom_friction[ids, 0].copy(),

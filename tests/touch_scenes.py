@@ -1,0 +1,190 @@
+"""Canes, a bunch, a gripper and a bar: built for our physics, and the same wholly in MuJoCo as the oracle."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics import rigid as rigid_module
+from vinesim.physics.rigid import Rigid
+from vinesim.physics.touching import shapes_of
+from vinesim.world.grow import Tree, Wood, assemble
+from vinesim.world.ids import Organ
+from vinesim.world.model import Model
+from vinesim.world.state import State
+from vinesim.world.values import Drive, RobotSpec
+
+DOWN = frames.aligned(np.array([0.0, 0.0, -1.0]))
+
+
+def cane(at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0) -> Tree:
+    """A cane of 1 m in 16 pieces, level when drawn; ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm."""
+    tree = Tree(frames.pose(np.array(at, float), frames.yaw(heading)))
+    wood = Wood(5e9, 800.0, beta, shear=2.5e9)  # G = E/2 makes torsion as stiff as bending, as MuJoCo's ball wants
+    last = tree.rod(-1, 1.0, (radius, radius), wood, 16)[-1]
+    if bunch:
+        mass, stiffness = 800.0 * np.pi * 0.002**2 * 0.04, 1e9 * np.pi * 0.002**4 / 4 / 0.04
+        across = mass * (0.04**2 / 12 + 0.002**2 / 4)
+        for i in range(2):
+            last = tree.add(
+                last, offset=(0.0625 if i == 0 else 0.04, 0, 0), rest=DOWN if i == 0 else frames.IDENTITY,
+                organ=int(Organ.PEDUNCLE), mass=mass, com=(0.02, 0, 0), length=0.04, radius=(0.002, 0.002),
+                inertia=(0.5 * mass * 0.002**2, across, across), stiffness=np.full(3, stiffness),
+                damping=np.full(3, 0.01 * stiffness + 1e-3),
+            )  # fmt: skip
+        last = tree.add(
+            last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=bunch, com=(0.085, 0, 0), length=0.17,
+            radius=(0.04, 0.04), inertia=(bunch * 0.00064, bunch * 0.00174, bunch * 0.00174),
+            stiffness=np.full(3, stiffness), damping=np.full(3, 0.01 * stiffness + 2e-3),
+        )  # fmt: skip
+        tree.bunches.append({"body": last, "length": 0.17, "radius": 0.045, "berries": 80})
+    tree.settle()
+    return tree
+
+
+def _inertial(mass: float) -> str:
+    i = 0.004 * mass
+    return f'<inertial><mass value="{mass}"/><inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+
+def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0") -> str:
+    return (
+        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/>'
+        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1000" velocity="5"/></joint>'
+    )
+
+
+GRIPPER = f"""<robot name="gripper"><link name="base_footprint">{_inertial(50)}</link>
+<link name="carriage">{_inertial(1)}</link><link name="hand">{_inertial(4)}</link>
+{_slide("shift", "base_footprint", "carriage", "0 1 0")}{_slide("lift", "carriage", "hand", "0 0 1")}
+<link name="left">{_inertial(0.1)}<collision><geometry><box size="0.04 0.02 0.07"/></geometry></collision></link>
+<link name="right">{_inertial(0.1)}<collision><geometry><box size="0.04 0.02 0.07"/></geometry></collision></link>
+{_slide("close_left", "hand", "left", "0 -1 0", "0 0.085 0")}{_slide("close_right", "hand", "right", "0 1 0", "0 -0.085 0")}
+</robot>"""
+
+
+def gripper(bunch: np.ndarray, name: str = "grip", effort: float = 40.0) -> RobotSpec:
+    """Two box fingers, open about the point ``bunch`` [3]; drives: shift (y), lift (z), both fingers."""
+    drives = (
+        Drive("shift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
+        Drive("lift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
+        Drive("close_left", 4000.0, 80.0, effort, 5.0, -1.0, 1.0),
+        Drive("close_right", 4000.0, 80.0, effort, 5.0, -1.0, 1.0),
+    )
+    return RobotSpec(name, 0, GRIPPER, "base_footprint", frames.pose(bunch), drives, np.zeros(4))
+
+
+BAR = f"""<robot name="bar"><link name="base_footprint">{_inertial(50)}</link>
+<link name="bar">{_inertial(3)}
+<collision><geometry><cylinder radius="0.03" length="0.6"/></geometry></collision></link>
+{_slide("sweep", "base_footprint", "bar", "0 1 0")}</robot>"""
+
+
+def bar(at, name: str = "bar", stiffness: float = 0.0, damping: float = 0.0) -> RobotSpec:
+    """An upright bar of 3 kg that slides along y; without gains it coasts."""
+    drives = (Drive("sweep", stiffness, damping, 1000.0, 5.0, -5.0, 5.0),)
+    return RobotSpec(name, 1, BAR, "base_footprint", frames.pose(np.array(at, float)), drives, np.zeros(1))
+
+
+class Whole:
+    """The oracle: plants and robots in one MuJoCo world, ball joints and sphere and capsule geoms."""
+
+    def __init__(self, model: Model, spec: RobotSpec, *, dt: float = 0.01) -> None:
+        """The scheme of ``discrete`` adds dt K of damping; it is taken off, down to nothing."""
+        self.rigid = Rigid(model, dt=dt)
+        self.rigid.add_robot(spec)
+        scene = rigid_module._scene(model, dt)
+        scene.memory = 1 << 26
+        for robot in self.rigid._robots.values():
+            rigid_module._attach(scene, robot)
+        made = []
+        for b in range(len(model.body_mass)):
+            parent = int(model.body_parent[b])
+            pose = frames.pose(model.body_offset[b], model.body_rest[b])
+            if parent < 0:
+                pose = frames.compose(model.tree_pose[model.body_tree[b]].astype(float), pose)
+            body = (scene.worldbody if parent < 0 else made[parent]).add_body(
+                name=f"plant/{b}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[b]),
+                ipos=model.body_com[b], inertia=model.body_inertia[b], explicitinertial=True,
+            )  # fmt: skip
+            k, c = float(model.joint_stiffness[b, 1]), float(model.joint_damping[b, 1])
+            body.add_joint(
+                name=f"plant/{b}", type=mujoco.mjtJoint.mjJNT_BALL, stiffness=k, damping=max(0.0, c - dt * k)
+            )
+            made.append(body)
+        shapes = shapes_of(model)
+        for b, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
+            size, place = [float(radius), 0, 0], {"pos": start}
+            kind = mujoco.mjtGeom.mjGEOM_SPHERE
+            if (start != end).any():
+                kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
+            made[b].add_geom(
+                type=kind, size=size, contype=rigid_module._FIXED, conaffinity=0, mass=0.0,
+                friction=[rigid_module.FRICTION, 0.005, 0.0001], solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2],
+                **place,
+            )  # fmt: skip
+        self.world = world = scene.compile()
+        self.data = data = mujoco.MjData(world)
+        mine = self.rigid.world
+        for j in range(mine.njnt):
+            to, at = world.joint(mine.joint(j).name), mine.joint(j)
+            data.qpos[to.qposadr[0] : to.qposadr[0] + len(at.qpos0)] = self.rigid.data.joint(j).qpos
+        state = State.at_rest(model)
+        for b in range(len(model.body_mass)):
+            data.joint(f"plant/{b}").qpos[:] = frames.to_wxyz(state.joint_q[b])
+        # from here on the robot's side speaks to the whole world
+        self.rigid.world, self.rigid.data = world, data
+        for robot in self.rigid._robots.values():
+            self.rigid._locate(robot)
+        self.rigid._contact = np.zeros(world.nv)
+
+    def step(self) -> None:
+        self.rigid._servo()
+        mujoco.mj_step(self.world, self.data)
+        self.rigid._fresh = False
+
+    def body_q(self, b: int) -> np.ndarray:
+        """Pose [7] after the last step."""
+        self.rigid._refresh()
+        body = self.data.body(f"plant/{b}")
+        return np.concatenate([body.xpos, frames.from_wxyz(body.xquat)])
+
+    def force_on(self, link: str) -> np.ndarray:
+        """[3] N of all contacts on one robot link in the last step."""
+        total, wrench = np.zeros(3), np.zeros(6)
+        for c in range(self.data.ncon):
+            contact = self.data.contact[c]
+            mujoco.mj_contactForce(self.world, self.data, c, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3]
+            bodies = [self.world.body(self.world.geom_bodyid[g]).name for g in contact.geom]
+            if bodies[1].endswith("/" + link):
+                total += force
+            if bodies[0].endswith("/" + link):
+                total -= force
+        return total
+
+
+def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:
+    """A model with one hanging bunch, the bunch's body, and its middle in the world."""
+    model = assemble([cane((0.0, 0.0, 2.0), bunch=mass)])
+    body = int(model.bunch_body[0])
+    pose = model.forward(model.joint_settled)[body]
+    return model, body, pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
+
+
+def grasp(t: float) -> tuple[np.ndarray, float]:
+    """What the gripper is asked at time t: targets of its drives, and an extra pull on the hand [N].
+
+    Close, lift 10 cm, move 20 cm aside, be pulled down, let go.
+    """
+
+    def ramp(a: float, b: float) -> float:
+        return float(np.clip((t - a) / (b - a), 0.0, 1.0))
+
+    def smooth(u: float) -> float:
+        return u * u * (3.0 - 2.0 * u)
+
+    fingers = 0.05 * ramp(0.3, 0.8) if t < 6.5 else 0.05 * (1.0 - ramp(6.5, 6.8))
+    pull = -15.0 * ramp(4.5, 4.8) * (t < 6.0)
+    return np.array([0.20 * smooth(ramp(3.0, 4.0)), 0.10 * smooth(ramp(1.5, 2.5)), fingers, fingers]), pull

@@ -1,0 +1,475 @@
+"""Articulated trees on ball joints with implicit springs: free motion, response to unit impulses, commitment.
+
+Featherstone's articulated-body recursion (Rigid Body Dynamics Algorithms, 2008, chapter 7), one thread a tree. The
+springs enter the recursion implicitly: with theta the joint's rotation vector, w its rate and phi in [1/2, 1], the
+torque over one tick is -K (theta + phi dt w_phi) - D w_phi, w_phi = w + phi dt dw/dt, so every joint inertia grows by
+the *metric* phi dt (phi dt K + D) and stiffness cannot make the tick unstable. phi = 1 is backward Euler (MuJoCo's
+``discrete`` integrator), phi = 1/2 the trapezoidal rule.
+
+Signs and frames: world axes; velocities and accelerations are (linear of the body's origin, angular), wrenches (force
+at the origin, moment about it). The inertia of a body or subtree about the body's origin is held as three blocks,
+
+    moment = J alpha + H a        force = H^T alpha + M a        with H = m [c]x for one body,
+
+and after elimination of its joint a body keeps only D = (J + metric)^-1, D J and D H.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def exponential(v: wp.vec3):
+    """Quaternion of the rotation vector v [rad]."""
+    square = wp.dot(v, v)
+    half_sinc = 0.5 - square * (1.0 / 48.0 - square * (1.0 / 3840.0))
+    cosine = 1.0 - square * (1.0 / 8.0 - square * (1.0 / 384.0))
+    if square > 0.1:
+        angle = wp.sqrt(square)
+        half_sinc = wp.sin(0.5 * angle) / angle
+        cosine = wp.cos(0.5 * angle)
+    return wp.quat(half_sinc * v[0], half_sinc * v[1], half_sinc * v[2], cosine)
+
+
+@wp.func
+def logarithm(q: wp.quat):
+    """Rotation vector [rad] of the unit quaternion q, the short way round."""
+    v = wp.vec3(q[0], q[1], q[2])
+    w = q[3]
+    if w < 0.0:
+        v = -v
+        w = -w
+    square = wp.dot(v, v)
+    scale = 2.0 + square * (1.0 / 3.0 + square * (3.0 / 20.0 + square * (5.0 / 56.0)))  # 2 asin(s) / s
+    if square > 0.02:
+        sine = wp.sqrt(square)
+        scale = 2.0 * wp.atan2(sine, w) / sine
+    return scale * v
+
+
+@wp.kernel
+def place(
+    # model
+    tree_first: wp.array(dtype=wp.int32),
+    tree_size: wp.array(dtype=wp.int32),
+    tree_pose: wp.array(dtype=wp.transform),
+    body_parent: wp.array(dtype=wp.int32),
+    body_offset: wp.array(dtype=wp.vec3),
+    body_rest: wp.array(dtype=wp.quat),
+    # in
+    trees: wp.array(dtype=wp.int32),
+    joint_q: wp.array(dtype=wp.quat),
+    joint_qd: wp.array(dtype=wp.vec3),
+    # out
+    body_q_out: wp.array(dtype=wp.transform),
+    body_qd_out: wp.array(dtype=wp.spatial_vector),
+):
+    """Put the bodies of one tree where its joints say, without moving anything."""
+    tree = trees[wp.tid()]
+    first = tree_first[tree]
+    for k in range(first, first + tree_size[tree]):
+        parent = body_parent[k]
+        above = tree_pose[tree]
+        motion = wp.spatial_vector()
+        if parent >= 0:
+            above = body_q_out[parent]
+            motion = body_qd_out[parent]
+        turning = wp.spatial_bottom(motion)
+        axes = wp.transform_get_rotation(above) * body_rest[k]
+        lever = wp.quat_rotate(wp.transform_get_rotation(above), body_offset[k])
+        body_q_out[k] = wp.transform(wp.transform_get_translation(above) + lever, axes * joint_q[k])
+        body_qd_out[k] = wp.spatial_vector(
+            wp.spatial_top(motion) + wp.cross(turning, lever), turning + wp.quat_rotate(axes, joint_qd[k])
+        )
+
+
+@wp.kernel
+def free(
+    # model
+    dt: float,
+    brisk: float,
+    gravity: wp.vec3,
+    tree_first: wp.array(dtype=wp.int32),
+    tree_size: wp.array(dtype=wp.int32),
+    tree_pose: wp.array(dtype=wp.transform),
+    body_parent: wp.array(dtype=wp.int32),
+    body_offset: wp.array(dtype=wp.vec3),
+    body_rest: wp.array(dtype=wp.quat),
+    body_mass: wp.array(dtype=float),
+    body_com: wp.array(dtype=wp.vec3),
+    body_inertia: wp.array(dtype=wp.vec3),
+    body_hang: wp.array(dtype=wp.vec3),
+    joint_stiffness: wp.array(dtype=wp.vec3),
+    joint_damping: wp.array(dtype=wp.vec3),
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_onset: wp.array(dtype=wp.int32),
+    body_load: wp.array(dtype=wp.spatial_vector),
+    joint_q: wp.array(dtype=wp.quat),
+    joint_qd: wp.array(dtype=wp.vec3),
+    # out
+    body_q_out: wp.array(dtype=wp.transform),
+    body_qd_out: wp.array(dtype=wp.spatial_vector),
+    tree_phi_out: wp.array(dtype=float),
+    axes_out: wp.array(dtype=wp.quat),
+    lever_out: wp.array(dtype=wp.vec3),
+    J_out: wp.array(dtype=wp.mat33),
+    H_out: wp.array(dtype=wp.mat33),
+    M_out: wp.array(dtype=wp.mat33),
+    bias_out: wp.array(dtype=wp.spatial_vector),
+    D_out: wp.array(dtype=wp.mat33),
+    DJ_out: wp.array(dtype=wp.mat33),
+    DH_out: wp.array(dtype=wp.mat33),
+    Du_out: wp.array(dtype=wp.vec3),
+    body_acceleration_out: wp.array(dtype=wp.spatial_vector),
+    joint_qd_free_out: wp.array(dtype=wp.vec3),
+    body_qd_free_out: wp.array(dtype=wp.spatial_vector),
+):
+    """Solve the motion of one tree over a tick without contacts, and keep the factors of its implicit inertia."""
+    tree = trees[wp.tid()]
+    first = tree_first[tree]
+    size = tree_size[tree]
+
+    # outward: poses and velocities at the start of the tick, each body's own inertia and bias
+    fastest = float(0.0)
+    for k in range(first, first + size):
+        fastest = wp.max(fastest, wp.length_sq(joint_qd[k]))
+    phi = tree_phi[tree]
+    if fastest > brisk * brisk or tree_onset[tree] > 0:
+        phi = 1.0
+    tree_phi_out[tree] = phi
+
+    for k in range(first, first + size):
+        parent = body_parent[k]
+        above = tree_pose[tree]
+        motion = wp.spatial_vector()
+        if parent >= 0:
+            above = body_q_out[parent]
+            motion = body_qd_out[parent]
+        turning = wp.spatial_bottom(motion)
+        axes = wp.transform_get_rotation(above) * body_rest[k]
+        lever = wp.quat_rotate(wp.transform_get_rotation(above), body_offset[k])
+        turned = axes * joint_q[k]
+        omega = turning + wp.quat_rotate(axes, joint_qd[k])
+        body_q_out[k] = wp.transform(wp.transform_get_translation(above) + lever, turned)
+        body_qd_out[k] = wp.spatial_vector(wp.spatial_top(motion) + wp.cross(turning, lever), omega)
+        axes_out[k] = axes
+        lever_out[k] = lever
+
+        mass = body_mass[k]
+        rotation = wp.quat_to_matrix(turned)
+        com = rotation * body_com[k]
+        inertia = rotation * wp.diag(body_inertia[k]) * wp.transpose(rotation)
+        load = body_load[k]
+        force = mass * (wp.cross(omega, wp.cross(omega, com)) - gravity)
+        # the weight's moment is taken (1 - phi) dt ahead: explicit gravity would feed energy into a hanging bunch
+        ahead = (1.0 - phi) * dt * wp.cross(omega, rotation * body_hang[k])
+        moment = wp.cross(omega, inertia * omega) + wp.cross(com, force) - wp.cross(ahead, gravity)
+        bias_out[k] = wp.spatial_vector(force, moment) - load
+        J_out[k] = inertia + mass * (wp.dot(com, com) * wp.identity(n=3, dtype=float) - wp.outer(com, com))
+        H_out[k] = mass * wp.skew(com)
+        M_out[k] = mass * wp.identity(n=3, dtype=float)
+
+    # inward: eliminate each joint and hand what is left of the subtree to the parent
+    for i in range(size):
+        k = first + size - 1 - i
+        parent = body_parent[k]
+        turning = wp.vec3()
+        if parent >= 0:
+            turning = wp.spatial_bottom(body_qd_out[parent])
+        frame = wp.quat_to_matrix(axes_out[k])
+        stiffness = joint_stiffness[k]
+        artificial = (2.0 * phi - 1.0) * dt  # [s] the scheme damps as if beta were larger by this
+        damping = wp.max(joint_damping[k] - artificial * stiffness, wp.vec3())
+        metric = frame * wp.diag(phi * dt * (phi * dt * stiffness + damping)) * wp.transpose(frame)
+        rate = joint_qd[k]
+        spring = wp.cw_mul(stiffness, logarithm(joint_q[k]) + phi * dt * rate) + wp.cw_mul(damping, rate)
+        bias = bias_out[k]
+        J = J_out[k]
+        H = H_out[k]
+        M = M_out[k]
+        # the metric acts on the rate as the joint frame sees it, not on its derivative in world axes
+        u = metric * wp.cross(turning, frame * rate) - frame * spring - wp.spatial_bottom(bias)
+        D = wp.inverse(J + metric)
+        DJ = D * J
+        DH = D * H
+        Du = D * u
+        D_out[k] = D
+        DJ_out[k] = DJ
+        DH_out[k] = DH
+        Du_out[k] = Du
+        if parent >= 0:
+            lever = lever_out[k]
+            arm = wp.skew(lever)
+            J_left = metric * DJ  # = J - J D J without the cancellation; the same for H
+            H_left = metric * DH
+            M_left = M - wp.transpose(H) * DH
+            centripetal = wp.cross(turning, wp.cross(turning, lever))
+            force = wp.spatial_top(bias) + wp.transpose(H) * Du + M_left * centripetal
+            moment = wp.spatial_bottom(bias) + J * Du + H_left * centripetal + wp.cross(lever, force)
+            carried = H_left + arm * M_left
+            J_out[parent] = J_out[parent] + J_left - carried * arm + arm * wp.transpose(H_left)
+            H_out[parent] = H_out[parent] + carried
+            M_out[parent] = M_out[parent] + M_left
+            bias_out[parent] = bias_out[parent] + wp.spatial_vector(force, moment)
+
+    # outward: accelerations, and the rates and velocities they lead to
+    for k in range(first, first + size):
+        parent = body_parent[k]
+        pushed = wp.spatial_vector()
+        motion = wp.spatial_vector()
+        turning = wp.vec3()
+        if parent >= 0:
+            pushed = body_acceleration_out[parent]
+            motion = body_qd_free_out[parent]
+            turning = wp.spatial_bottom(body_qd_out[parent])
+        lever = lever_out[k]
+        alpha = wp.spatial_bottom(pushed)
+        a = wp.spatial_top(pushed) + wp.cross(alpha, lever) + wp.cross(turning, wp.cross(turning, lever))
+        relative = Du_out[k] - DJ_out[k] * alpha - DH_out[k] * a
+        body_acceleration_out[k] = wp.spatial_vector(a, alpha + relative)
+        rate = joint_qd[k]
+        seen = relative - wp.cross(turning, wp.quat_rotate(axes_out[k], rate))
+        rate = rate + dt * wp.quat_rotate_inv(axes_out[k], seen)
+        joint_qd_free_out[k] = rate
+        omega = wp.spatial_bottom(motion)
+        body_qd_free_out[k] = wp.spatial_vector(
+            wp.spatial_top(motion) + wp.cross(omega, lever), omega + wp.quat_rotate(axes_out[k], rate)
+        )
+
+
+@wp.kernel
+def response(
+    # model
+    tree_first: wp.array(dtype=wp.int32),
+    body_tree: wp.array(dtype=wp.int32),
+    body_parent: wp.array(dtype=wp.int32),
+    stride: int,
+    # in
+    bodies: wp.array(dtype=wp.int32),
+    lever: wp.array(dtype=wp.vec3),
+    D: wp.array(dtype=wp.mat33),
+    DJ: wp.array(dtype=wp.mat33),
+    DH: wp.array(dtype=wp.mat33),
+    # out
+    a_by_force_out: wp.array(dtype=wp.mat33),
+    a_by_moment_out: wp.array(dtype=wp.mat33),
+    alpha_by_force_out: wp.array(dtype=wp.mat33),
+    alpha_by_moment_out: wp.array(dtype=wp.mat33),
+    response_out: wp.array4d(dtype=float),
+):
+    """Push one body by six unit impulses and write the velocity of every listed body (the list ends with -1)."""
+    slot = wp.tid()
+    body = bodies[slot]
+    tree = body_tree[body]
+    first = tree_first[tree]
+    shift = slot * stride - first  # scratch of this thread: one entry for each body of the tree
+    last = body
+    n = wp.int32(0)
+    while bodies[n] >= 0:
+        if body_tree[bodies[n]] == tree:
+            last = wp.max(last, bodies[n])
+        n = n + 1
+
+    # inward along the path to the root; columns are the three unit forces and the three unit moments
+    zero = wp.mat33()
+    force_f = wp.identity(n=3, dtype=float)
+    force_m = wp.mat33()
+    moment_f = wp.mat33()
+    moment_m = wp.identity(n=3, dtype=float)
+    path = int(body)
+    for i in range(last - first + 1):
+        k = last - i
+        alpha_by_force_out[shift + k] = zero
+        alpha_by_moment_out[shift + k] = zero
+        if k == path:
+            alpha_by_force_out[shift + k] = D[k] * moment_f
+            alpha_by_moment_out[shift + k] = D[k] * moment_m
+            DJt = wp.transpose(DJ[k])
+            DHt = wp.transpose(DH[k])
+            arm = wp.skew(lever[k])
+            force_f = force_f - DHt * moment_f
+            force_m = force_m - DHt * moment_m
+            moment_f = moment_f - DJt * moment_f + arm * force_f
+            moment_m = moment_m - DJt * moment_m + arm * force_m
+            path = body_parent[k]
+
+    for k in range(first, last + 1):
+        parent = body_parent[k]
+        a_f = wp.mat33()
+        a_m = wp.mat33()
+        alpha_f = wp.mat33()
+        alpha_m = wp.mat33()
+        if parent >= 0:
+            arm = wp.skew(lever[k])
+            alpha_f = alpha_by_force_out[shift + parent]
+            alpha_m = alpha_by_moment_out[shift + parent]
+            a_f = a_by_force_out[shift + parent] - arm * alpha_f
+            a_m = a_by_moment_out[shift + parent] - arm * alpha_m
+        a_by_force_out[shift + k] = a_f
+        a_by_moment_out[shift + k] = a_m
+        alpha_by_force_out[shift + k] = alpha_f + alpha_by_force_out[shift + k] - DJ[k] * alpha_f - DH[k] * a_f
+        alpha_by_moment_out[shift + k] = alpha_m + alpha_by_moment_out[shift + k] - DJ[k] * alpha_m - DH[k] * a_m
+
+    for other in range(n):
+        a_f = zero
+        a_m = zero
+        alpha_f = zero
+        alpha_m = zero
+        if body_tree[bodies[other]] == tree:
+            at = shift + bodies[other]
+            a_f = a_by_force_out[at]
+            a_m = a_by_moment_out[at]
+            alpha_f = alpha_by_force_out[at]
+            alpha_m = alpha_by_moment_out[at]
+        for r in range(3):
+            for c in range(3):
+                response_out[other, r, slot, c] = a_f[r, c]
+                response_out[other, r, slot, 3 + c] = a_m[r, c]
+                response_out[other, 3 + r, slot, c] = alpha_f[r, c]
+                response_out[other, 3 + r, slot, 3 + c] = alpha_m[r, c]
+
+
+@wp.kernel
+def push(
+    # model
+    dt: float,
+    tree_first: wp.array(dtype=wp.int32),
+    tree_size: wp.array(dtype=wp.int32),
+    body_parent: wp.array(dtype=wp.int32),
+    # in
+    trees: wp.array(dtype=wp.int32),
+    body_wrench: wp.array(dtype=wp.spatial_vector),
+    axes: wp.array(dtype=wp.quat),
+    lever: wp.array(dtype=wp.vec3),
+    D: wp.array(dtype=wp.mat33),
+    DJ: wp.array(dtype=wp.mat33),
+    DH: wp.array(dtype=wp.mat33),
+    # out
+    spread_out: wp.array(dtype=wp.spatial_vector),
+    Du_out: wp.array(dtype=wp.vec3),
+    body_acceleration_out: wp.array(dtype=wp.spatial_vector),
+    joint_qd_free_out: wp.array(dtype=wp.vec3),
+):
+    """Add what the wrenches on one touched tree do to its free accelerations and joint rates."""
+    tree = trees[wp.tid()]
+    first = tree_first[tree]
+    size = tree_size[tree]
+    for k in range(first, first + size):
+        spread_out[k] = body_wrench[k]
+    for i in range(size):
+        k = first + size - 1 - i
+        parent = body_parent[k]
+        wrench = spread_out[k]
+        moment = wp.spatial_bottom(wrench)
+        Du_out[k] = D[k] * moment
+        if parent >= 0:
+            force = wp.spatial_top(wrench) - wp.transpose(DH[k]) * moment
+            moment = moment - wp.transpose(DJ[k]) * moment + wp.cross(lever[k], force)
+            spread_out[parent] = spread_out[parent] + wp.spatial_vector(force, moment)
+    for k in range(first, first + size):
+        parent = body_parent[k]
+        above = wp.spatial_vector()
+        if parent >= 0:
+            above = spread_out[parent]
+        alpha = wp.spatial_bottom(above)
+        a = wp.spatial_top(above) + wp.cross(alpha, lever[k])
+        relative = Du_out[k] - DJ[k] * alpha - DH[k] * a
+        added = wp.spatial_vector(a, alpha + relative)
+        spread_out[k] = added
+        body_acceleration_out[k] = body_acceleration_out[k] + added
+        joint_qd_free_out[k] = joint_qd_free_out[k] + dt * wp.quat_rotate_inv(axes[k], relative)
+
+
+@wp.kernel
+def integrate(
+    # model
+    dt: float,
+    bound: float,
+    tree_first: wp.array(dtype=wp.int32),
+    tree_size: wp.array(dtype=wp.int32),
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_awake: wp.array(dtype=wp.bool),
+    tree_phi: wp.array(dtype=float),
+    joint_qd_free: wp.array(dtype=wp.vec3),
+    # out
+    tree_rate_out: wp.array(dtype=float),
+    tree_onset_out: wp.array(dtype=wp.int32),
+    joint_q_out: wp.array(dtype=wp.quat),
+    joint_qd_out: wp.array(dtype=wp.vec3),
+):
+    """Move the joints of one tree to the end of the tick; a tree beyond bound stops where the tick began."""
+    tree = trees[wp.tid()]
+    if not tree_awake[tree]:
+        return
+    first = tree_first[tree]
+    last = first + tree_size[tree]
+    fastest = float(0.0)
+    for k in range(first, last):
+        square = wp.length_sq(joint_qd_free[k])
+        if square > fastest or square != square:  # NaN enters, and stays
+            fastest = square
+    tree_rate_out[tree] = wp.sqrt(fastest)
+    tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
+    sound = fastest <= bound * bound
+    phi = tree_phi[tree]
+    for k in range(first, last):
+        if sound:
+            rate = joint_qd_free[k]
+            mean = (1.0 - phi) * joint_qd_out[k] + phi * rate
+            joint_qd_out[k] = rate
+            joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q_out[k])
+        else:
+            joint_qd_out[k] = wp.vec3()
+
+
+@wp.kernel
+def joint_wrench(
+    # model
+    gravity: wp.vec3,
+    tree_first: wp.array(dtype=wp.int32),
+    tree_size: wp.array(dtype=wp.int32),
+    body_tree: wp.array(dtype=wp.int32),
+    body_parent: wp.array(dtype=wp.int32),
+    body_mass: wp.array(dtype=float),
+    body_com: wp.array(dtype=wp.vec3),
+    body_inertia: wp.array(dtype=wp.vec3),
+    # in
+    bodies: wp.array(dtype=wp.int32),
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
+    body_acceleration: wp.array(dtype=wp.spatial_vector),
+    body_load: wp.array(dtype=wp.spatial_vector),
+    body_wrench: wp.array(dtype=wp.spatial_vector),
+    # out
+    wrench_out: wp.array(dtype=wp.spatial_vector),
+):
+    """Add up what one joint must carry so that everything beyond it moves as it did in the last tick."""
+    slot = wp.tid()
+    body = bodies[slot]
+    tree = body_tree[body]
+    at = wp.transform_get_translation(body_q[body])
+    force = wp.vec3()
+    moment = wp.vec3()
+    for k in range(body, tree_first[tree] + tree_size[tree]):
+        up = int(k)
+        while up > body:
+            up = body_parent[up]
+        if up == body:
+            pose = body_q[k]
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            inertia = rotation * wp.diag(body_inertia[k]) * wp.transpose(rotation)
+            com = rotation * body_com[k]
+            omega = wp.spatial_bottom(body_qd[k])
+            alpha = wp.spatial_bottom(body_acceleration[k])
+            a = wp.spatial_top(body_acceleration[k]) + wp.cross(alpha, com) + wp.cross(omega, wp.cross(omega, com))
+            own = body_mass[k] * (a - gravity)
+            given = body_load[k] + body_wrench[k]
+            arm = wp.transform_get_translation(pose) - at
+            force += own - wp.spatial_top(given)
+            moment += wp.cross(arm + com, own) + inertia * alpha + wp.cross(omega, inertia * omega)
+            moment -= wp.cross(arm, wp.spatial_top(given)) + wp.spatial_bottom(given)
+    wrench_out[slot] = wp.spatial_vector(force, moment)

@@ -1,0 +1,439 @@
+"""Who touches whom, and with what force: one contact solve a tick, shared by plants and rigid bodies.
+
+Both sides say how fast they would move if the other were not there, and how an impulse changes that. The impulses
+that keep them apart are then found for both at once, so they feel equal and opposite forces in the same tick. Solving
+them in turn with penalty springs instead (a *staggered* scheme) blows up from 1e4 N/m on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels import contact as kernels
+from vinesim.physics.plants import Plants
+from vinesim.physics.rigid import Rigid
+from vinesim.world.model import Model
+from vinesim.world.values import Contact
+
+STIFFNESS = 2e4
+"""[N/m] of every contact, normal and (as the anchor of friction) tangential; its damping is 2 dt times this."""
+SWEEPS = 50
+"""Gauss-Seidel sweeps at most; warm-started, ten to twenty are usual."""
+TOLERANCE = 1e-7
+"""Of the largest impulse: a smaller change in a sweep ends them."""
+SLOTS = 6
+"""Rigid shapes that one plant shape can touch at once."""
+ISLANDS = 24
+"""Up to so many contacts are solved as one block; more are parted into islands that do not feel each other."""
+STIR = 1e-3
+"""[m/s] A box slower than this wakes nobody."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shapes:
+    """What of the plants can be touched: segments with a radius, sorted by body."""
+
+    tree: np.ndarray
+    """[tree + 1] first shape of each tree, then their number."""
+    body: np.ndarray
+    """[shape]"""
+    bunch: np.ndarray
+    """[shape] the bunch it belongs to, -1 for wood."""
+    start: np.ndarray
+    """[shape, 3] m, in the body's frame; equal to ``end`` for a sphere."""
+    end: np.ndarray
+    radius: np.ndarray
+    """[shape] m"""
+
+
+def shapes_of(model: Model) -> Shapes:
+    """A capsule for each piece of wood and a few spheres for each bunch.
+
+    The spheres are the largest that fit a spheroid of the bunch's length and radius: a ball of radius
+    R sqrt(1 - c^2 / (a^2 - R^2)) about each point c of the axis between its centres of curvature (a: half length).
+    """
+    body, bunch, start, end, radius = [], [], [], [], []
+    of_body = {int(b): i for i, b in enumerate(model.bunch_body)}
+    for b in range(len(model.body_mass)):
+        if b in of_body:
+            i = of_body[b]
+            a, r = 0.5 * float(model.bunch_length[i]), float(model.bunch_radius[i])
+            furthest = (a * a - r * r) / a if a > r else 0.0
+            count = min(1 + 2 * int(np.ceil(furthest / r - 1e-6)), 7) if furthest > 1e-6 else 1
+            for c in np.linspace(-furthest, furthest, count) if count > 1 else [0.0]:
+                body.append(b)
+                bunch.append(i)
+                start.append((a + c, 0.0, 0.0))
+                end.append((a + c, 0.0, 0.0))
+                radius.append(min(a, r) * np.sqrt(1.0 - c * c / (a * a - r * r)) if count > 1 else min(a, r))
+        else:
+            body.append(b)
+            bunch.append(-1)
+            start.append((0.0, 0.0, 0.0))
+            end.append((float(model.body_length[b]), 0.0, 0.0))
+            radius.append(float(model.body_radius[b].mean()))
+    tree = np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))) if body else np.zeros(1)
+    return Shapes(
+        tree=np.asarray(tree, np.int32),
+        body=np.array(body, np.int32),
+        bunch=np.array(bunch, np.int32),
+        start=np.array(start, np.float32).reshape(-1, 3),
+        end=np.array(end, np.float32).reshape(-1, 3),
+        radius=np.array(radius, np.float32),
+    )
+
+
+class Touching:
+    """Contacts between the plants and the rigid world of one tick.
+
+    ``find()`` (before ``plants.free()``) wakes whatever a rigid body comes near; ``solve()`` (after it) leaves
+    ``bodies`` and ``wrenches`` for ``plants.commit()`` and ``force`` for ``rigid.finish()``.
+
+    Args:
+        capacity: contacts solved in one tick; of more, the deepest are kept, and ``dropped`` and ``complaint`` say so.
+        stiffness: [N/m] see :data:`STIFFNESS`.
+    """
+
+    def __init__(
+        self, model: Model, plants: Plants, rigid: Rigid, *, capacity: int = 128, stiffness: float = STIFFNESS
+    ) -> None:
+        self.model, self.plants, self.rigid = model, plants, rigid
+        self.dt, self.capacity = rigid.dt, capacity
+        self.stiffness, self.damping = stiffness, 2.0 * stiffness * rigid.dt
+        self.shapes = shapes_of(model)
+        self.count = 0
+        """Contacts of the last tick, those that do not press included."""
+        self.bodies = np.zeros(0, np.int32)
+        """Plant bodies in contact [n], sorted."""
+        self.wrenches = np.zeros((0, 6))
+        """[n, 6] N, N m on them, at their origins, world axes."""
+        self.force: np.ndarray | None = None
+        """[dof] generalised force of the same contacts on the rigid world; None without contact."""
+        self.sweeps = 0
+        self.dropped = 0
+        """Contacts left out since the start, for want of room."""
+        self.complaint = ""
+        """When contacts were last left out and how many: empty if never."""
+        self.near = np.zeros(0, np.int32)
+        """Trees [k] whose box a robot or a moving box reaches into: these must not fall asleep."""
+        self._generation = 0
+        self._awake = np.zeros(0, np.int32)
+        self._allocate()
+        self._renew()
+        self._bound(np.arange(len(model.tree_first), dtype=np.int32))
+
+    # ------------------------------------------------------------------ the two halves of a tick
+
+    def find(self) -> None:
+        """Wake the trees that a robot or a moving box is about to reach; the rest cost one comparison each."""
+        if self._generation != self.rigid.generation:
+            self._renew()
+        self._launch(self._bound_geoms, len(self._geoms.id))
+        asleep_now = self._awake[~self.plants.state.tree_awake[self._awake]]
+        if len(asleep_now):
+            self._bound(asleep_now)
+        near = []
+        for actor in range(len(self._actor_first)):
+            mine = slice(self._actor_first[actor], self._actor_end[actor])
+            if self._actor_lies[actor] and self._geom_speed[mine].max() < STIR:
+                continue
+            low, high = self._geom_low[mine], self._geom_high[mine]
+            trees = self._reached(low.min(0), high.max(0))
+            if len(trees):
+                near.append(trees[self._overlap(trees, low, high).any(1)])
+        self.near = np.unique(np.concatenate(near)).astype(np.int32) if near else self.near[:0]
+        if len(self.near) and not self.plants.state.tree_awake[self.near].all():
+            self.plants.wake(self.near)
+
+    def solve(self) -> None:
+        """Find the contacts of all awake trees and the forces that go with them."""
+        self._awake = awake = self.plants.awake
+        self.count, self.bodies, self.wrenches, self.force = 0, self.bodies[:0], self.wrenches[:0], None
+        self._values: tuple[Contact, ...] | None = ()
+        if len(awake) and len(self._geoms.id):
+            self._bound(awake)
+            overlap = self._overlap(awake, self._geom_low, self._geom_high)
+            trees = awake[overlap.any(1)]
+            if len(trees):
+                self._meet(trees, np.flatnonzero(overlap.any(0)))
+        if self.count:
+            self._press()
+        else:
+            self._known_count[0] = 0
+
+    # ------------------------------------------------------------------ what came of it
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """The contacts of the last tick that press, sorted by (tree, body, shape, geom)."""
+        if self._values is None:
+            n, geoms = self.count, self._geoms
+            force, push = self._force[:n], self._impulse[0 : 3 * n : 3]
+            self._values = tuple(
+                Contact(
+                    geoms.actor[g], geoms.link[g], int(self._contact_body[c]), self._point[c].copy(), -force[c],
+                    float(self._gap[c]),
+                )
+                for c, g in enumerate(self._geom[:n].tolist())
+                if push[c] > 0.0
+            )  # fmt: skip
+        return self._values
+
+    @property
+    def touched(self) -> tuple[tuple[int, str], ...]:
+        """(tree, actor) for every tree that somebody presses on in the last tick, sorted."""
+        return tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
+
+    # ------------------------------------------------------------------ who is close
+
+    def _bound(self, trees: np.ndarray) -> None:
+        self._trees[: len(trees)] = trees
+        self._launch(self._bound_trees, len(trees))
+
+    def _reached(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Trees whose box overlaps one box."""
+        a, b = self._tree_low, self._tree_high
+        inside = a[0] <= high[0]
+        for outside in (a[1] <= high[1], a[2] <= high[2], b[0] >= low[0], b[1] >= low[1], b[2] >= low[2]):
+            inside &= outside
+        return np.flatnonzero(inside)
+
+    def _overlap(self, trees: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """[tree, geom] whether their boxes overlap."""
+        a, b = self._tree_low[:, trees, None], self._tree_high[:, trees, None]
+        return ((a <= high.T[:, None]) & (b >= low.T[:, None])).all(0)
+
+    def _meet(self, trees: np.ndarray, geoms: np.ndarray) -> None:
+        """Contacts of all shapes of some trees with some geoms."""
+        first = self.shapes.tree
+        near = np.concatenate([np.arange(first[t], first[t + 1], dtype=np.int32) for t in trees])
+        if len(near) > self._room:
+            self._make_room(2 * len(near))
+        n = len(near)
+        self._near_shapes[:n] = near
+        self._near_geoms[: len(geoms)] = geoms
+        self._geom_count[0] = len(geoms)
+        self._launch(self._meeting, n)
+        hits = np.flatnonzero(self._hit_geom[: n * SLOTS] >= 0)
+        dropped = int(self._missed[:n].sum())
+        if len(hits) > self.capacity:
+            dropped += len(hits) - self.capacity
+            deepest = np.argsort(self._hit_gap[hits], kind="stable")[: self.capacity]
+            hits = np.sort(hits[deepest])
+        if dropped:
+            self.dropped += dropped
+            self.complaint = (
+                f"{dropped} of {len(hits) + dropped} contacts of one tick were left out, the shallowest; "
+                f"room is for {self.capacity}, and for {SLOTS} at one shape: raise Touching's capacity"
+            )
+        self.count = len(hits)
+        self._hits[: len(hits)] = hits
+        self._contact_shape[: len(hits)] = near[hits // SLOTS]
+
+    # ------------------------------------------------------------------ with what force
+
+    def _press(self) -> None:
+        """Impulses of all contacts at once, and what they do to either side."""
+        n, rows = self.count, 3 * self.count
+        shape = self._contact_shape[:n]
+        body = self._contact_body[:n] = self.shapes.body[shape]
+        bodies, slot = np.unique(body, return_inverse=True)
+        self._contact_column[:n] = 6 * slot
+        columns = 6 * len(bodies)
+        plant_rows, rigid_rows = self._plant_rows[:rows, :columns], self._rigid_rows[:rows]
+        plant_rows[:] = 0.0
+        rigid_rows[:] = 0.0
+        self._dof_free[:] = self.rigid.velocity_free
+        self._launch(self._coupling, n)
+
+        response = self.plants.response(bodies).reshape(columns, columns).astype(float)
+        A = self._A[:rows, :rows]
+        A[:] = plant_rows @ response @ plant_rows.T + rigid_rows @ self.rigid.inverse(rigid_rows)
+        self._launch(self._relaxing, self._part(n))
+        self.sweeps = int(self._sweeps.max())
+
+        impulse = self._impulse[:rows]
+        self._known_count[0] = n
+        self._launch(self._remembering, n)
+        self.bodies = bodies
+        self.wrenches = (impulse @ plant_rows / self.dt).reshape(-1, 6)
+        self.force = impulse @ rigid_rows / -self.dt
+        self._values = None
+
+    def _part(self, n: int) -> int:
+        """Split the contacts into islands that share no body; returns how many there are."""
+        self._sweeps[:] = 0
+        if n <= ISLANDS:
+            self._island_first[1] = n
+            self._island_member[:n] = np.arange(n)
+            return 1
+        tree = self.model.body_tree[self._contact_body[:n]]
+        thing = self.rigid.group[self._geoms.id[self._hit_geom[self._hits[:n]]]]
+        label: dict[int, int] = {}
+
+        def root(x: int) -> int:
+            while label.setdefault(x, x) != x:
+                x = label[x]
+            return x
+
+        for t, r in sorted(set(zip(tree.tolist(), thing.tolist(), strict=True))):
+            a, b = sorted((root(t), root(-1 - r)))
+            label[b] = a
+        of_contact = np.array([root(t) for t in tree.tolist()])
+        _, member = np.unique(of_contact, return_inverse=True)
+        self._island_member[:n] = np.argsort(member, kind="stable")
+        ends = np.cumsum(np.bincount(member))
+        self._island_first[1 : 1 + len(ends)] = ends
+        return len(ends)
+
+    # ------------------------------------------------------------------ memory and launches
+
+    @staticmethod
+    def _launch(command: wp.Launch, threads: int) -> None:
+        if threads:
+            command.set_dim(threads)
+            command.launch()
+
+    def _allocate(self) -> None:
+        """Everything whose size does not depend on who is here."""
+        n, trees, shapes = self.capacity, len(self.model.tree_first), len(self.shapes.body)
+        self._trees = np.zeros(trees, np.int32)
+        self._tree_low, self._tree_high = np.zeros((3, trees), np.float32), np.zeros((3, trees), np.float32)
+        self._start, self._end = np.zeros((shapes, 3), np.float32), np.zeros((shapes, 3), np.float32)
+        self._shape_speed = np.zeros(shapes, np.float32)
+        for name in ("hits", "contact_shape", "contact_body", "contact_column", "geom", "known_shape", "known_geom"):
+            setattr(self, "_" + name, np.zeros(n, np.int32))
+        for name in ("gap", "known_push"):
+            setattr(self, "_" + name, np.zeros(n))
+        for name in ("point", "known_rub", "known_anchor", "force"):
+            setattr(self, "_" + name, np.zeros((n, 3)))
+        for name in ("free", "offset", "impulse"):
+            setattr(self, "_" + name, np.zeros(3 * n))
+        self._axes = np.zeros((n, 3, 3))
+        self._plant_rows, self._A = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3 * n))
+        self._island_first, self._island_member = np.zeros(n + 1, np.int32), np.zeros(n, np.int32)
+        self._sweeps = np.zeros(n, np.int32)
+        self._known_count, self._geom_count = np.zeros(1, np.int32), np.zeros(1, np.int32)
+        self._values = ()
+        self._room = 0
+        self._geoms = None
+
+    def _make_room(self, shapes: int) -> None:
+        """Room for the hits of so many plant shapes near something rigid."""
+        self._room = shapes
+        self._near_shapes, self._missed = np.zeros(shapes, np.int32), np.zeros(shapes, np.int32)
+        self._hit_geom, self._hit_gap = np.zeros(shapes * SLOTS, np.int32), np.zeros(shapes * SLOTS)
+        self._hit_normal, self._hit_point = np.zeros((shapes * SLOTS, 3)), np.zeros((shapes * SLOTS, 3))
+        self._record()
+
+    def _renew(self) -> None:
+        """Take over the rigid world after an actor came or went; contacts remember by the names of the geoms."""
+        old, self._geoms = self._geoms, self.rigid.geoms
+        g, d = self._geoms, self.rigid.data
+        self._generation = self.rigid.generation
+        names = _names(g)
+        if old is not None:
+            at = {name: i for i, name in enumerate(names)}
+            for k, name in enumerate(_names(old)[i] for i in self._known_geom[: self._known_count[0]]):
+                self._known_geom[k] = at.get(name, -1)
+        count = len(g.id)
+        self._geom_middle, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
+        self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+        self._near_geoms = np.zeros(count, np.int32)
+        self._rigid_rows = np.zeros((3 * self.capacity, self.rigid.world.nv))
+        self._dof_free = np.zeros(self.rigid.world.nv)
+        self._dof_parent = self.rigid.world.dof_parentid
+        self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
+        first = [i for i in range(count) if i == 0 or g.actor[i] != g.actor[i - 1]]
+        self._actor_first, self._actor_end = first, [*first[1:], count]
+        self._actor_lies = [g.actor[i].startswith("box/") for i in first]
+        self._make_room(max(self._room, 256))
+
+    def _record(self) -> None:
+        """Bind every kernel to its arrays once: a recorded launch costs a fifth of a plain one."""
+        s, g, state, mj = self.shapes, self._geoms, self.plants.state, self._mujoco
+
+        def shared(data: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(data, dtype=dtype, device="cpu", copy=False)
+
+        def record(kernel: wp.Kernel, inputs: list, outputs: list) -> wp.Launch:
+            return wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
+
+        def ints(*names: str) -> list[wp.array]:
+            return [shared(getattr(self, "_" + name), wp.int32) for name in names]
+
+        def doubles(*names: str) -> list[wp.array]:
+            return [shared(getattr(self, "_" + name), wp.float64) for name in names]
+
+        def vectors(*names: str) -> list[wp.array]:
+            return [shared(getattr(self, "_" + name), wp.vec3d) for name in names]
+
+        g_id, g_body, g_root = (shared(x, wp.int32) for x in (g.id, g.body, g.root))
+        g_kind, g_dof = shared(g.kind, wp.int32), shared(g.dof, wp.int32)
+        g_center, g_half, g_size = (shared(x, wp.vec3d) for x in (g.center, g.half, g.size))
+        g_radius, g_friction = shared(g.radius, wp.float64), shared(g.friction, wp.float64)
+        s_tree, s_body, s_bunch = (shared(x, wp.int32) for x in (s.tree, s.body, s.bunch))
+        s_radius, s_speed = shared(s.radius, float), shared(self._shape_speed, float)
+        s_at = [shared(x, wp.vec3) for x in (self._start, self._end)]
+        xpos, com = shared(mj["xpos"], wp.vec3d), shared(mj["com"], wp.vec3d)
+        xmat = shared(mj["xmat"].reshape(-1, 3, 3), wp.mat33d)
+        cvel, cdof = shared(mj["cvel"], wp.float64), shared(mj["cdof"], wp.float64)
+        body_q, body_qd = shared(state.body_q, wp.transform), shared(state.body_qd, wp.spatial_vector)
+        body_qd_free = shared(self.plants.velocity_free, wp.spatial_vector)
+        dt, k, c = self.dt, self.stiffness, self.damping
+        softness = 1.0 / (dt * (k * dt + c))
+
+        self._bound_geoms = record(
+            kernels.bound_geoms,
+            [dt, g_id, g_body, g_root, g_center, g_half, xpos, xmat, cvel, com],
+            [*vectors("geom_middle"), *doubles("geom_speed"), shared(self._geom_low, wp.vec3),
+             shared(self._geom_high, wp.vec3)],
+        )  # fmt: skip
+        self._bound_trees = record(
+            kernels.bound_trees,
+            [dt, s_tree, s_body, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius, *ints("trees"), body_q,
+             body_qd],
+            [*s_at, s_speed, shared(self._tree_low, float), shared(self._tree_high, float)],
+        )  # fmt: skip
+        self._meeting = record(
+            kernels.meet,
+            [dt, SLOTS, s_bunch, s_radius, g_id, g_kind, g_size, g_center, g_radius,
+             shared(state.bunch_attached, wp.bool), *ints("near_shapes", "near_geoms", "geom_count"), *s_at, s_speed,
+             xpos, xmat, *vectors("geom_middle"), *doubles("geom_speed")],
+            [*ints("hit_geom"), *doubles("hit_gap"), *vectors("hit_normal", "hit_point"), *ints("missed")],
+        )  # fmt: skip
+        known = [*ints("known_shape", "known_geom"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
+        axes = shared(self._axes, wp.mat33d)
+        self._coupling = record(
+            kernels.couple,
+            [dt, k, c, g_dof, g_root, shared(self._dof_parent, wp.int32), *ints("hits", "hit_geom"),
+             *doubles("hit_gap"), *vectors("hit_normal", "hit_point"),
+             *ints("contact_shape", "contact_body", "contact_column"), body_q, body_qd_free, *doubles("dof_free"), cdof,
+             com, *ints("known_count"), *known],
+            [*ints("geom"), *doubles("gap"), *vectors("point"), axes,
+             *doubles("plant_rows", "rigid_rows", "free", "offset", "impulse")],
+        )  # fmt: skip
+        self._relaxing = record(
+            kernels.relax,
+            [softness, SWEEPS, TOLERANCE, g_friction, *ints("island_first", "island_member", "geom"),
+             *doubles("A", "free", "offset")],
+            [*doubles("impulse"), *ints("sweeps")],
+        )  # fmt: skip
+        self._remembering = record(
+            kernels.remember,
+            [dt, k, c, *ints("known_count", "contact_shape", "geom"), axes, *doubles("A", "free", "impulse")],
+            [*vectors("force"), *known],
+        )  # fmt: skip
+
+
+def _names(geoms) -> list[tuple[str, str, int]]:
+    """A name for each geom that outlives recompilation: actor, link and its number on that link."""
+    seen: dict[tuple[str, str], int] = {}
+    names = []
+    for actor, link in zip(geoms.actor, geoms.link, strict=True):
+        number = seen[actor, link] = seen.get((actor, link), -1) + 1
+        names.append((actor, link, number))
+    return names
