@@ -78,5 +78,5 @@ def listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.ndarra
 
 
 def full_rate(distance: float, now: bool) -> bool:
-    """Whether an actor at ``distance`` [m] is heard at the full rate, given whether it is ``now``: 12 m in, 14 m out."""
+    """Whether an actor at ``distance`` [m] is heard at the full rate, given whether it is so ``now``: hysteresis."""
     return distance <= (ACTOR_LEAVE if now else ACTOR_NEAR)

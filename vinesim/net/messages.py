@@ -64,7 +64,7 @@ class MessageError(ValueError):
     """A message that must not be believed; the text says why."""
 
 
-class WrongVersion(MessageError):
+class WrongVersion(MessageError):  # noqa: N818
     """A message of another protocol version; ``theirs`` is its number."""
 
     def __init__(self, theirs: int) -> None:

@@ -36,7 +36,7 @@ def spin(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     a, b, c = 0.5 * omega[..., 0], 0.5 * omega[..., 1], 0.5 * omega[..., 2]
-    rate = np.empty(np.broadcast_shapes(q.shape[:-1], omega.shape[:-1]) + (4,), np.result_type(q, omega))
+    rate = np.empty((*np.broadcast_shapes(q.shape[:-1], omega.shape[:-1]), 4), np.result_type(q, omega))
     rate[..., 0] = a * w + b * z - c * y
     rate[..., 1] = b * w + c * x - a * z
     rate[..., 2] = c * w + a * y - b * x
