@@ -126,7 +126,6 @@ class Store:
 
     def __init__(self) -> None:
         self._samples: collections.deque[tuple[int, str, bytes]] = collections.deque()
-        self._count = 0
         self.overflowed = 0
 
     def put(self, depth: int, key: str, payload: bytes) -> None:
@@ -187,7 +186,7 @@ class MemoryHub:
         self._seen[name] = {name}
         for other in sorted(self._members):
             self._seen[name].add(other)
-            self.later(functools.partial(self._notice, other, name, True))
+            self.later(functools.partial(self._notice, other, name, True), ("live", other))
         self._members[name] = bus
         return bus
 
@@ -248,7 +247,7 @@ class MemoryHub:
         self._members.pop(name, None)
         self._seen.pop(name, None)
         for other in sorted(self._members):
-            self.later(functools.partial(self._notice, other, name, False))
+            self.later(functools.partial(self._notice, other, name, False), ("live", other))
 
     def _notice(self, observer: str, name: str, there: bool) -> None:
         if observer in self._seen:

@@ -12,6 +12,8 @@ to the bit uses :func:`quantised` of what it sends.
 from __future__ import annotations
 
 import dataclasses
+import math
+import struct
 from typing import Any
 
 import msgspec
@@ -50,7 +52,7 @@ MAX_JOINTS = 256
 MAX_TREES = 4096
 MAX_BODIES = 1 << 16
 
-_HEAD = np.dtype([("magic", "S2"), ("version", "u1"), ("kind", "u1"), ("count", "<u2"), ("time", "<f8")])
+_HEAD = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
 _BASE = np.dtype([("position", "<f4", 3), ("turn", "<i2", 3), ("velocity", "<i2", 6)])
 _JOINT = np.dtype([("position", "<f4"), ("velocity", "<i2")])
 _TREE = np.dtype(
@@ -128,13 +130,6 @@ class Trees:
             for tree, ownership, authority, flags, start, end in rows
         ]  # fmt: skip
 
-    def __getitem__(self, part: slice) -> Trees:
-        """The trees of a slice."""
-        first = int(self.bodies[: part.start or 0].sum())
-        body = slice(first, first + int(self.bodies[part].sum()))
-        kept = (self.tree, self.ownership, self.authority, self.flags, self.bodies)
-        return Trees(self.time, *(column[part] for column in kept), self.joint_q[body], self.joint_qd[body])
-
 
 # ---------------------------------------------------------------- rotations
 
@@ -161,9 +156,9 @@ def quaternion(v: np.ndarray) -> np.ndarray:
 
 
 def _head(kind: int, count: int, time: float) -> bytes:
-    if not np.isfinite(time):
+    if not math.isfinite(time):
         raise MessageError(f"time {time} is not finite")
-    return np.array((MAGIC, PROTOCOL, kind, count, time), _HEAD).tobytes()
+    return _HEAD.pack(MAGIC, PROTOCOL, kind, count, time)
 
 
 def kind_of(payload: bytes) -> int:
@@ -183,13 +178,12 @@ def _open(payload: bytes, kind: int, name: str) -> tuple[int, float]:
     """Count and time of a numpy message of the given kind."""
     if (found := kind_of(payload)) != kind:
         raise MessageError(f"message of kind {found} where {name} (kind {kind}) was expected")
-    if len(payload) < _HEAD.itemsize:
+    if len(payload) < _HEAD.size:
         raise MessageError(f"{name} of {len(payload)} B is cut off in its header")
-    head = np.frombuffer(payload, _HEAD, 1)[0]
-    time = float(head["time"])
-    if not np.isfinite(time):
+    _, _, _, count, time = _HEAD.unpack_from(payload)
+    if not math.isfinite(time):
         raise MessageError(f"{name} with time {time}")
-    return int(head["count"]), time
+    return count, time
 
 
 def _pack(kind: int, value: Any) -> bytes:
@@ -241,13 +235,13 @@ def encode_robot(update: RobotUpdate) -> bytes:
 def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     """The pose that ``actor`` (known from the key, never from the payload) sent."""
     count, time = _open(payload, ROBOT, "actor pose")
-    expected = _HEAD.itemsize + _BASE.itemsize + count * _JOINT.itemsize
+    expected = _HEAD.size + _BASE.itemsize + count * _JOINT.itemsize
     if count > MAX_JOINTS or len(payload) != expected:
         raise MessageError(
             f"actor pose with {count} joints (at most {MAX_JOINTS}) in {len(payload)} B, expected {expected} B"
         )
-    base = np.frombuffer(payload, _BASE, 1, _HEAD.itemsize)[0]
-    joints = np.frombuffer(payload, _JOINT, count, _HEAD.itemsize + _BASE.itemsize)
+    base = np.frombuffer(payload, _BASE, 1, _HEAD.size)[0]
+    joints = np.frombuffer(payload, _JOINT, count, _HEAD.size + _BASE.itemsize)
     where, position = base["position"].astype(np.float64), joints["position"].astype(np.float64)
     if not (np.isfinite(where).all() and np.isfinite(position).all()) or max(np.abs(where).max(), 0.0) > 1e9:
         raise MessageError("actor pose that is not finite")
@@ -298,44 +292,49 @@ def quantised(joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, np
     return _restore(bodies, records, scale)
 
 
-def encode_trees(trees: Trees) -> list[tuple[bytes, Trees]]:
-    """Messages of at most 1.1 kB where single trees allow it, each with what its receivers will decode."""
+def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
+    """Messages of at most 1.1 kB where single trees allow it, and what their receivers will decode, taken together."""
     ids = trees.tree
     if not len(ids) or (len(ids) > 1 and not (ids[1:] > ids[:-1]).all()):
         raise MessageError("trees of a batch must be at least one, in strictly increasing order")
-    if trees.bodies.min() < 1 or trees.bodies.sum() != len(trees.joint_q) or len(trees.joint_q) != len(trees.joint_qd):
-        raise MessageError(f"{trees.bodies.sum()} bodies declared, {len(trees.joint_q)} given")
+    sizes = trees.bodies.tolist()
+    if min(sizes) < 1 or sum(sizes) != len(trees.joint_q) or len(trees.joint_q) != len(trees.joint_qd):
+        raise MessageError(
+            f"{sum(sizes)} bodies declared, {len(trees.joint_q)} rotations and {len(trees.joint_qd)} rates"
+        )
     records, scale = _quantise(trees.bodies, trees.joint_q, trees.joint_qd)
     joint_q, joint_qd = _restore(trees.bodies, records, scale)
     heads = np.empty(len(ids), _TREE)
     for name in ("tree", "ownership", "authority", "flags", "bodies"):
         heads[name] = getattr(trees, name)
     heads["scale"] = scale
-    heard = dataclasses.replace(trees, joint_q=joint_q, joint_qd=joint_qd)
 
-    messages, start, body = [], 0, 0
-    sizes = trees.bodies.tolist()
+    payloads, start, body = [], 0, 0
+    head_bytes, body_bytes = heads.tobytes(), records.tobytes()
     while start < len(sizes):
-        end, last, room = start, body, SAMPLE - _HEAD.itemsize
+        end, last, room = start, body, SAMPLE - _HEAD.size
         while end < len(sizes):
             room -= _TREE.itemsize + sizes[end] * _BODY.itemsize
             if room < 0 and end > start:
                 break
             last += sizes[end]
             end += 1
-        payload = _head(TREES, end - start, trees.time) + heads[start:end].tobytes() + records[body:last].tobytes()
-        messages.append((payload, heard if (start, end) == (0, len(sizes)) else heard[start:end]))
+        payloads.append(
+            _head(TREES, end - start, trees.time)
+            + head_bytes[start * _TREE.itemsize : end * _TREE.itemsize]
+            + body_bytes[body * _BODY.itemsize : last * _BODY.itemsize]
+        )
         start, body = end, last
-    return messages
+    return payloads, dataclasses.replace(trees, joint_q=joint_q, joint_qd=joint_qd)
 
 
 def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
     """Records of trees; with ``tree_size`` [tree] of the model, ids and body counts are held against it."""
     count, time = _open(payload, TREES, "trees")
-    at = _HEAD.itemsize + count * _TREE.itemsize
+    at = _HEAD.size + count * _TREE.itemsize
     if not 1 <= count <= MAX_TREES or len(payload) < at:
         raise MessageError(f"{count} trees announced (1 to {MAX_TREES}) in {len(payload)} B")
-    heads = np.frombuffer(payload, _TREE, count, _HEAD.itemsize)
+    heads = np.frombuffer(payload, _TREE, count, _HEAD.size)
     tree, bodies = heads["tree"].astype(np.int64), heads["bodies"].astype(np.int64)
     total = int(bodies.sum())
     if len(payload) != at + total * _BODY.itemsize or bodies.min() < 1 or total > MAX_BODIES:
