@@ -582,7 +582,6 @@ class Exchange:
         if not due.any():
             return
 
-        sent: list[TreeUpdate] = []
         by_cell: dict[Cell, list[int]] = {}
         for row in np.flatnonzero(due).tolist():
             by_cell.setdefault(self._cells[active[row]], []).append(row)

@@ -19,7 +19,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from vinesim.net import smooth
 from vinesim.net.authority import Claim
 from vinesim.world.values import RobotUpdate, TreeUpdate
 
@@ -53,8 +52,7 @@ MAX_TREES = 4096
 MAX_BODIES = 1 << 16
 
 _HEAD = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
-_BASE = np.dtype([("position", "<f4", 3), ("turn", "<i2", 3), ("velocity", "<i2", 6)])
-_JOINT = np.dtype([("position", "<f4"), ("velocity", "<i2")])
+_BASE = struct.Struct("<3f3h6h")  # position, turn, velocity; then all joint positions f4, all joint velocities i2
 _TREE = np.dtype(
     [("tree", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("bodies", "<u2"), ("scale", "<u2")]
 )
@@ -137,18 +135,16 @@ class Trees:
 def rotation_vector(q: np.ndarray) -> np.ndarray:
     """Unit quaternions [..., 4] to rotation vectors [..., 3] rad, the short way round; lean, for the tick."""
     v, w = q[..., :3], q[..., 3]
-    sine = np.sqrt(np.einsum("...i,...i->...", v, v))
-    factor = 2.0 * np.arctan2(sine, np.abs(w)) / np.maximum(sine, 1e-12)
-    factor = np.where(sine > 1e-9, factor, 2.0)
-    return v * np.where(w < 0.0, -factor, factor)[..., None]
+    sine = np.maximum(np.sqrt(np.einsum("...i,...i->...", v, v)), 1e-12)
+    return v * np.copysign(2.0 * np.arctan2(sine, np.abs(w)) / sine, w)[..., None]
 
 
 def quaternion(v: np.ndarray) -> np.ndarray:
     """Rotation vectors [..., 3] rad to unit quaternions [..., 4]; lean, for the tick."""
-    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", v, v))
+    half = np.maximum(0.5 * np.sqrt(np.einsum("...i,...i->...", v, v)), 1e-12)
     q = np.empty((*v.shape[:-1], 4), v.dtype)
-    q[..., :3] = v * (0.5 * np.sinc(half / np.pi))[..., None]
-    q[..., 3] = np.cos(half)
+    np.multiply(v, (0.5 * np.sin(half) / half)[..., None], out=q[..., :3])
+    np.cos(half, out=q[..., 3])
     return q
 
 
@@ -207,48 +203,51 @@ _time_decoder = msgspec.msgpack.Decoder(tuple[float, float])
 # ---------------------------------------------------------------- actors
 
 
-def _whole(value: np.ndarray, unit: float) -> np.ndarray:
-    return np.clip(np.rint(value / unit), -32767, 32767)
+def _steps(values: list[float], unit: float) -> list[int]:
+    """Values in whole units, clipped to i16."""
+    return [min(max(round(value / unit), -32767), 32767) for value in values]
 
 
 def encode_robot(update: RobotUpdate) -> bytes:
     """An actor's pose: 44 bytes and 6 a joint. Velocities beyond 32.7 m/s or rad/s are clipped."""
-    count = len(update.position)
-    if count > MAX_JOINTS or len(update.velocity) != count:
+    pose, twist = update.base_q.tolist(), update.base_qd.tolist()
+    position, velocity = update.position.tolist(), update.velocity.tolist()
+    count = len(position)
+    if count > MAX_JOINTS or len(velocity) != count or len(pose) != 7 or len(twist) != 6:
         raise MessageError(
-            f"{count} joint positions and {len(update.velocity)} velocities; equal, at most {MAX_JOINTS}"
+            f"{update.actor!r}: pose of {len(pose)} numbers (7), velocity of {len(twist)} (6), {count} joint positions "
+            f"and {len(velocity)} velocities (equal, at most {MAX_JOINTS})"
         )
-    numbers = np.concatenate([update.base_q, update.base_qd, update.position, update.velocity]).astype(np.float64)
-    if len(numbers) != 13 + 2 * count or not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e9:
-        raise MessageError(f"state of {update.actor!r} is not 7 + 6 finite numbers and {count} finite joints")
-    if not 0.9 < float(numbers[3:7] @ numbers[3:7]) < 1.1:
-        raise MessageError(f"orientation {numbers[3:7].tolist()} of {update.actor!r} is no unit quaternion")
-    base, joints = np.empty(1, _BASE), np.empty(count, _JOINT)
-    base["position"] = numbers[:3]
-    base["turn"] = _whole(rotation_vector(smooth.unit(numbers[3:7])), TURN)
-    base["velocity"] = _whole(numbers[7:13], VELOCITY)
-    joints["position"] = numbers[13 : 13 + count]
-    joints["velocity"] = _whole(numbers[13 + count :], VELOCITY)
-    return _head(ROBOT, count, update.time) + base.tobytes() + joints.tobytes()
+    if not all(-1e9 < number < 1e9 for number in (*pose, *twist, *position, *velocity)):
+        raise MessageError(f"state of {update.actor!r} has a number that is not finite or beyond 1e9")
+    x, y, z, w = pose[3:]
+    sine = math.hypot(x, y, z)
+    if not 0.95 < math.hypot(sine, w) < 1.05:
+        raise MessageError(f"orientation {pose[3:]} of {update.actor!r} is no unit quaternion")
+    factor = math.copysign(2.0 * math.atan2(sine, abs(w)) / sine, w) if sine > 1e-12 else 0.0
+    return (
+        _head(ROBOT, count, update.time)
+        + _BASE.pack(*pose[:3], *_steps([x * factor, y * factor, z * factor], TURN), *_steps(twist, VELOCITY))
+        + struct.pack(f"<{count}f{count}h", *position, *_steps(velocity, VELOCITY))
+    )
 
 
 def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     """The pose that ``actor`` (known from the key, never from the payload) sent."""
     count, time = _open(payload, ROBOT, "actor pose")
-    expected = _HEAD.size + _BASE.itemsize + count * _JOINT.itemsize
+    expected = _HEAD.size + _BASE.size + 6 * count
     if count > MAX_JOINTS or len(payload) != expected:
         raise MessageError(
-            f"actor pose with {count} joints (at most {MAX_JOINTS}) in {len(payload)} B, expected {expected} B"
+            f"actor pose with {count} joints (at most {MAX_JOINTS}) in {len(payload)} B, not {expected} B"
         )
-    base = np.frombuffer(payload, _BASE, 1, _HEAD.size)[0]
-    joints = np.frombuffer(payload, _JOINT, count, _HEAD.size + _BASE.itemsize)
-    where, position = base["position"].astype(np.float64), joints["position"].astype(np.float64)
-    if not (np.isfinite(where).all() and np.isfinite(position).all()) or max(np.abs(where).max(), 0.0) > 1e9:
-        raise MessageError("actor pose that is not finite")
-    turn = _checked_turn(base["turn"] * TURN, "actor pose")
+    base = _BASE.unpack_from(payload, _HEAD.size)
+    joints = struct.unpack_from(f"<{count}f{count}h", payload, _HEAD.size + _BASE.size)
+    if not all(-1e9 < number < 1e9 for number in (*base[:3], *joints[:count])):
+        raise MessageError("actor pose with a number that is not finite or beyond 1e9")
+    turn = _checked_turn(np.array(base[3:6]) * TURN, "actor pose")
     return RobotUpdate(
-        actor, time, np.concatenate([where, quaternion(turn)]), base["velocity"] * VELOCITY, position,
-        joints["velocity"] * VELOCITY,
+        actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:]) * VELOCITY,
+        np.array(joints[:count], float), np.array(joints[count:], float) * VELOCITY,
     )  # fmt: skip
 
 
@@ -262,24 +261,20 @@ def _checked_turn(turn: np.ndarray, name: str) -> np.ndarray:
 # ---------------------------------------------------------------- trees
 
 
-def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Body records [sum of bodies] and scales of rates [k] of the given joints."""
+def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Whole steps of turn [n, 3] and of rate [n, 3] as floats, scales of rates [k], and the unit of rate [n, 1]."""
     if not (np.isfinite(joint_q).all() and np.isfinite(joint_qd).all()):
         raise MessageError("joint state of a tree is not finite")
-    starts = np.cumsum(bodies) - bodies
-    fastest = np.maximum.reduceat(np.abs(joint_qd).max(axis=1), starts)
-    scale = np.minimum(np.ceil(fastest / (127.0 * RATE)), 65535.0).astype(np.uint16)
-    step = np.repeat(np.maximum(scale, 1) * RATE, bodies)[:, None]
-    records = np.empty(len(joint_q), _BODY)
-    records["turn"] = np.rint(rotation_vector(joint_q) * (1.0 / TURN))
-    records["rate"] = np.clip(np.rint(joint_qd / step), -127, 127)
-    return records, scale
+    fastest = np.maximum.reduceat(np.abs(joint_qd).max(axis=1), np.cumsum(bodies) - bodies)
+    scale = np.minimum(np.ceil(fastest / (127.0 * RATE)), 65535.0)
+    unit = _unit(bodies, scale)
+    turn = np.rint(rotation_vector(joint_q) / TURN) + 0.0  # an integer has no negative zero
+    rate = np.minimum(np.maximum(np.rint(joint_qd / np.maximum(unit, RATE)), -127.0), 127.0) + 0.0
+    return turn, rate, scale, unit
 
 
-def _restore(bodies: np.ndarray, records: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joint rotations and rates of body records: the inverse of :func:`_quantise`."""
-    step = np.repeat(scale * RATE, bodies)[:, None]
-    return quaternion(_checked_turn(records["turn"] * TURN, "tree")), records["rate"] * step
+def _unit(bodies: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    return np.repeat(scale * RATE, bodies)[:, None]
 
 
 def quantised(joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -287,9 +282,8 @@ def quantised(joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, np
 
     Rotations are off by at most 0.005 degrees; rates by 0.4 % of the fastest joint (beyond 83 rad/s they are clipped).
     """
-    bodies = np.array([len(joint_q)])
-    records, scale = _quantise(bodies, np.asarray(joint_q), np.asarray(joint_qd))
-    return _restore(bodies, records, scale)
+    turn, rate, _, unit = _quantise(np.array([len(joint_q)]), np.asarray(joint_q, float), np.asarray(joint_qd, float))
+    return quaternion(turn * TURN), rate * unit
 
 
 def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
@@ -302,8 +296,9 @@ def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
         raise MessageError(
             f"{sum(sizes)} bodies declared, {len(trees.joint_q)} rotations and {len(trees.joint_qd)} rates"
         )
-    records, scale = _quantise(trees.bodies, trees.joint_q, trees.joint_qd)
-    joint_q, joint_qd = _restore(trees.bodies, records, scale)
+    turn, rate, scale, unit = _quantise(trees.bodies, trees.joint_q, trees.joint_qd)
+    records = np.empty(len(turn), _BODY)
+    records["turn"], records["rate"] = turn, rate
     heads = np.empty(len(ids), _TREE)
     for name in ("tree", "ownership", "authority", "flags", "bodies"):
         heads[name] = getattr(trees, name)
@@ -325,7 +320,7 @@ def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
             + body_bytes[body * _BODY.itemsize : last * _BODY.itemsize]
         )
         start, body = end, last
-    return payloads, dataclasses.replace(trees, joint_q=joint_q, joint_qd=joint_qd)
+    return payloads, dataclasses.replace(trees, joint_q=quaternion(turn * TURN), joint_qd=rate * unit)
 
 
 def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
@@ -349,7 +344,9 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
             raise MessageError(
                 f"tree {tree[wrong]} with {bodies[wrong]} bodies, this vineyard's has {tree_size[tree[wrong]]}"
             )
-    joint_q, joint_qd = _restore(bodies, np.frombuffer(payload, _BODY, total, at), heads["scale"])
+    records = np.frombuffer(payload, _BODY, total, at)
+    joint_q = quaternion(_checked_turn(records["turn"] * TURN, "tree"))
+    joint_qd = records["rate"] * _unit(bodies, heads["scale"])
     return Trees(time, tree, heads["ownership"], heads["authority"], heads["flags"], bodies, joint_q, joint_qd)
 
 
