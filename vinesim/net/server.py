@@ -9,14 +9,13 @@ import logging
 import socket
 import threading
 import time
-import weakref
 from typing import Self
 
 import zenoh
 
 from vinesim.net import messages
 from vinesim.net.bus import BusError
-from vinesim.net.zenoh_bus import ROOT, config
+from vinesim.net.zenoh_bus import ROOT, close_session, config, open_session
 
 log = logging.getLogger(__name__)
 
@@ -54,13 +53,12 @@ class Server:
         self._lock = threading.Lock()
         self._stop = threading.Event()
         try:
-            self._session = zenoh.open(
+            self._session = open_session(
                 config("router", listen__endpoints=[self.endpoint], listen__exit_on_failure=True)
             )
         except zenoh.ZError as error:
             reason = "address already in use" if "in use" in str(error) else str(error).split(" at /")[0]
             raise PortTaken(self.endpoint, reason) from error
-        self._finalizer = weakref.finalize(self, _close, self._session)
         self._declared = (
             self._session.liveliness().declare_subscriber(f"{ROOT}/*/live/*/*", self._notice, history=True),
             self._session.declare_queryable(f"{ROOT}/*/clock", self._clock),
@@ -84,7 +82,7 @@ class Server:
     def close(self) -> None:
         """Stop carrying messages; the second time nothing happens."""
         self.stop()
-        self._finalizer()
+        close_session(self._session)
 
     def __enter__(self) -> Self:
         return self
@@ -127,8 +125,3 @@ def _chosen(listen: str) -> str:
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.bind((host.strip("[]"), 0))
         return f"tcp/{host}:{probe.getsockname()[1]}"
-
-
-def _close(session: zenoh.Session) -> None:
-    if not session.is_closed():
-        session.close()

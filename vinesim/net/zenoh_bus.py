@@ -13,7 +13,6 @@ import logging
 import queue
 import threading
 import time
-import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
@@ -69,6 +68,37 @@ def config(mode: str, **settings: Any) -> zenoh.Config:
     for key, value in {**common, **settings}.items():
         made.insert_json5(key.replace("__", "/"), json.dumps(value))
     return made
+
+
+_open_sessions: set[zenoh.Session] = set()
+_guard: list[threading.Thread] = []
+
+
+def open_session(settings: zenoh.Config) -> zenoh.Session:
+    """A session that is closed at the latest when the main thread ends.
+
+    Zenoh runs Python callbacks in threads for which the interpreter waits before it exits, so a forgotten session
+    would hang for ever.
+    """
+    session = zenoh.open(settings)
+    _open_sessions.add(session)
+    if not _guard:
+        _guard.append(threading.Thread(target=_close_all, name="closes forgotten sessions"))
+        _guard[0].start()
+    return session
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Close a session; the second time nothing happens."""
+    _open_sessions.discard(session)
+    if not session.is_closed():
+        session.close()
+
+
+def _close_all() -> None:
+    threading.main_thread().join()
+    for session in list(_open_sessions):
+        close_session(session)
 
 
 @contextmanager
@@ -136,7 +166,7 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._connected = True
         with _meant_for_the_user(connect):
-            self._session = zenoh.open(
+            self._session = open_session(
                 config(
                     "client",
                     connect__endpoints=[connect],
@@ -145,8 +175,6 @@ class ZenohBus:
                     connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
                 )
             )
-        # also when nobody closes: the interpreter would wait for Zenoh's threads for ever
-        self._finalizer = weakref.finalize(self, _close, self._session)
         try:
             liveliness = self._session.liveliness()
             self._declared: list[object] = [
@@ -279,21 +307,16 @@ class ZenohBus:
 
     def close(self) -> None:
         work = getattr(self, "_work", None)
-        if work is not None and self._finalizer.alive:
+        if work is not None:
             work.put(None)
             self._worker.join(timeout=PATIENCE)
-        self._finalizer()
+        close_session(self._session)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _close(session: zenoh.Session) -> None:
-    if not session.is_closed():
-        session.close()
 
 
 def _run(work: queue.SimpleQueue) -> None:
