@@ -1,0 +1,82 @@
+"""Who hears what (CANOPIES D6.4 section 5.1): cells, windows of cells, and the exact distance; pure.
+
+The ground is cut into square cells. Whoever owns a moving tree publishes under the cell of that tree, and whoever
+wants to hear subscribes to the 3x3 cells around itself: a publisher without a subscriber sends nothing at all.
+
+A cell is 8 m wide. Smaller cells mean more subscriptions to redo under way (0.4 ms each) and a shorter reach;
+larger ones hear more that is not near. 3x3 cells of 8 m minus 1 m of hysteresis guarantee 7 m on all sides:
+an arm, a bunch and a camera's good range, and two to three vines of a tendone. Inside the window the exact distance
+decides, so the size of a cell never changes what is seen, only what it costs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+CELL = 8.0
+"""Edge of a cell [m]; the same for everybody, it is part of the keys."""
+
+HYSTERESIS = 1.0
+"""A window moves only when its owner is this far [m] outside of the middle cell."""
+
+REACH = CELL - HYSTERESIS
+"""The window covers at least this distance [m] on all sides, wherever its owner stands in it."""
+
+NEAR = 5.0
+"""Default of the setting *near* [m]: nearer than this to a tree one sees it moved by others."""
+
+ACTOR_NEAR = 12.0
+"""Actors nearer than this [m] hear each other's poses at the full rate."""
+
+ACTOR_LEAVE = 14.0
+"""... until they are this far apart [m]."""
+
+Cell = tuple[int, int]
+
+
+def cell(position: np.ndarray) -> Cell:
+    """The cell of a position [2 or 3] m, world axes."""
+    return int(position[0] // CELL), int(position[1] // CELL)
+
+
+def cells(positions: np.ndarray) -> np.ndarray:
+    """Cells [k, 2] int of positions [k, 2 or 3] m."""
+    return np.floor(positions[:, :2] / CELL).astype(np.int64)
+
+
+def window(middle: Cell) -> frozenset[Cell]:
+    """The 3x3 cells around ``middle``."""
+    return frozenset((middle[0] + x, middle[1] + y) for x in (-1, 0, 1) for y in (-1, 0, 1))
+
+
+def moved(middle: Cell | None, position: np.ndarray) -> Cell:
+    """The middle cell of the window of somebody at ``position`` m, until now ``middle``: it clings by 1 m."""
+    if middle is not None:
+        inside = all(
+            CELL * middle[axis] - HYSTERESIS <= position[axis] <= CELL * (middle[axis] + 1) + HYSTERESIS
+            for axis in (0, 1)
+        )
+        if inside:
+            return middle
+    return cell(position)
+
+
+def checked(near: float) -> float:
+    """``near`` [m] if the window can cover it; :class:`ValueError` with the bound otherwise."""
+    if not 0.0 < near <= REACH:
+        raise ValueError(f"near = {near} m: must be above 0 and at most {REACH} m, what 3x3 cells of {CELL} m cover")
+    return float(near)
+
+
+def listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.ndarray:
+    """How many ``actors`` [a, 3] m are within ``near`` m, on the ground plan, of each middle [k, 3] m: [k] int."""
+    if not len(actors) or not len(middles):
+        return np.zeros(len(middles), np.int64)
+    x = middles[:, None, 0] - actors[None, :, 0]
+    y = middles[:, None, 1] - actors[None, :, 1]
+    return np.count_nonzero(x * x + y * y <= near * near, axis=1)
+
+
+def full_rate(distance: float, now: bool) -> bool:
+    """Whether an actor at ``distance`` [m] is heard at the full rate, given whether it is so ``now``: hysteresis."""
+    return distance <= (ACTOR_LEAVE if now else ACTOR_NEAR)

@@ -1,0 +1,75 @@
+"""Dead reckoning and the hiding of corrections: pure functions, the clock is an argument.
+
+Sender and receiver extrapolate with the same :func:`ahead`, so the sender knows how wrong its copies are and stays
+silent while that error is small. Distances in metres, angles in radians, times in seconds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+EXTRAPOLATION = 0.150
+"""Nobody extrapolates further than this [s]; later the copy stands still."""
+
+POSITION_ERROR = 0.005
+"""A record is due when copies are wrong by more than this [m] ..."""
+
+ANGLE_ERROR = float(np.radians(1.0))
+"""... or by more than this [rad] ..."""
+
+HEARTBEAT = 1.0
+"""... or when nothing was said for this long [s] while awake."""
+
+BLEND = 0.100
+"""A correction is spread over this time [s] in what is shown; velocities are taken at once."""
+
+
+def unit(q: np.ndarray) -> np.ndarray:
+    """Quaternions [..., 4] brought back to length one (none of them may be zero)."""
+    return q / np.sqrt(np.einsum("...i,...i->...", q, q))[..., None]
+
+
+def spin(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Time derivative [..., 4] of unit quaternions ``q`` [..., 4] xyzw that turn with ``omega`` [..., 3] rad/s.
+
+    ``omega`` is given in the frame that ``q`` rotates into (world axes for a base, joint-frame axes for a body).
+    """
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    a, b, c = 0.5 * omega[..., 0], 0.5 * omega[..., 1], 0.5 * omega[..., 2]
+    rate = np.empty((*np.broadcast_shapes(q.shape[:-1], omega.shape[:-1]), 4), np.result_type(q, omega))
+    rate[..., 0] = a * w + b * z - c * y
+    rate[..., 1] = b * w + c * x - a * z
+    rate[..., 2] = c * w + a * y - b * x
+    rate[..., 3] = -a * x - b * y - c * z
+    return rate
+
+
+def horizon(age: float | np.ndarray) -> float | np.ndarray:
+    """How far a record of this ``age`` [s] is extrapolated [s]: never back in time, never past the cap."""
+    return np.minimum(np.maximum(age, 0.0), EXTRAPOLATION)
+
+
+def ahead(q: np.ndarray, rate: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
+    """Quaternions [..., 4] after ``dt`` [s] (a number, or one with a trailing axis) at the rate of :func:`spin`.
+
+    First order, normalised: it turns by 2 atan(|omega| dt / 2), within 0.4 degrees of exact at 3 rad/s and 150 ms.
+    """
+    return unit(q + rate * dt)
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle [...] rad between rotations ``a`` and ``b`` [..., 4], exact also when it is tiny."""
+    same, opposite = a - b, a + b
+    chord = np.minimum(np.einsum("...i,...i->...", same, same), np.einsum("...i,...i->...", opposite, opposite))
+    return 4.0 * np.arcsin(np.minimum(0.5 * np.sqrt(chord), 1.0))
+
+
+def due(position_error: np.ndarray, angle_error: np.ndarray, silence: np.ndarray) -> np.ndarray:
+    """Which things must be sent again [k] bool: copies wrong by 5 mm or 1 degree, or silent for a heartbeat."""
+    return (position_error > POSITION_ERROR) | (angle_error > ANGLE_ERROR) | (silence >= HEARTBEAT - 1e-9)
+
+
+def remaining(age: float | np.ndarray) -> float | np.ndarray:
+    """How much of a correction is still hidden ``age`` seconds after it: 1 falling smoothly to 0 over 100 ms."""
+    x = np.clip(np.asarray(age) / BLEND, 0.0, 1.0)
+    return 1.0 - x * x * (3.0 - 2.0 * x)
