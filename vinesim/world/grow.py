@@ -48,7 +48,9 @@ class Tree:
         """Append one body with explicit :class:`Model` fields (names without prefix); returns its number."""
         if not -1 <= parent < len(self.bodies):
             raise ValueError(f"body {len(self.bodies)} names parent {parent}, which does not stand before it")
-        self.bodies.append({"parent": parent, "offset": np.asarray(offset, float), "rest": np.asarray(rest, float), **fields})
+        self.bodies.append(
+            {"parent": parent, "offset": np.asarray(offset, float), "rest": np.asarray(rest, float), **fields}
+        )
         return len(self.bodies) - 1
 
     def rod(
@@ -72,67 +74,102 @@ class Tree:
         root and on a fork, where the neighbour is stiff) doubles the first spring.
         """
         if length <= 0.0 or min(radius) <= 0.0 or pieces < 1 or wood.modulus <= 0.0 or wood.density <= 0.0:
-            raise ValueError(f"rod of length {length} m, radius {radius} m, {pieces} pieces, {wood}: all must be positive")
-        clamped = True if clamped is None else clamped
+            raise ValueError(
+                f"rod of length {length} m, radius {radius} m, {pieces} pieces, {wood}: all must be positive"
+            )
         h = length / pieces
+        edges = radius[0] + (radius[1] - radius[0]) * np.arange(pieces + 1) / pieces
+        first = (np.arange(pieces) == 0) & (clamped is None or clamped)
+        masses, inertias, stiffnesses = section(h, edges[:-1], edges[1:], wood.modulus, wood.density, first, wood.shear)
+        if not first[0]:  # the joint lies between like neighbours: the section of the piece's middle stands for both
+            middle = 0.5 * (edges[0] + edges[1])
+            stiffnesses[0] = section(h, middle, middle, wood.modulus, wood.density, False, wood.shear)[2]
         numbers = []
         for i in range(pieces):
-            start, end = (radius[0] + (radius[1] - radius[0]) * (i + k) / pieces for k in (0, 1))
-            middle = 0.5 * (start + end)
-            mass = wood.density * np.pi * h * (start * start + start * end + end * end) / 3.0
-            # bending at the joint sees the section there; torsion the same
-            area_moment = np.pi * start**4 / 4.0 if i else np.pi * (start if clamped else middle) ** 4 / 4.0
-            k_bend = wood.modulus * area_moment / h * (2.0 if i == 0 and clamped else 1.0)
-            k_twist = (wood.shear or wood.modulus / 2.6) * 2.0 * area_moment / h * (2.0 if i == 0 and clamped else 1.0)
-            stiffness = np.array([k_twist, k_bend, k_bend])
-            across = mass * (h * h / 12.0 + middle * middle / 4.0)
             turn = frames.IDENTITY if bends is None else bends[i]
             if i == 0:
-                at = offset if offset is not None else ((0, 0, 0) if parent < 0 else (self.bodies[parent]["length"], 0, 0))
+                at = (
+                    offset
+                    if offset is not None
+                    else ((0, 0, 0) if parent < 0 else (self.bodies[parent]["length"], 0, 0))
+                )
                 turn = frames.multiply(rest, turn)
             else:
                 at = (h, 0.0, 0.0)
             parent = self.add(
-                parent, offset=at, rest=turn, organ=int(organ), mass=mass, com=(h / 2, 0, 0), length=h, radius=(start, end),
-                inertia=(0.5 * mass * middle * middle, across, across), stiffness=stiffness, damping=wood.damping * stiffness,
+                parent, offset=at, rest=turn, organ=int(organ), mass=masses[i], com=(h / 2, 0, 0), length=h,
+                radius=(edges[i], edges[i + 1]), inertia=inertias[i], stiffness=stiffnesses[i],
+                damping=wood.damping * stiffnesses[i],
             )  # fmt: skip
             numbers.append(parent)
         return numbers
 
     def settle(self) -> None:
-        """Choose rest rotations so that the shape drawn so far is the equilibrium under gravity.
+        """Choose rest rotations so that the shape drawn so far is the equilibrium under gravity: see :func:`settle`."""
+        model = settle(assemble([self]))
+        for body, rest, settled in zip(self.bodies, model.body_rest, model.joint_settled, strict=True):
+            body["rest"], body["settled"] = rest.astype(float), settled.astype(float)
 
-        Until now ``rest`` held the drawn rotation. The spring must carry the weight hanging below each joint, so it is
-        turned by theta = torque / stiffness (in joint axes), and ``settled`` turns it back: drawn = rest * settled.
-        """
-        count = len(self.bodies)
-        world = np.zeros((count, 7))
-        for i, body in enumerate(self.bodies):
-            base = self.pose if body["parent"] < 0 else world[body["parent"]]
-            world[i] = frames.compose(base, np.concatenate([body["offset"], body["rest"]]))
-        force, moment = np.zeros(3 * count).reshape(-1, 3), np.zeros((count, 3))
-        for i in reversed(range(count)):
-            body = self.bodies[i]
-            weight = body["mass"] * GRAVITY
-            moment[i] += np.cross(frames.rotate(world[i, 3:], np.asarray(body["com"], float)), weight)
-            force[i] += weight
-            if body["parent"] >= 0:
-                p = body["parent"]
-                force[p] += force[i]
-                moment[p] += moment[i] + np.cross(world[i, :3] - world[p, :3], force[i])
-        for i, body in enumerate(self.bodies):
-            base = self.pose if body["parent"] < 0 else world[body["parent"]]
-            drawn, settled = body["rest"], frames.IDENTITY
-            for _ in range(30):  # the joint's axes depend on the answer; the map contracts for theta below ~1 rad
-                rest = frames.multiply(drawn, frames.conjugate(settled))
-                axes = frames.multiply(base[3:], rest)
-                theta = frames.rotate(frames.conjugate(axes), moment[i]) / body["stiffness"]
-                settled = frames.exp(theta)
-            body["rest"], body["settled"] = frames.multiply(drawn, frames.conjugate(settled)), settled
+
+def section(
+    length: np.ndarray | float,
+    start: np.ndarray | float,
+    end: np.ndarray | float,
+    modulus: np.ndarray | float,
+    density: float,
+    clamped: np.ndarray | bool,
+    shear: float | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass [...], moments of inertia [..., 3] and joint stiffness [..., 3] of rod pieces with radii start and end [m].
+
+    The joint sits at the start and bends with the section there; ``clamped`` doubles it (half an element to a wall).
+    """
+    length, start, end, modulus = np.broadcast_arrays(length, start, end, modulus)
+    middle = 0.5 * (start + end)
+    mass = density * np.pi * length * (start * start + start * end + end * end) / 3.0
+    across = mass * (length * length / 12.0 + middle * middle / 4.0)
+    inertia = np.stack([0.5 * mass * middle * middle, across, across], -1)
+    area_moment = np.pi * start**4 / 4.0 * np.where(clamped, 2.0, 1.0) / length
+    bend = modulus * area_moment
+    twist = (modulus / 2.6 if shear is None else shear) * 2.0 * area_moment
+    return mass, inertia, np.stack([twist, bend, bend], -1)
+
+
+def settle(model: Model) -> Model:
+    """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is the equilibrium.
+
+    The spring must carry the weight hanging below each joint, so it is turned by theta = torque / stiffness (in joint
+    axes), and ``joint_settled`` turns it back: drawn = rest * settled. Writes both fields and returns the model.
+    """
+    if not (model.joint_stiffness > 0.0).all():
+        body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
+        raise ValueError(
+            f"body {body} has joint stiffness {model.joint_stiffness[body]}; all must be positive to carry weight"
+        )
+    drawn = frames.normalize(model.body_rest.astype(float))
+    world = model.forward(np.broadcast_to(frames.IDENTITY, drawn.shape))
+    depth, parent = model.depth(), model.body_parent
+    force = model.body_mass[:, None].astype(float) * GRAVITY
+    moment = np.cross(frames.rotate(world[:, 3:], model.body_com.astype(float)), force)
+    for level in range(int(depth.max(initial=0)), 0, -1):
+        here = np.flatnonzero(depth == level)
+        above = parent[here]
+        np.add.at(force, above, force[here])
+        np.add.at(moment, above, moment[here] + np.cross(world[here, :3] - world[above, :3], force[here]))
+    settled = np.broadcast_to(frames.IDENTITY, drawn.shape)
+    local = frames.rotate(frames.conjugate(world[:, 3:]), moment)
+    for _ in range(60):  # the joint's axes depend on the answer; the map contracts for theta below ~1 rad
+        before = settled
+        settled = frames.exp(frames.rotate(settled, local) / model.joint_stiffness)
+        if np.abs(settled - before).max(initial=0.0) < 1e-12:
+            break
+    model.body_rest[:] = frames.multiply(drawn, frames.conjugate(settled))
+    model.joint_settled[:] = settled
+    return model
 
 
 def assemble(trees: list[Tree], **others: np.ndarray) -> Model:
-    """One :class:`Model` of all trees; ``others`` are whole arrays of the rest (``fixed_start=...``, ``box_pose=...``)."""
+    """One :class:`Model` of all trees; ``others`` are whole arrays of the rest (``fixed_start=...``)."""
     counts = {
         "tree": len(trees),
         "body": sum(len(t.bodies) for t in trees),

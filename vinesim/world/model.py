@@ -111,7 +111,7 @@ class Model(Arrays):
         return slice(first, first + int(self.tree_size[tree]))
 
     def forward(self, joint_q: np.ndarray) -> np.ndarray:
-        """World poses of all bodies [body, 7] for joint rotations [body, 4] (a plain loop over depth, not for the tick)."""
+        """World poses of all bodies [body, 7] for joint rotations [body, 4] (loops over depth: not for the tick)."""
         body_q = np.zeros((len(self.body_mass), 7))
         joint = np.concatenate([self.body_offset, frames.multiply(self.body_rest, joint_q)], -1).astype(float)
         depth = self.depth()
@@ -125,7 +125,8 @@ class Model(Arrays):
     def depth(self) -> np.ndarray:
         """Number of bodies between each body and its root [body]."""
         depth = np.zeros(len(self.body_mass), np.int32)
-        for body, parent in enumerate(self.body_parent):
-            if parent >= 0:
-                depth[body] = depth[parent] + 1
+        above = self.body_parent.copy()
+        while (above >= 0).any():
+            depth += above >= 0
+            above = np.where(above >= 0, self.body_parent[above], -1)
         return depth

@@ -1,0 +1,617 @@
+"""From a scene to a model: poles, wires and old wood stand fixed; every shoot is a tree with leaves and bunches.
+
+Shoots are rows of a table with the same slots each (main axis, side shoot, two stalks with a bunch); what a shoot does
+not have is masked out at the end, so nothing here loops over plants except the drawing of random numbers. Each vine
+draws from its own stream, named by (seed, row, place): no vine knows how many others there are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.world import berries, grow, leaves, vine
+from vinesim.world.ids import Organ
+from vinesim.world.model import Model
+from vinesim.world.scene import Scene
+
+PIECES = 14
+"""Bodies of a shoot's main axis."""
+SIDE_PIECES = 4
+"""Bodies of a side shoot."""
+STALK_PIECES = 2
+"""Bodies of a peduncle."""
+BUNCHES = 2
+"""Most bunches on a shoot."""
+NODES = 25
+"""Most leaves on a shoot's main axis."""
+SIDE_NODES = 6
+"""Leaves of a side shoot."""
+ARM_PIECES = 5
+TRUNK_PIECES = 7
+
+_SIDE = slice(PIECES, PIECES + SIDE_PIECES)
+_SLOTS = PIECES + SIDE_PIECES + BUNCHES * (STALK_PIECES + 1)
+_CLEAR = 0.02
+"""Least gap between a bunch and its neighbours, poles and trunks [m]."""
+
+
+def _stalk(which: int) -> slice:
+    """Slots of one peduncle and, last, its bunch."""
+    first = PIECES + SIDE_PIECES + which * (STALK_PIECES + 1)
+    return slice(first, first + STALK_PIECES + 1)
+
+
+def generate(scene: Scene) -> Model:
+    """The model of a scene; the same scene gives the same bits."""
+    parts = vine.load(scene.plants)
+    wood = _old_wood(scene, parts)
+    shoots = _draw_shoots(scene, parts, wood)
+    bodies = _bodies(scene, parts, shoots)
+    leaf = _leaves(scene, parts, shoots, bodies)
+    model = _model(scene, parts, wood, shoots, bodies, leaf)
+    return grow.settle(model).check()
+
+
+# ---- old wood and trellis ------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class _Wood:
+    """Vines with the numbers each has drawn, their arms, and everything that stands still."""
+
+    foot: np.ndarray
+    """[vine, 3] m"""
+    row: np.ndarray
+    """[vine]"""
+    draws: list[np.random.Generator]
+    arms: np.ndarray
+    """[vine, arm, point, 3] m"""
+    trunk: np.ndarray
+    """[vine, point, 3] m"""
+    fixed: dict[str, np.ndarray]
+
+
+def _old_wood(scene: Scene, parts: vine.Vine) -> _Wood:
+    layout, tendone = scene.layout, scene.training == "tendone"
+    row, place = (a.ravel() for a in np.mgrid[0 : layout.rows, 0 : layout.vines])
+    foot = np.stack([place * layout.vine_spacing, row * layout.row_spacing, 0.0 * row], -1)
+    draws = [
+        np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(int(r), int(p))))
+        for r, p in zip(row, place, strict=True)
+    ]
+    arm_count = int((parts.arm.tendone_arms if tendone else parts.arm.vsp_arms).value)
+    wobble = np.stack([g.normal(size=(TRUNK_PIECES + 1, 3)) for g in draws])
+    bend = np.stack([g.normal(size=(arm_count, ARM_PIECES + 1, 3)) for g in draws])
+
+    head = layout.height - (0.06 if tendone else 0.03)
+    up = np.linspace(0.0, 1.0, TRUNK_PIECES + 1)[:, None]
+    beside = parts.trunk.beside_pole.value
+    trunk = foot[:, None] + up * [0.0, 0.0, head] + [0.0, beside, 0.0] * (1.0 - 0.45 * up)
+    trunk += np.cumsum(wobble, 1) * [0.015, 0.015, 0.0] * np.sin(np.pi * np.minimum(up, 0.5))
+
+    angle = 2.0 * np.pi * np.arange(arm_count) / arm_count
+    out = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
+    reach = parts.arm.share.value * np.where(np.abs(out[:, 1]) > 0.5, layout.row_spacing, layout.vine_spacing)
+    along = np.linspace(0.0, 1.0, ARM_PIECES + 1)[:, None]
+    arms = trunk[:, -1, None, None] + out[:, None] * reach[:, None, None] * along
+    sway = np.cumsum(bend, 2) * [0.016, 0.016, 0.008]
+    sway[:, :, 0] = 0.0
+    arms = arms + sway
+    arms[..., 2] = np.minimum(arms[..., 2] + 0.03 * along[:, 0], layout.height - 0.005)
+
+    thick = 0.5 * parts.trunk.diameter.at(up[:, 0])
+    thin = 0.5 * parts.arm.diameter.at(along[:, 0])
+    count = len(foot)
+    radius = 0.5 * parts.trellis.pole_diameter.value
+    pieces = [
+        _chains(trunk, thick, Organ.TRUNK, np.arange(count)),
+        _chains(arms.reshape(-1, ARM_PIECES + 1, 3), thin, Organ.ARM, np.arange(count * arm_count)),
+        _chains(
+            foot[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
+            np.array([radius, radius]), Organ.POLE, np.arange(count),
+        ),
+        *_wires(scene, parts),
+    ]  # fmt: skip
+    fixed = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    return _Wood(foot, row, draws, arms, trunk, fixed)
+
+
+def _chains(points: np.ndarray, radius: np.ndarray, organ: Organ, index: np.ndarray) -> dict[str, np.ndarray]:
+    """Round cones along polylines [chain, point, 3]."""
+    pieces = points.shape[1] - 1
+    pairs = np.broadcast_to(np.stack([radius[:-1], radius[1:]], -1), (len(points), pieces, 2))
+    return {
+        "fixed_start": points[:, :-1].reshape(-1, 3),
+        "fixed_end": points[:, 1:].reshape(-1, 3),
+        "fixed_radius": pairs.reshape(-1, 2),
+        "fixed_organ": np.full(len(points) * pieces, int(organ)),
+        "fixed_index": np.repeat(index, pieces),
+    }
+
+
+def _wires(scene: Scene, parts: vine.Vine) -> list[dict[str, np.ndarray]]:
+    """A net at the roof (tendone), or a fruiting wire and pairs of catch wires in each row (vsp)."""
+    layout, trellis = scene.layout, parts.trellis
+    wide, deep = (layout.vines - 1) * layout.vine_spacing, (layout.rows - 1) * layout.row_spacing
+    over_x, over_y = 0.5 * layout.vine_spacing, 0.5 * layout.row_spacing
+    # a wire runs from pole to pole: points half a field before the first and behind the last one
+    xs = np.unique([-over_x, *(np.arange(layout.vines) * layout.vine_spacing), wide + over_x])
+    ys = np.unique([-over_y, *(np.arange(layout.rows) * layout.row_spacing), deep + over_y])
+    radius = 0.5 * trellis.wire_diameter.value
+    if scene.training == "tendone":
+        step_y = layout.row_spacing / round(layout.row_spacing / trellis.tendone_wire_spacing.value)
+        step_x = layout.vine_spacing / round(layout.vine_spacing / trellis.tendone_wire_spacing.value)
+        at_y = np.arange(-over_y, deep + over_y + 1e-6, step_y)
+        at_x = np.arange(-over_x, wide + over_x + 1e-6, step_x)
+        along_x = np.stack(np.broadcast_arrays(xs[None], at_y[:, None], layout.height), -1)
+        along_y = np.stack(np.broadcast_arrays(at_x[:, None], ys[None], layout.height + 2.0 * radius), -1)
+        lines = [along_x, along_y]
+    else:
+        apart = radius + 0.5 * trellis.pole_diameter.value
+        heights = layout.height + trellis.vsp_wire_spacing.value * np.arange(1, int(trellis.vsp_wires.value) + 1)
+        across = [(0.0, layout.height), *((side * apart, z) for z in heights for side in (-1.0, 1.0))]
+        rows = np.arange(layout.rows) * layout.row_spacing
+        lines = [np.stack(np.broadcast_arrays(xs[None], (rows + y)[:, None], z), -1) for y, z in across]
+    first, pieces = 0, []
+    for line in lines:
+        pieces.append(_chains(line, np.full(line.shape[1], radius), Organ.WIRE, first + np.arange(len(line))))
+        first += len(line)
+    return pieces
+
+
+# ---- shoots --------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class _Shoots:
+    """What is drawn of each shoot, first axis: shoot."""
+
+    vine: np.ndarray
+    ref: np.ndarray
+    """[shoot, 3] direction that a body's z axis leans to."""
+    points: np.ndarray
+    """[shoot, PIECES + 1, 3] m, main axis."""
+    length: np.ndarray
+    base: np.ndarray
+    """[shoot] radius at the base [m]"""
+    side: np.ndarray
+    """[shoot] bool: has a side shoot"""
+    side_at: np.ndarray
+    """[shoot] piece of the main axis whose tip carries it"""
+    side_points: np.ndarray
+    """[shoot, SIDE_PIECES + 1, 3] m"""
+    bunch: np.ndarray
+    """[shoot, BUNCHES] bool"""
+    bunch_at: np.ndarray
+    """[shoot, BUNCHES] piece of the main axis whose tip carries the stalk"""
+    stalk: np.ndarray
+    """[shoot, BUNCHES, STALK_PIECES + 1, 3] m, the last point is the bunch's origin"""
+    hang: np.ndarray
+    """[shoot, BUNCHES, 3] direction of the bunch's axis"""
+    roll: np.ndarray
+    """[shoot, BUNCHES, 3] direction that the bunch's z axis leans to"""
+    fruit: dict[str, np.ndarray]
+    """[shoot, BUNCHES] mass, count, length, radius, seed, variety, pull, thick"""
+    nodes: np.ndarray
+    """[shoot] nodes of the main axis"""
+    luck: np.ndarray
+    """[shoot, NODES + SIDE_NODES, 12] standard normal numbers of the leaves"""
+
+
+def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
+    tendone, cane = scene.training == "tendone", parts.cane
+    each = int((parts.arm.tendone_shoots if tendone else parts.arm.vsp_shoots).value)
+    arm_count = wood.arms.shape[1]
+    per_vine, vines = each * arm_count, len(wood.foot)
+    count = per_vine * vines
+
+    def uniform(*shape: int) -> np.ndarray:
+        return np.stack([g.random((per_vine, *shape)) for g in wood.draws]).reshape(count, *shape)
+
+    def normal(*shape: int) -> np.ndarray:
+        return np.stack([g.standard_normal((per_vine, *shape)) for g in wood.draws]).reshape(count, *shape)
+
+    # where a shoot springs from its arm: evenly, a little shuffled, alternating sides
+    number = np.tile(np.arange(each), arm_count * vines)
+    share = 0.17 + 0.81 * (number + 0.2 + 0.6 * uniform()) / each
+    where = share * ARM_PIECES
+    piece = np.minimum(where.astype(int), ARM_PIECES - 1)
+    arm = wood.arms.reshape(vines * arm_count, ARM_PIECES + 1, 3)[np.repeat(np.arange(vines * arm_count), each)]
+    pick = np.arange(count)
+    start = arm[pick, piece] + (arm[pick, piece + 1] - arm[pick, piece]) * (where - piece)[:, None]
+    along = frames.normalize((arm[:, -1] - arm[:, 0]) * [1.0, 1.0, 0.0])
+
+    length = cane.length.at(uniform())
+    base = 0.5 * cane.base_diameter.at(uniform())
+    side_sign = np.where(number % 2, 1.0, -1.0)
+    if tendone:
+        turn = np.arctan2(along[:, 1], along[:, 0]) + side_sign * (1.0 + 0.6 * uniform())
+        heading = np.stack([np.cos(turn), np.sin(turn), -0.35 + 0.15 * uniform()], -1)
+        ref = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
+    else:
+        lean = normal(2) * [0.12, 0.05]
+        across = np.cross([0.0, 0.0, 1.0], along)
+        heading = along * lean[:, :1] + across * lean[:, 1:] + [0.0, 0.0, 1.0]
+        ref = along
+    points = _main_axis(
+        scene, start, heading, length, normal(PIECES, 3), wood.foot[np.repeat(np.arange(vines), per_vine)]
+    )
+
+    side = uniform() < cane.lateral_share.value
+    side_at = 6 + (5 * uniform()).astype(int)
+    side_points = _side_axis(
+        points,
+        side_at,
+        ref,
+        cane.lateral_length.at(uniform()),
+        np.where(uniform() < 0.5, 1, -1),
+        normal(SIDE_PIECES, 3),
+    )
+
+    owner = np.repeat(np.arange(vines), per_vine)
+    nodes = np.floor(cane.nodes.value[0] + (cane.nodes.value[1] - cane.nodes.value[0] + 1) * uniform()).astype(int)
+    nodes = np.minimum(nodes, NODES)
+    fruit, at, stalk, hang, roll = _draw_fruit(scene, parts, points, length, nodes, wood.row[owner], uniform, normal)
+    chosen = _choose_bunches(scene, wood, owner, per_vine, stalk, fruit)
+    luck = normal(NODES + SIDE_NODES, 12)
+    return _Shoots(
+        owner, ref, points, length, base, side, side_at, side_points, chosen, at, stalk, hang, roll, fruit, nodes, luck
+    )
+
+
+def _main_axis(
+    scene: Scene, start: np.ndarray, heading: np.ndarray, length: np.ndarray, luck: np.ndarray, foot: np.ndarray
+) -> np.ndarray:
+    """Points of the shoots: over the net they are held between its wires, in a hedge between the catch wires."""
+    layout, tendone = scene.layout, scene.training == "tendone"
+    points = np.empty((len(start), PIECES + 1, 3))
+    points[:, 0] = start
+    heading = frames.normalize(heading)
+    step = (length / PIECES)[:, None]
+    for i in range(PIECES):
+        at, share = points[:, i], i / PIECES
+        heading = heading + luck[:, i] * ([0.10, 0.10, 0.06] if tendone else [0.07, 0.05, 0.03])
+        if tendone:
+            # the bearing part droops below the net, the rest climbs over it
+            low = layout.height - 0.24 + 0.40 * min(2.0 * share, 1.0)
+            heading[:, 2] += np.clip(2.2 * (low - at[:, 2]), -0.2, 0.28) * (0.5 + share)
+            heading[:, 2] = np.clip(heading[:, 2], -0.42, 0.5)
+        else:
+            heading[:, 1] += 0.9 * (foot[:, 1] - at[:, 1])
+            heading[:, 2] += 0.12
+        heading = frames.normalize(heading)
+        points[:, i + 1] = at + heading * step
+    return points
+
+
+def _side_axis(
+    points: np.ndarray, at: np.ndarray, ref: np.ndarray, length: np.ndarray, sign: np.ndarray, luck: np.ndarray
+) -> np.ndarray:
+    """Points of the side shoots: 45 degrees off the main axis, then on with a little wander."""
+    pick = np.arange(len(points))
+    start, axis = points[pick, at + 1], frames.normalize(points[pick, at + 1] - points[pick, at])
+    heading = axis + sign[:, None] * frames.normalize(np.cross(ref, axis)) + 0.25 * ref
+    result = np.empty((len(points), SIDE_PIECES + 1, 3))
+    result[:, 0] = start
+    for i in range(SIDE_PIECES):
+        heading = frames.normalize(heading) + 0.12 * luck[:, i]
+        result[:, i + 1] = result[:, i] + frames.normalize(heading) * (length / SIDE_PIECES)[:, None]
+    return result
+
+
+# ---- fruit ---------------------------------------------------------------------------------------------------------
+
+
+def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # type: ignore[no-untyped-def]
+    """Two bunches for every shoot, of which :func:`_choose_bunches` keeps some."""
+    fruit, stalk = parts.bunch, parts.peduncle
+    sigma = np.sqrt(np.log(1.0 + fruit.mass_variation.value**2))
+    mass = fruit.mass.value * np.exp(sigma * normal(BUNCHES) - 0.5 * sigma**2)
+    mass = np.clip(mass, *fruit.mass_range.value)
+    names = [v.name for v in berries.VARIETIES]
+    in_turn = np.array([names.index(name) for name in scene.fruit.varieties])
+    variety = np.broadcast_to(in_turn[row % len(in_turn)][:, None], mass.shape)
+    juice = mass * (1.0 - fruit.stem_share.value)
+    berry_mass = np.array([v.mass for v in berries.VARIETIES])[variety]
+    count = np.clip(np.round(juice / berry_mass), berries.FEWEST, berries.MOST).astype(int)
+    seed = (uniform(BUNCHES) * 2.0**32).astype(np.uint32)
+    size = np.array([v.volume_radius for v in berries.VARIETIES])[variety] * np.cbrt(juice / (count * berry_mass))
+    hull = berries.hull(count, seed) * size[..., None]
+    drawn = {
+        "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,
+        "pull": stalk.pull.at(uniform(BUNCHES)), "thick": 0.5 * stalk.diameter.at(uniform(BUNCHES)),
+    }  # fmt: skip
+
+    # opposite the third to sixth leaf and one or two nodes further on, never both on one piece's tip
+    low, high = parts.cane.first_bunch_node.value
+    node = low + (high - low) * uniform()
+    node = np.stack([node, node + 2.2], -1)
+    at = np.clip(np.round(node / nodes[:, None] * PIECES).astype(int) - 1, 1, PIECES - 2)
+    at[:, 1] = np.maximum(at[:, 1], at[:, 0] + 1)
+    pick = np.arange(len(points))[:, None]
+    top = points[pick, at + 1]
+    long = stalk.length.at(uniform(BUNCHES)) / STALK_PIECES
+    angle = 2.0 * np.pi * uniform(BUNCHES)
+    level = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
+    tilt = np.clip(0.10 + 0.04 * normal(BUNCHES), 0.02, 0.18)[..., None]
+    first = frames.normalize(level * tilt - [0.0, 0.0, 1.0])
+    second = frames.normalize(level * 0.3 * tilt - [0.0, 0.0, 1.0])
+    middle = top + first * long[..., None]
+    end = middle + second * long[..., None]
+    hang = frames.normalize(0.02 * normal(BUNCHES, 3) - [0.0, 0.0, 1.0])
+    return drawn, at, np.stack([top, middle, end], 2), hang, level
+
+
+def _choose_bunches(
+    scene: Scene, wood: _Wood, owner: np.ndarray, per_vine: int, stalk: np.ndarray, fruit: dict[str, np.ndarray]
+) -> np.ndarray:
+    """Thin each vine to its number of bunches, keeping none that touches a pole, a trunk, or a bunch already kept."""
+    layout = scene.layout
+    low, high = scene.fruit.bunches
+    slots = per_vine * BUNCHES
+    top = stalk[:, :, -1].reshape(-1, slots, 3)
+    length, radius = (fruit[k].reshape(-1, slots) for k in ("length", "radius"))
+    level = top[..., :2] - wood.foot[:, None, :2]
+    inside = (
+        np.abs(level) + radius[..., None] + 0.5 * _CLEAR < 0.5 * np.array([layout.vine_spacing, layout.row_spacing])
+    ).all(-1)
+    # the pole and the trunk, whose head lies 5-15 cm beside it
+    trunk = wood.trunk[:, :, None, :2] - top[:, None, :, :2]
+    beside = np.sqrt((trunk * trunk).sum(-1)).min(1)
+    clear = (np.linalg.norm(level, axis=-1) > radius + 0.05 + _CLEAR) & (beside > radius + 0.06 + _CLEAR)
+    kept = np.zeros((len(top), slots), bool)
+    for number, g in enumerate(wood.draws):
+        wanted = int(g.integers(low, high + 1))
+        # the first bunch of a shoot is likelier kept than its second
+        order = np.argsort(g.random(slots) + 0.45 * (np.arange(slots) % BUNCHES), kind="stable")
+        order = order[(inside & clear)[number, order]]
+        t, r, h = top[number, order], radius[number, order], length[number, order]
+        apart = np.sqrt(((t[:, None, :2] - t[None, :, :2]) ** 2).sum(-1))
+        rise = np.abs((t[:, None, 2] - 0.5 * h[:, None]) - (t[None, :, 2] - 0.5 * h[None]))
+        touch = (apart < r[:, None] + r[None] + _CLEAR) & (rise < 0.5 * (h[:, None] + h[None]) + 0.03)
+        free = np.ones(len(order), bool)
+        for i in range(len(order)):
+            if wanted and free[i]:
+                kept[number, order[i]] = True
+                free &= ~touch[i]
+                wanted -= 1
+    return kept.reshape(-1, BUNCHES)
+
+
+# ---- bodies --------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class _Bodies:
+    """[shoot, slot]: the table that becomes the model's bodies."""
+
+    present: np.ndarray
+    parent: np.ndarray
+    """Slot, -1 for the root."""
+    organ: np.ndarray
+    origin: np.ndarray
+    turn: np.ndarray
+    """World pose as drawn."""
+    length: np.ndarray
+    radius: np.ndarray
+    mass: np.ndarray
+    com: np.ndarray
+    inertia: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+
+def _bodies(scene: Scene, parts: vine.Vine, s: _Shoots) -> _Bodies:
+    count = len(s.vine)
+    shape = (count, _SLOTS)
+    b = _Bodies(
+        present=np.ones(shape, bool), parent=np.zeros(shape, int), organ=np.full(shape, int(Organ.CANE)),
+        origin=np.zeros((*shape, 3)), turn=np.zeros((*shape, 4)), length=np.zeros(shape), radius=np.zeros((*shape, 2)),
+        mass=np.zeros(shape), com=np.zeros((*shape, 3)), inertia=np.zeros((*shape, 3)),
+        stiffness=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)),
+    )  # fmt: skip
+    cane, stalk = parts.cane, parts.peduncle
+
+    tip = 0.5 * cane.tip_diameter.value
+    share = np.linspace(0.0, 1.0, PIECES + 1)
+    radius = s.base[:, None] + (tip - s.base[:, None]) * share
+    green = np.clip((share[:-1] - cane.woody_share.value) / 0.2 + 0.5, 0.0, 1.0)
+    modulus = np.exp(np.log(cane.woody_modulus.value) * (1.0 - green) + np.log(cane.green_modulus.value) * green)
+    parent = np.broadcast_to(np.arange(-1, PIECES - 1), (count, PIECES))
+    _rod(b, slice(0, PIECES), s.points, radius, modulus, cane.density.value, cane.damping.value, s.ref, parent)
+
+    thin = 0.5 * cane.lateral_diameter.value
+    radius = np.broadcast_to(np.linspace(thin, 0.6 * thin, SIDE_PIECES + 1), (count, SIDE_PIECES + 1))
+    parent = np.concatenate(
+        [s.side_at[:, None], np.broadcast_to(np.arange(PIECES, PIECES + SIDE_PIECES - 1), (count, SIDE_PIECES - 1))], 1
+    )
+    modulus = np.full(SIDE_PIECES, cane.green_modulus.value)
+    _rod(b, _SIDE, s.side_points, radius, modulus, cane.density.value, cane.damping.value, s.ref, parent)
+    b.present[:, _SIDE] = s.side[:, None]
+
+    for k in range(BUNCHES):
+        slots = _stalk(k)
+        pieces = slice(slots.start, slots.stop - 1)
+        thick = s.fruit["thick"][:, k]
+        radius = np.broadcast_to(thick[:, None], (count, STALK_PIECES + 1))
+        chain = np.broadcast_to(np.arange(slots.start, slots.stop - 2), (count, STALK_PIECES - 1))
+        parent = np.concatenate([s.bunch_at[:, k, None], chain], 1)
+        modulus = np.full(STALK_PIECES, stalk.modulus.value)
+        _rod(b, pieces, s.stalk[:, k], radius, modulus, stalk.density.value, stalk.damping.value, s.roll[:, k], parent)
+        b.organ[:, pieces] = int(Organ.PEDUNCLE)
+
+        bunch = slots.stop - 1
+        mass, long, wide = (s.fruit[name][:, k] for name in ("mass", "length", "radius"))
+        b.organ[:, bunch] = int(Organ.BUNCH)
+        b.parent[:, bunch] = bunch - 1
+        b.origin[:, bunch] = s.stalk[:, k, -1]
+        b.turn[:, bunch] = frames.aligned(s.hang[:, k], s.roll[:, k])
+        b.length[:, bunch] = long
+        b.radius[:, bunch] = wide[:, None]
+        b.mass[:, bunch] = mass
+        b.com[:, bunch, 0] = 0.45 * long  # a cone's would be 0.25, a cylinder's 0.5
+        across = mass / 5.0 * (wide * wide + 0.25 * long * long)
+        b.inertia[:, bunch] = np.stack([mass / 5.0 * 2.0 * wide * wide, across, across], -1)
+        b.stiffness[:, bunch] = b.stiffness[:, bunch - 1]
+        b.damping[:, bunch] = b.damping[:, bunch - 1]
+        b.present[:, slots] = s.bunch[:, k, None]
+    return b
+
+
+def _rod(
+    b: _Bodies, slots: slice, points: np.ndarray, radius: np.ndarray, modulus: np.ndarray, density: float,
+    damping: float, up: np.ndarray, parent: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill the slots of one axis: points [shoot, piece + 1, 3], radius [shoot, piece + 1], modulus [piece]."""
+    along = np.diff(points, axis=1)
+    length = np.linalg.norm(along, axis=-1)
+    start, end = radius[:, :-1], radius[:, 1:]
+    first = np.arange(length.shape[1]) == 0
+    mass, inertia, stiffness = grow.section(length, start, end, modulus, density, first)
+    b.parent[:, slots] = parent
+    b.origin[:, slots] = points[:, :-1]
+    b.turn[:, slots] = frames.aligned(along, up[:, None])
+    b.length[:, slots] = length
+    b.radius[:, slots] = np.stack([start, end], -1)
+    b.mass[:, slots] = mass
+    b.com[:, slots, 0] = 0.5 * length
+    b.inertia[:, slots] = inertia
+    b.stiffness[:, slots] = stiffness
+    b.damping[:, slots] = damping * stiffness
+
+
+# ---- leaves --------------------------------------------------------------------------------------------------------
+
+
+def _leaves(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str, np.ndarray]:
+    """Leaves at the nodes, left and right in turn, and their weight on the bodies that carry them."""
+    count, leaf = len(s.vine), parts.leaf
+    node = np.arange(NODES + SIDE_NODES)
+    main = node < NODES
+    many = np.where(main, s.nodes[:, None], SIDE_NODES)
+    rank = np.where(main, node, node - NODES)
+    share = np.minimum((rank + 0.7) / many, 0.999)
+    luck = s.luck
+    kept = _to_uniform(luck[..., 0]) < scene.season.leafiness
+    present = (rank < many) & kept & (main | s.side[:, None])
+
+    pieces = np.where(main, PIECES, SIDE_PIECES)
+    piece = (share * pieces).astype(int)
+    slot = np.where(main, piece, PIECES + piece)
+    pick = np.arange(count)[:, None]
+    length, turn = b.length[pick, slot], b.turn[pick, slot]
+    x = (share * pieces - piece) * length
+    thick = b.radius[pick, slot, 0]
+
+    axis = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))
+    up = np.broadcast_to([0.0, 0.0, 1.0], axis.shape)
+    sideways = frames.normalize(np.cross(s.ref[:, None], axis))
+    hand = np.where((rank + s.side_at[:, None]) % 2, 1.0, -1.0)[..., None]
+    lift = up if scene.training == "tendone" else 0.35 * up
+    out = frames.normalize(
+        hand * sideways + 0.35 * luck[..., 1, None] * axis + (0.55 + 0.3 * luck[..., 2, None]) * lift
+    )
+    petiole = leaf.petiole.at(_to_uniform(luck[..., 3]))
+    young = np.clip((share - 0.75) / 0.25, 0.0, 1.0)
+    shrink = np.where(main, 1.0, 0.55) * (1.0 - (1.0 - leaf.young_area.value) * young)
+    area = leaf.area.at(_to_uniform(luck[..., 4])) * shrink
+    base = np.stack([x, 0.0 * x, 0.0 * x], -1) + thick[..., None] * frames.rotate(frames.conjugate(turn), out)
+    blade = base + (petiole * np.sqrt(shrink))[..., None] * frames.rotate(frames.conjugate(turn), out)
+
+    flat = frames.normalize(out * [1.0, 1.0, 0.0])
+    droop = (-0.45 + 0.3 * luck[..., 5, None]) if scene.training == "tendone" else (-1.0 + 0.4 * luck[..., 5, None])
+    midrib = frames.normalize(flat + 0.3 * luck[..., 6, None] * axis + droop * up)
+    upper = up + (0.0 if scene.training == "tendone" else 0.9) * flat + 0.3 * luck[..., 7:10]
+    pose = np.concatenate([blade, frames.multiply(frames.conjugate(turn), frames.aligned(midrib, upper))], -1)
+
+    yellow = _to_uniform(luck[..., 11]) < scene.season.yellow
+    age = np.where(yellow, 0.75 + 0.08 * luck[..., 10], 0.45 * (1.0 - share) + 0.05 + 0.08 * luck[..., 10])
+
+    weight = np.where(present, leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink), 0.0)
+    _load(b, slot, weight, blade)
+    return {
+        "present": present, "slot": slot, "base": base, "pose": pose, "area": area, "age": np.clip(age, 0.0, 1.0)
+    }  # fmt: skip
+
+
+def _to_uniform(z: np.ndarray) -> np.ndarray:
+    """Standard normal numbers to uniform ones (logistic fit of the normal distribution, within 1e-3)."""
+    return 1.0 / (1.0 + np.exp(-1.5976 * z - 0.07056 * z**3))
+
+
+def _load(b: _Bodies, slot: np.ndarray, weight: np.ndarray, where: np.ndarray) -> None:
+    """Add point masses [shoot, leaf] at ``where`` in body frames; products of inertia are dropped."""
+    mass, first, second = b.mass.copy(), b.mass[..., None] * b.com, b.inertia + b.mass[..., None] * _lever(b.com)
+    pick = np.broadcast_to(np.arange(len(slot))[:, None], slot.shape)
+    np.add.at(mass, (pick, slot), weight)
+    np.add.at(first, (pick, slot), weight[..., None] * where)
+    np.add.at(second, (pick, slot), weight[..., None] * _lever(where))
+    b.mass, b.com = mass, first / mass[..., None]
+    b.inertia = second - mass[..., None] * _lever(b.com)
+
+
+def _lever(p: np.ndarray) -> np.ndarray:
+    """Squared distance of points from the three axes."""
+    square = p * p
+    return square.sum(-1, keepdims=True) - square
+
+
+# ---- the model -----------------------------------------------------------------------------------------------------
+
+
+def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, leaf: dict[str, np.ndarray]) -> Model:
+    """Leave out what is masked, number the rest, and make drawn world poses relative."""
+    size = b.present.sum(1)
+    first = np.cumsum(size) - size
+    number = first[:, None] + np.cumsum(b.present, 1) - 1
+    has = b.present
+    tree = np.broadcast_to(np.arange(len(size))[:, None], has.shape)[has]
+    bunch = np.stack([number[:, _stalk(k).stop - 1] for k in range(BUNCHES)], 1)
+    order = np.argsort(leaf["slot"], axis=1, kind="stable")  # leaves lie in the order of their bodies
+    pick = np.arange(len(order))[:, None]
+    leaf = {name: value[pick, order] for name, value in leaf.items()}
+    shown = leaf["present"]
+    carrier = number[pick, leaf["slot"]][shown]
+
+    model = Model.allocate(
+        tree=len(size), body=int(size.sum()), bunch=int(s.bunch.sum()), leaf=int(shown.sum()),
+        fixed=len(wood.fixed["fixed_start"]), box=len(scene.boxes),
+    )  # fmt: skip
+    model.tree_first[:], model.tree_size[:], model.tree_vine[:] = first, size, s.vine
+    model.tree_pose[:] = frames.pose(b.origin[:, 0], b.turn[:, 0])
+
+    parent = b.parent[has]
+    root = parent < 0
+    model.body_tree[:] = tree
+    model.body_parent[:] = np.where(root, -1, number[tree, np.maximum(parent, 0)])
+    base = np.where(root[:, None], model.tree_pose[tree], frames.pose(b.origin, b.turn)[tree, np.maximum(parent, 0)])
+    drawn = frames.compose(frames.inverse(base), frames.pose(b.origin, b.turn)[has])
+    model.body_offset[:], model.body_rest[:] = drawn[:, :3], frames.normalize(drawn[:, 3:])
+    for name in ("organ", "mass", "com", "inertia", "length", "radius"):
+        getattr(model, f"body_{name}")[:] = getattr(b, name)[has]
+    model.joint_stiffness[:], model.joint_damping[:] = b.stiffness[has], b.damping[has]
+
+    fruit = {name: value[s.bunch] for name, value in s.fruit.items()}
+    model.bunch_body[:] = bunch[s.bunch]
+    model.bunch_berries[:] = fruit["count"]
+    for name in ("length", "radius", "seed", "variety", "pull"):
+        getattr(model, f"bunch_{name}")[:] = fruit[name]
+
+    model.leaf_body[:] = carrier
+    model.leaf_base[:], model.leaf_pose[:], model.leaf_age[:] = (
+        leaf["base"][shown],
+        leaf["pose"][shown],
+        leaf["age"][shown],
+    )
+    blade = np.array([leaves.area(shape) for shape in range(leaves.SHAPES)])
+    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade[leaves.shape_of(np.arange(len(carrier)))])
+
+    for name, value in wood.fixed.items():
+        getattr(model, name)[:] = value
+    for i, box in enumerate(scene.boxes):
+        model.box_pose[i] = frames.pose(np.array([box.x, box.y, 0.0]), frames.yaw(box.yaw))
+        model.box_size[i], model.box_mass[i] = box.size, box.mass
+    return model

@@ -1,0 +1,106 @@
+"""TOML files into frozen structs; what is wrong with a file is said in one line: file, place, finding, remedy."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import pathlib
+import re
+import tomllib
+from typing import Any, TypeVar
+
+import msgspec
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": 'text in "quotes"',
+    "array": "a list [...]",
+    "object": "a table",
+}
+
+
+class DataError(ValueError):
+    """A data file that cannot be used. The text is one line."""
+
+
+def read(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
+    """The TOML file at ``path`` as a ``kind``; raises ``error`` otherwise."""
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as bad:
+        raise error(f"{path}: not valid TOML: {_one_line(bad)}; correct the syntax there") from None
+    except (OSError, UnicodeDecodeError) as bad:
+        raise error(f"{path}: cannot be read: {_one_line(bad)}; give a readable UTF-8 file") from None
+    for place, value in _leaves(data):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise error(f"{path}: {place} is {value}; give a finite number")
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as bad:
+        raise error(f"{path}: {_explain(str(bad), data, kind)}") from None
+
+
+def _one_line(bad: Exception) -> str:
+    return " ".join(str(bad).split())
+
+
+def _leaves(data: Any, place: str = "") -> list[tuple[str, Any]]:
+    """Every value of nested tables and lists with its place, ``spawns[0].x``."""
+    if isinstance(data, dict):
+        return [leaf for key, value in data.items() for leaf in _leaves(value, f"{place}.{key}" if place else key)]
+    if isinstance(data, list):
+        return [leaf for i, value in enumerate(data) for leaf in _leaves(value, f"{place}[{i}]")]
+    return [(place, data)]
+
+
+def _explain(message: str, data: Any, kind: Any) -> str:
+    """Place, finding and remedy from msgspec's text, which ends in ``- at `$.a[0].b```."""
+    what, _, where = message.partition(" - at `$")
+    place = where.rstrip("`").lstrip(".")
+    steps = [int(s) if s.isdigit() else s for s in re.findall(r"[^.\[\]]+", place)]
+    found: Any = data
+    for step in steps:
+        found = found[step]
+    named = f"{place}." if place else ""
+    quoted = re.findall(r"`([^`]*)`", what)
+    if "unknown field" in what:
+        known = _fields(kind, steps)
+        near = difflib.get_close_matches(quoted[0], known, 1, 0.5)
+        hint = f"did you mean {near[0]!r}?" if near else "remove it"
+        return f"{named}{quoted[0]} is not a field; {hint} (known: {', '.join(known)})"
+    if "missing required field" in what:
+        return f"{named}{quoted[0]} is missing; add it: {quoted[0]} = ..."
+    place = place or "the file"
+    if what.startswith("Invalid enum value"):
+        return f"{place} is {quoted[0]!r}; give one of: {', '.join(_choices(kind, steps))}"
+    if what.startswith("Expected") and quoted:
+        types = [_KINDS.get(t.strip(), t.strip()) for t in re.split(r"\|", quoted[0])]
+        bound = what.split("`", 2)[2].partition(", got")[0].strip()
+        return f"{place} is {found!r}; give {' or '.join(types)}{' ' + bound if bound else ''}"
+    return f"{place} is {found!r}; {what}"
+
+
+def _step_in(kind: Any, steps: list[Any]) -> Any:
+    """The msgspec type that stands at ``steps`` below ``kind``."""
+    at: Any = msgspec.inspect.type_info(kind)
+    for step in steps:
+        if isinstance(at, msgspec.inspect.StructType):
+            at = next(f.type for f in at.fields if f.encode_name == step)
+        elif isinstance(at, msgspec.inspect.DictType):
+            at = at.value_type
+        elif isinstance(at, msgspec.inspect.TupleType):
+            at = at.item_types[step]
+        else:
+            at = at.item_type
+    return at
+
+
+def _fields(kind: Any, steps: list[Any]) -> list[str]:
+    return [f.encode_name for f in _step_in(kind, steps).fields]
+
+
+def _choices(kind: Any, steps: list[Any]) -> list[str]:
+    return [str(v) for v in _step_in(kind, steps).values]

@@ -1,0 +1,147 @@
+"""What a scene file says: a vineyard's layout, season, fruit, boxes, sun, and where robots start.
+
+Lengths in metres, angles in radians, axes as in :mod:`vinesim.frames`. The first vine of the first row stands at the
+origin; vines follow along +x, rows along +y, so that a longer row or one row more moves nobody.
+"""
+
+from __future__ import annotations
+
+import math
+import pathlib
+from typing import Annotated, Literal
+
+import msgspec
+
+from vinesim.world.berries import VARIETIES
+from vinesim.world.places import NotFoundInData, find
+from vinesim.world.reading import DataError, read
+
+MOST_ROBOTS = 10
+"""Robots that may meet in one vineyard (CANOPIES D6.4 section 2.3)."""
+
+Length = Annotated[float, msgspec.Meta(gt=0.0)]
+"""[m]"""
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+"""[1]"""
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class SceneError(DataError):
+    """A scene that cannot be used; one line with file, place, finding and remedy."""
+
+
+class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
+class Layout(_Part, frozen=True, kw_only=True):
+    """Where the vines stand."""
+
+    rows: Count
+    vines: Count
+    """Vines in each row."""
+    row_spacing: Length
+    vine_spacing: Length
+    height: Length
+    """Of the wire net (tendone) or of the fruiting wire (vsp)."""
+
+
+class Season(_Part, frozen=True, kw_only=True):
+    """How the canopy looks on that day."""
+
+    leafiness: Share = 1.0
+    """Share of the nodes that still carry their leaf."""
+    yellow: Share = 0.05
+    """Share of the leaves that have turned."""
+
+
+class Fruit(_Part, frozen=True, kw_only=True):
+    """What hangs on the vines."""
+
+    bunches: tuple[int, int]
+    """Fewest and most bunches on a vine."""
+    varieties: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    """Names of :data:`vinesim.world.berries.VARIETIES`; the rows take them in turn."""
+
+
+class Box(_Part, frozen=True, kw_only=True):
+    """A picking box standing on the ground."""
+
+    x: float
+    y: float
+    yaw: float = 0.0
+    size: tuple[Length, Length, Length] = (0.6, 0.4, 0.24)
+    """Outer length, width, height [m]."""
+    mass: Annotated[float, msgspec.Meta(gt=0.0)] = 1.6
+    """[kg], empty"""
+
+
+class Sun(_Part, frozen=True, kw_only=True):
+    """Direction to the sun."""
+
+    azimuth: float = 0.9
+    """[rad] from +x, counter-clockwise seen from above."""
+    elevation: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.9
+    """[rad] above the horizon."""
+
+    def direction(self) -> tuple[float, float, float]:
+        """Unit vector from the ground to the sun, world axes."""
+        level = math.cos(self.elevation)
+        return level * math.cos(self.azimuth), level * math.sin(self.azimuth), math.sin(self.elevation)
+
+
+class Spawn(_Part, frozen=True, kw_only=True):
+    """A named place where a robot or a person starts, on the ground."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1)]
+    x: float
+    y: float
+    yaw: float = 0.0
+
+
+class Scene(_Part, frozen=True, kw_only=True):
+    """One vineyard as its file describes it."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1)]
+    seed: Annotated[int, msgspec.Meta(ge=0)]
+    training: Literal["tendone", "vsp"]
+    """Overhead net (tendone) or vertical shoot positioning (vsp)."""
+    plants: str = "vine"
+    """File of plant parameters in ``data/plants``."""
+    layout: Layout
+    season: Season = Season()
+    fruit: Fruit
+    boxes: tuple[Box, ...] = ()
+    sun: Sun = Sun()
+    spawns: tuple[Spawn, ...] = ()
+
+
+def load(path_or_name: str | pathlib.Path) -> Scene:
+    """The scene in a file, or the one of that name in ``data/scenes``; :class:`SceneError` in one line otherwise."""
+    try:
+        path = find("scenes", str(path_or_name), ".toml")
+    except NotFoundInData as missing:
+        raise SceneError(str(missing)) from None
+    scene = read(path, Scene, SceneError)
+    trouble = _trouble(scene)
+    if trouble:
+        raise SceneError(f"{path}: {trouble}")
+    return scene
+
+
+def _trouble(scene: Scene) -> str:
+    """What the types cannot say: place, finding, remedy; empty if all is well."""
+    low, high = scene.fruit.bunches
+    if not 0 <= low <= high:
+        return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
+    known = [v.name for v in VARIETIES]
+    for i, name in enumerate(scene.fruit.varieties):
+        if name not in known:
+            return f"fruit.varieties[{i}] is {name!r}; give one of: {', '.join(known)}"
+    if len(scene.spawns) > MOST_ROBOTS:
+        return f"spawns has {len(scene.spawns)} entries; give at most {MOST_ROBOTS}"
+    names = [s.name for s in scene.spawns]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            return f"spawns[{i}].name is {name!r}, as spawns[{names.index(name)}].name; give each its own name"
+    return ""
