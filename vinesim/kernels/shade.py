@@ -145,6 +145,7 @@ def cast_shadows(
     clusters: Clusters,
     ball: wp.array(dtype=wp.vec4),
     # in
+    which: wp.array(dtype=wp.int32),
     m: ShadowMap,
     smallest: float,
     lanes: int,
@@ -152,7 +153,8 @@ def cast_shadows(
     depth_out: wp.array(dtype=wp.float32),
 ):
     """One thread draws every ``lanes``-th primitive of one cluster as the sun sees it."""
-    cluster, lane = wp.tid()
+    k, lane = wp.tid()
+    cluster = which[k]
     kind = clusters.kind[cluster]
     bound = ball[cluster]
     e = xyz(bound) - m.corner
@@ -218,15 +220,15 @@ def cast_shadows(
                     # sun rays are parallel: leaf coordinates are affine in the texel, then one step for the curvature
                     bend = shapes.d[i]
                     number = int(b4[3])
-                    k = m.texel / r
+                    per_leaf = m.texel / r
                     tu = wp.dot(m.sun, across) / slant
                     tv = wp.dot(m.sun, rib) / slant
                     rn = wp.dot(m.right, up)
                     un = wp.dot(m.up, up)
-                    ux = (wp.dot(m.right, across) - rn * tu) * k
-                    uy = (wp.dot(m.up, across) - un * tu) * k
-                    vx = (wp.dot(m.right, rib) - rn * tv) * k
-                    vy = (wp.dot(m.up, rib) - un * tv) * k
+                    ux = (wp.dot(m.right, across) - rn * tu) * per_leaf
+                    uy = (wp.dot(m.up, across) - un * tu) * per_leaf
+                    vx = (wp.dot(m.right, rib) - rn * tv) * per_leaf
+                    vy = (wp.dot(m.up, rib) - un * tv) * per_leaf
                     heights = leaf_heights(bend)
                     lx = float(1.0e9)
                     hx = float(-1.0e9)
@@ -236,8 +238,15 @@ def cast_shadows(
                         corner = shapes.hull[number, n]
                         for level in range(2):
                             w = heights[level]
-                            qx = x + (corner[0] * wp.dot(m.right, across) + corner[1] * wp.dot(m.right, rib) + w * rn) / k
-                            qy = y + (corner[0] * wp.dot(m.up, across) + corner[1] * wp.dot(m.up, rib) + w * un) / k
+                            qx = (
+                                x
+                                + (corner[0] * wp.dot(m.right, across) + corner[1] * wp.dot(m.right, rib) + w * rn)
+                                / per_leaf
+                            )
+                            qy = (
+                                y
+                                + (corner[0] * wp.dot(m.up, across) + corner[1] * wp.dot(m.up, rib) + w * un) / per_leaf
+                            )
                             lx = wp.min(lx, qx)
                             hx = wp.max(hx, qx)
                             ly = wp.min(ly, qy)
@@ -271,7 +280,12 @@ def cast_shadows(
                 rt = reach_i / m.texel
                 for py in range(wp.max(int(y - rt), 0), wp.min(int(y + rt) + 2, m.side)):
                     for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
-                        from_sun = m.corner + m.right * (float(px) * m.texel) + m.up * (float(py) * m.texel) + m.sun * SUN_HEIGHT
+                        from_sun = (
+                            m.corner
+                            + m.right * (float(px) * m.texel)
+                            + m.up * (float(py) * m.texel)
+                            + m.sun * SUN_HEIGHT
+                        )
                         t = hit(shapes, i, from_sun, -m.sun, 0)
                         if t < FAR:
                             darken(m, depth_out, px, py, t)
@@ -286,7 +300,11 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: float, taps: int) -> f
     y = wp.dot(e, m.up) / m.texel + 0.5
     lit = float(-1.0)
     if x > 8.0 and y > 8.0 and x < float(m.side) - 9.0 and y < float(m.side) - 9.0:
-        z = SUN_HEIGHT - wp.dot(e, m.sun) - m.texel * (0.4 + 0.7 * wp.sqrt(1.0 - facing * facing) / wp.max(facing, 0.12))
+        z = (
+            SUN_HEIGHT
+            - wp.dot(e, m.sun)
+            - m.texel * (0.4 + 0.7 * wp.sqrt(1.0 - facing * facing) / wp.max(facing, 0.12))
+        )
         gap = z - m.depth[int(y) * m.side + int(x)]
         spread = float(1.6)
         if gap > 0.0:
@@ -328,7 +346,9 @@ def smooth(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
     ay = fy - float(j)
     k = (i + 1) & 255
     l = (j + 1) & 255
-    return (table[j, i] * (1.0 - ax) + table[j, k] * ax) * (1.0 - ay) + (table[l, i] * (1.0 - ax) + table[l, k] * ax) * ay
+    return (table[j, i] * (1.0 - ax) + table[j, k] * ax) * (1.0 - ay) + (
+        table[l, i] * (1.0 - ax) + table[l, k] * ax
+    ) * ay
 
 
 @wp.func
@@ -495,8 +515,18 @@ def leaf_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: flo
             s.albedo = s.albedo * (0.72 + 0.5 * t[3])
         if age > 0.12:
             spot = texel_of(l.noise, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
-            edge = float(g.outline[number, wp.clamp(int((v + 0.75) * 128.0), 0, 255), wp.clamp(int((u + 1.0) * 128.0), 0, 255)]) * 0.0025
-            yellow = age * smoothstep(0.16 + 0.1 * age, 0.0, edge - 0.10 * spot[1]) + 0.7 * smoothstep(0.62, 0.9, age) * spot[0]
+            edge = (
+                float(
+                    g.outline[
+                        number, wp.clamp(int((v + 0.75) * 128.0), 0, 255), wp.clamp(int((u + 1.0) * 128.0), 0, 255)
+                    ]
+                )
+                * 0.0025
+            )
+            yellow = (
+                age * smoothstep(0.16 + 0.1 * age, 0.0, edge - 0.10 * spot[1])
+                + 0.7 * smoothstep(0.62, 0.9, age) * spot[0]
+            )
             s.albedo = mix(s.albedo, wp.vec3(0.40, 0.34, 0.05), wp.clamp(yellow, 0.0, 1.0))
             brown = smoothstep(0.03, 0.0, edge - 0.05 * spot[2] * age) * smoothstep(0.35, 0.6, age)
             s.albedo = mix(s.albedo, wp.vec3(0.16, 0.085, 0.03), brown)
@@ -571,7 +601,9 @@ def solid_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
             s.normal = wp.normalize(n + wp.vec3(t[1] - 0.5, t[2] - 0.5, t[3] - 0.5) * (0.7 / (1.0 + pixel * 500.0)))
         s.polish = 14.0
     elif material == BARK:
-        wide = smooth(l.noise, grain[0] * 2.6 + grain[2] * 0.24 + seed, grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4)
+        wide = smooth(
+            l.noise, grain[0] * 2.6 + grain[2] * 0.24 + seed, grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4
+        )
         fine = texel_of(l.noise, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed)
         height = wide[2] * 0.6 + fine[1] * 0.4
         s.albedo = mix(wp.vec3(0.075, 0.054, 0.038), wp.vec3(0.27, 0.20, 0.14), smoothstep(0.28, 0.75, height))
@@ -581,7 +613,9 @@ def solid_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
     elif material == POST:
         wide = smooth(l.noise, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
         fine = texel_of(l.noise, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)
-        s.albedo = tint * (0.55 + 0.55 * wide[1] + 0.35 * fine[2]) * (1.0 - 0.45 * smoothstep(0.35, 0.0, p[2]) * wide[0])
+        s.albedo = (
+            tint * (0.55 + 0.55 * wide[1] + 0.35 * fine[2]) * (1.0 - 0.45 * smoothstep(0.35, 0.0, p[2]) * wide[0])
+        )
         s.normal = wp.normalize(n + wp.vec3(fine[1] - 0.5, fine[2] - 0.5, 0.0) * 0.5)
         s.gloss = 0.02
     elif material == WIRE:
@@ -668,7 +702,16 @@ def mirrored(l: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
 
 @wp.func
 def shine(
-    l: Looks, light: Light, near: ShadowMap, far: ShadowMap, s: Surface, kind: int, p: wp.vec3, d: wp.vec3, t: float, turn: float
+    l: Looks,
+    light: Light,
+    near: ShadowMap,
+    far: ShadowMap,
+    s: Surface,
+    kind: int,
+    p: wp.vec3,
+    d: wp.vec3,
+    t: float,
+    turn: float,
 ) -> wp.vec3:
     """Light that leaves a surface at ``p`` against the unit ray ``d``."""
     n = s.normal
@@ -693,7 +736,9 @@ def shine(
         wp.max((ndl + s.wrap[2]) / (1.0 + s.wrap[2]), 0.0),
     )
     colour = wp.cw_mul(
-        s.albedo, wp.cw_mul(direct, light.sun_colour) * (lit * (0.35 + 0.65 * s.occlusion)) + ambient(light, n, s.sky) * s.occlusion
+        s.albedo,
+        wp.cw_mul(direct, light.sun_colour) * (lit * (0.35 + 0.65 * s.occlusion))
+        + ambient(light, n, s.sky) * s.occlusion,
     )
     if s.through[0] > 0.0:
         if kind == SPHEROID:  # a long way through the berry: saturated, brightest at the rim
@@ -702,7 +747,8 @@ def shine(
             colour += wp.cw_mul(s.through, light.sun_colour * sunny + ambient(light, -n, s.sky) * (0.35 * s.occlusion))
         else:
             colour += wp.cw_mul(
-                s.through, light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55) + ambient(light, -n, s.sky) * (0.30 * s.occlusion)
+                s.through,
+                light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55) + ambient(light, -n, s.sky) * (0.30 * s.occlusion),
             )
     if s.gloss > 0.0:
         grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
@@ -712,7 +758,9 @@ def shine(
             half = wp.normalize(light.sun - d)
             peak = 1.0 - wp.max(wp.dot(n, half), 0.0)
             if s.polish * peak < 8.0:
-                colour += light.sun_colour * (fresnel * wp.exp(-s.polish * peak) * (s.polish * 0.14 + 0.4) * lit * (ndl + 0.05))
+                colour += light.sun_colour * (
+                    fresnel * wp.exp(-s.polish * peak) * (s.polish * 0.14 + 0.4) * lit * (ndl + 0.05)
+                )
         if s.mirror * fresnel > 0.006:
             r = d - n * (2.0 * wp.dot(n, d))
             if kind == LEAF:
@@ -774,4 +822,6 @@ def shade(
             s = ground_surface(looks, p, footprint)
         colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
     for k in range(3):
-        rgb_out[pixel, k] = light.tone[wp.clamp(int(wp.sqrt(wp.max(colour[k], 0.0) * light.exposure) * 1024.0), 0, 4095)]
+        rgb_out[pixel, k] = light.tone[
+            wp.clamp(int(wp.sqrt(wp.max(colour[k], 0.0) * light.exposure) * 1024.0), 0, 4095)
+        ]

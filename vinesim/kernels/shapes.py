@@ -269,7 +269,9 @@ def hit(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> float:
         side = wp.cross(rib, up)
         k = 1.0 / a4[3]
         eye = wp.vec3(-wp.dot(a, side), -wp.dot(a, rib), -wp.dot(a, up)) * k
-        t = hit_leaf(s.outline, int(b4[3]), s.d[i], eye, wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up)) * k, smooth)
+        t = hit_leaf(
+            s.outline, int(b4[3]), s.d[i], eye, wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up)) * k, smooth
+        )
     elif kind == SPHEROID:
         k = 1.0 / b4[3] - 1.0
         t = hit_sphere(squeeze(a, xyz(b4), k), a4[3], squeeze(d, xyz(b4), k))

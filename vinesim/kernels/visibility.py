@@ -164,7 +164,13 @@ def raster_spheroids(
                     for x in range(box[0], box[1]):
                         at = y * lens.width + x
                         if keys_out[at] > nearest:
-                            keep(keys_out, at, hit_sphere(centre, a4[3], squeeze(ray_of(lens, x, y), axis, stretch)), i, lens.reach)
+                            keep(
+                                keys_out,
+                                at,
+                                hit_sphere(centre, a4[3], squeeze(ray_of(lens, x, y), axis, stretch)),
+                                i,
+                                lens.reach,
+                            )
 
 
 @wp.kernel
@@ -317,7 +323,13 @@ def raster_leaves(
                     for x in range(x0, x1):
                         at = y * lens.width + x
                         if keys_out[at] > nearest:
-                            keep(keys_out, at, hit_leaf(shapes.outline, number, bend, eye, row + dx * float(x), smooth), i, lens.reach)
+                            keep(
+                                keys_out,
+                                at,
+                                hit_leaf(shapes.outline, number, bend, eye, row + dx * float(x), smooth),
+                                i,
+                                lens.reach,
+                            )
 
 
 @wp.kernel
@@ -361,7 +373,12 @@ def raster_solids(
                 ez = lens.turn * wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
                 bound = wp.vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND)
                 for n in range(8):
-                    corner = centre + ex * (float(n & 1) * 2.0 - 1.0) + ey * (float(n & 2) - 1.0) + ez * (float(n & 4) * 0.5 - 1.0)
+                    corner = (
+                        centre
+                        + ex * (float(n & 1) * 2.0 - 1.0)
+                        + ey * (float(n & 2) - 1.0)
+                        + ez * (float(n & 4) * 0.5 - 1.0)
+                    )
                     x = corner[0] / corner[2] * lens.fx + lens.cx
                     y = corner[1] / corner[2] * lens.fy + lens.cy
                     bound = wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
