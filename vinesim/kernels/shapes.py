@@ -1,0 +1,397 @@
+"""Analytic primitives: their arrays, where a ray meets them, and how they ride on moving bodies.
+
+Every primitive is four vectors ``a b c d`` whose meaning follows from its kind:
+
+========== ======================= ======================= ============================ =====================
+kind       a                       b                       c                            d
+========== ======================= ======================= ============================ =====================
+CONE       start, radius           end, radius             distance along, seed, -, -   -
+SPHEROID   centre, radius          axis, length / width    seed, depth in bunch, -, -   occlusion vector, mean
+LEAF       petiole end, size       midrib, outline number  upper normal, seed           curvatures a b c, age
+BOX        centre, half x          quaternion              half y, half z, seed, -      -
+ELLIPSOID  centre, half x          quaternion              half y, half z, seed, -      -
+CYLINDER   centre of one end, r    centre of the other, -  distance along, seed, -, -   -
+TRIANGLE   corner, -               corner, -               corner, -                    -
+========== ======================= ======================= ============================ =====================
+
+A primitive that encloses the ray's origin is not hit, and triangles are seen from outside only (counter-clockwise):
+a camera inside the housing of its robot looks out. Rays may have any length; ``t`` counts in lengths of ``d``.
+
+Primitives lie in *clusters*: at most some dozens of one kind, close together, on one tree, bunch or link.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+CONE = wp.constant(0)
+SPHEROID = wp.constant(1)
+LEAF = wp.constant(2)
+BOX = wp.constant(3)
+ELLIPSOID = wp.constant(4)
+CYLINDER = wp.constant(5)
+TRIANGLE = wp.constant(6)
+
+FAR = wp.constant(1.0e30)
+OUTLINE_TEXELS = wp.constant(128.0)
+"""Texels of a leaf's outline per leaf unit: 256 texels over u in [-1, 1], v in [-0.75, 1.25]."""
+HIDDEN = wp.constant(-1.0e6)
+"""Height at which things that are gone lie for the ray caster [m]."""
+
+
+@wp.struct
+class Shapes:
+    """All primitives, posed in the world."""
+
+    a: wp.array(dtype=wp.vec4)
+    b: wp.array(dtype=wp.vec4)
+    c: wp.array(dtype=wp.vec4)
+    d: wp.array(dtype=wp.vec4)
+    kind: wp.array(dtype=wp.int32)
+    outline: wp.array3d(dtype=wp.int8)
+    """[outline, 256, 256] signed distance to the leaf's edge, positive inside, 1/400 leaf unit."""
+    hull: wp.array2d(dtype=wp.vec2)
+    """[outline, 8] corners of an octagon around each outline, leaf units."""
+
+
+@wp.struct
+class Clusters:
+    """Runs of primitives of one kind."""
+
+    first: wp.array(dtype=wp.int32)
+    size: wp.array(dtype=wp.int32)
+    kind: wp.array(dtype=wp.int32)
+    shown: wp.array(dtype=wp.int32)
+    """0 for what is gone: a picked bunch."""
+
+
+@wp.func
+def xyz(v: wp.vec4) -> wp.vec3:
+    return wp.vec3(v[0], v[1], v[2])
+
+
+@wp.func
+def with_w(v: wp.vec3, w: float) -> wp.vec4:
+    return wp.vec4(v[0], v[1], v[2], w)
+
+
+@wp.func
+def as_quat(v: wp.vec4) -> wp.quat:
+    return wp.quat(v[0], v[1], v[2], v[3])
+
+
+@wp.func
+def squeeze(v: wp.vec3, axis: wp.vec3, k: float) -> wp.vec3:
+    """``v`` scaled by 1 + k along ``axis``: a spheroid becomes a sphere."""
+    return v + axis * (k * wp.dot(v, axis))
+
+
+# ---------------------------------------------------------------------------------------------- rays
+
+
+@wp.func
+def hit_sphere(centre: wp.vec3, r: float, d: wp.vec3) -> float:
+    """First hit of a ray from the origin with a sphere that does not hold the origin."""
+    dd = wp.dot(d, d)
+    along = wp.dot(d, centre) / dd
+    miss = centre - d * along  # the perpendicular: r^2 - |miss|^2 loses no digits far away
+    h = (r * r - wp.dot(miss, miss)) / dd
+    t = FAR
+    if h >= 0.0:
+        t = along - wp.sqrt(h)
+        if t <= 0.0:
+            t = FAR
+    return t
+
+
+@wp.func
+def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
+    """First hit of a ray from the origin with the hull of two spheres (Quilez, "round cone")."""
+    ba = b - a
+    slope = ra - rb
+    dd = wp.dot(d, d)
+    # measured from the foot of the perpendicular onto the axis' middle, so that float32 keeps micrometres
+    shift = wp.dot((a + b) * 0.5, d) / dd
+    o = d * shift
+    oa = o - a
+    ob = o - b
+    m0 = wp.dot(ba, ba)
+    m1 = wp.dot(ba, oa)
+    m2 = wp.dot(ba, d)
+    m3 = wp.dot(d, oa)
+    m5 = wp.dot(oa, oa)
+    d2 = m0 - slope * slope
+    k2 = d2 * dd - m2 * m2
+    k1 = d2 * m3 - m1 * m2 + m2 * slope * ra
+    k0 = d2 * m5 - m1 * m1 + m1 * slope * ra * 2.0 - m0 * ra * ra
+    h = k1 * k1 - k0 * k2
+    best = FAR
+    side = int(0)
+    if d2 > 0.0 and h >= 0.0:
+        root = wp.sqrt(h)
+        if k2 > 0.0:
+            t = (-root - k1) / k2
+            y = m1 - ra * slope + t * m2
+            if y > 0.0 and y < d2:
+                best = t + shift
+                side = 1
+        elif k2 < 0.0:  # steeper than the slope, as when looking along the axis: either root may be the first hit
+            for k in range(2):
+                t = (wp.where(k == 0, root, -root) - k1) / k2
+                y = m1 - ra * slope + t * m2
+                if y > 0.0 and y < d2 and t + shift > 0.0:
+                    best = wp.min(best, t + shift)
+    if side == 0:
+        h1 = m3 * m3 - dd * (m5 - ra * ra)
+        if h1 > 0.0:
+            best = (-m3 - wp.sqrt(h1)) / dd + shift
+        m6 = wp.dot(ob, d)
+        h2 = m6 * m6 - dd * (wp.dot(ob, ob) - rb * rb)
+        if h2 > 0.0:
+            best = wp.min(best, (-m6 - wp.sqrt(h2)) / dd + shift)
+    return wp.where(best > 0.0, best, FAR)
+
+
+@wp.func
+def hit_cylinder(a: wp.vec3, b: wp.vec3, r: float, d: wp.vec3) -> float:
+    """First hit of a ray from the origin with a solid cylinder with flat ends."""
+    ba = b - a
+    length2 = wp.dot(ba, ba)
+    m = wp.dot(ba, d)
+    n = -wp.dot(ba, a)
+    k2 = length2 * wp.dot(d, d) - m * m
+    k1 = -length2 * wp.dot(a, d) - n * m
+    k0 = length2 * wp.dot(a, a) - n * n - r * r * length2
+    h = k1 * k1 - k2 * k0
+    best = FAR
+    if k2 > 1.0e-12 * length2 and h >= 0.0:
+        t = (-k1 - wp.sqrt(h)) / k2
+        y = n + t * m
+        if t > 0.0 and y > 0.0 and y < length2:
+            best = t
+    if m != 0.0:
+        end = wp.where(m > 0.0, 0.0, length2)  # the end that faces the ray
+        t = (end - n) / m
+        p = d * t - a - ba * (end / length2)
+        if t > 0.0 and t < best and wp.dot(p, p) <= r * r:
+            best = t
+    return best
+
+
+@wp.func
+def hit_box(o: wp.vec3, d: wp.vec3, half: wp.vec3) -> float:
+    """First hit with a box around the origin of its own frame."""
+    tiny = 1.0e-12
+    m = wp.vec3(
+        1.0 / wp.where(wp.abs(d[0]) > tiny, d[0], tiny),
+        1.0 / wp.where(wp.abs(d[1]) > tiny, d[1], tiny),
+        1.0 / wp.where(wp.abs(d[2]) > tiny, d[2], tiny),
+    )
+    n = wp.cw_mul(m, o)
+    k = wp.vec3(wp.abs(m[0]) * half[0], wp.abs(m[1]) * half[1], wp.abs(m[2]) * half[2])
+    near = wp.max(wp.max(-n[0] - k[0], -n[1] - k[1]), -n[2] - k[2])
+    far = wp.min(wp.min(-n[0] + k[0], -n[1] + k[1]), -n[2] + k[2])
+    return wp.where(near <= far and near > 0.0, near, FAR)
+
+
+@wp.func
+def hit_triangle(p: wp.vec3, q: wp.vec3, r: wp.vec3, d: wp.vec3) -> float:
+    """Hit of a ray from the origin with the front of a triangle (edge functions: neighbours leave no gap)."""
+    u = wp.dot(d, wp.cross(r, q))
+    v = wp.dot(d, wp.cross(p, r))
+    w = wp.dot(d, wp.cross(q, p))
+    t = FAR
+    slack = -1.0e-6 * (wp.abs(u) + wp.abs(v) + wp.abs(w))
+    if u >= slack and v >= slack and w >= slack and u + v + w > 0.0:
+        n = wp.cross(q - p, r - p)
+        t = wp.dot(p, n) / wp.dot(d, n)
+    return wp.where(t > 0.0, t, FAR)
+
+
+@wp.func
+def inside_outline(outline: wp.array3d(dtype=wp.int8), number: int, u: float, v: float, smooth: int) -> bool:
+    """Whether a point of the leaf's plane belongs to the blade."""
+    x = (u + 1.0) * OUTLINE_TEXELS - 0.5
+    y = (v + 0.75) * OUTLINE_TEXELS - 0.5
+    i = wp.clamp(int(x), 0, 254)
+    j = wp.clamp(int(y), 0, 254)
+    if smooth == 0:
+        return int(outline[number, j, i]) > 0
+    fx = x - float(i)
+    fy = y - float(j)
+    low = float(outline[number, j, i]) * (1.0 - fx) + float(outline[number, j, i + 1]) * fx
+    high = float(outline[number, j + 1, i]) * (1.0 - fx) + float(outline[number, j + 1, i + 1]) * fx
+    return low * (1.0 - fy) + high * fy > 0.0
+
+
+@wp.func
+def hit_leaf(
+    outline: wp.array3d(dtype=wp.int8), number: int, bend: wp.vec4, o: wp.vec3, d: wp.vec3, smooth: int
+) -> float:
+    """First hit with a blade in its own frame and unit: two half surfaces w = a u^2 + b v^2 + c |u|, hinged at u = 0."""
+    best = FAR
+    q2 = -(bend[0] * d[0] * d[0] + bend[1] * d[1] * d[1])
+    linear = d[2] - 2.0 * (bend[0] * o[0] * d[0] + bend[1] * o[1] * d[1])
+    constant = o[2] - bend[0] * o[0] * o[0] - bend[1] * o[1] * o[1]
+    for half in range(2):
+        sign = 1.0 - 2.0 * float(half)
+        q1 = linear - bend[2] * sign * d[0]
+        q0 = constant - bend[2] * sign * o[0]
+        h = q1 * q1 - 4.0 * q2 * q0
+        if h >= 0.0:
+            root = wp.sqrt(h)
+            q = -0.5 * (q1 + wp.where(q1 > 0.0, root, -root))
+            for k in range(2):
+                top = wp.where(k == 0, q0, q)
+                bottom = wp.where(k == 0, q, q2)
+                if bottom != 0.0:
+                    t = top / bottom
+                    if t > 0.0 and t < best:
+                        u = o[0] + t * d[0]
+                        v = o[1] + t * d[1]
+                        if sign * u >= -1.0e-5 and u < 0.99 and u > -0.99 and v > -0.74 and v < 1.24:
+                            if inside_outline(outline, number, u, v, smooth):
+                                best = t
+    return best
+
+
+@wp.func
+def hit(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> float:
+    """First hit of a world ray with primitive ``i``; :data:`FAR` if there is none."""
+    kind = s.kind[i]
+    a4 = s.a[i]
+    b4 = s.b[i]
+    a = xyz(a4) - o
+    t = FAR
+    if kind == LEAF:
+        up = xyz(s.c[i])
+        rib = xyz(b4)
+        side = wp.cross(rib, up)
+        k = 1.0 / a4[3]
+        eye = wp.vec3(-wp.dot(a, side), -wp.dot(a, rib), -wp.dot(a, up)) * k
+        t = hit_leaf(
+            s.outline, int(b4[3]), s.d[i], eye, wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up)) * k, smooth
+        )
+    elif kind == SPHEROID:
+        k = 1.0 / b4[3] - 1.0
+        t = hit_sphere(squeeze(a, xyz(b4), k), a4[3], squeeze(d, xyz(b4), k))
+    elif kind == CONE:
+        t = hit_cone(a, a4[3], xyz(b4) - o, b4[3], d)
+    elif kind == TRIANGLE:
+        t = hit_triangle(a, xyz(b4) - o, xyz(s.c[i]) - o, d)
+    elif kind == CYLINDER:
+        t = hit_cylinder(a, xyz(b4) - o, a4[3], d)
+    else:
+        c4 = s.c[i]
+        q = as_quat(b4)
+        half = wp.vec3(a4[3], c4[0], c4[1])
+        eye = wp.quat_rotate_inv(q, -a)
+        ray = wp.quat_rotate_inv(q, d)
+        if kind == BOX:
+            t = hit_box(eye, ray, half)
+        else:
+            t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
+    return t
+
+
+# ---------------------------------------------------------------------------------------------- motion
+
+
+@wp.func
+def leaf_heights(bend: wp.vec4) -> wp.vec2:
+    """Lowest and highest w of a blade, leaf units (|u| <= 0.95, |v| <= 1.05)."""
+    low = wp.min(0.0, bend[0] * 0.9) + wp.min(0.0, bend[1] * 1.1) + wp.min(0.0, bend[2] * 0.95)
+    high = wp.max(0.0, bend[0] * 0.9) + wp.max(0.0, bend[1] * 1.1) + wp.max(0.0, bend[2] * 0.95)
+    return wp.vec2(low, high)
+
+
+@wp.kernel
+def pose_clusters(
+    # model
+    local: Shapes,
+    clusters: Clusters,
+    carrier: wp.array(dtype=wp.int32),
+    # in
+    dirty: wp.array(dtype=wp.int32),
+    poses: wp.array(dtype=wp.transform),
+    # out
+    a_out: wp.array(dtype=wp.vec4),
+    b_out: wp.array(dtype=wp.vec4),
+    c_out: wp.array(dtype=wp.vec4),
+    d_out: wp.array(dtype=wp.vec4),
+    lower_out: wp.array(dtype=wp.vec3),
+    upper_out: wp.array(dtype=wp.vec3),
+    ball_out: wp.array(dtype=wp.vec4),
+):
+    """One thread carries one cluster from its bodies' frames into the world, and bounds it."""
+    cluster = dirty[wp.tid()]
+    kind = clusters.kind[cluster]
+    first = clusters.first[cluster]
+    lowest = wp.vec3(FAR, FAR, FAR)
+    highest = wp.vec3(-FAR, -FAR, -FAR)
+    for i in range(first, first + clusters.size[cluster]):
+        pose = poses[carrier[i]]
+        q = wp.transform_get_rotation(pose)
+        a4 = local.a[i]
+        b4 = local.b[i]
+        c4 = local.c[i]
+        d4 = local.d[i]
+        a = wp.transform_point(pose, xyz(a4))
+        a4 = with_w(a, a4[3])
+        lo = a
+        hi = a
+        if kind == LEAF:
+            rib = wp.quat_rotate(q, xyz(b4))
+            up = wp.quat_rotate(q, xyz(c4))
+            side = wp.cross(rib, up)
+            heights = leaf_heights(d4)
+            for k in range(8):
+                corner = local.hull[int(b4[3]), k]
+                flat = a + (side * corner[0] + rib * corner[1]) * a4[3]
+                for m in range(2):
+                    p = flat + up * (heights[m] * a4[3])
+                    lo = wp.min(lo, p)
+                    hi = wp.max(hi, p)
+            b4 = with_w(rib, b4[3])
+            c4 = with_w(up, c4[3])
+        elif kind == SPHEROID:
+            b4 = with_w(wp.quat_rotate(q, xyz(b4)), b4[3])
+            d4 = with_w(wp.quat_rotate(q, xyz(d4)), d4[3])
+            r = a4[3] * wp.max(1.0, b4[3])
+            reach = wp.vec3(r, r, r)
+            lo = a - reach
+            hi = a + reach
+        elif kind == CONE or kind == CYLINDER:
+            b = wp.transform_point(pose, xyz(b4))
+            r = wp.max(a4[3], wp.where(kind == CONE, b4[3], 0.0))
+            reach = wp.vec3(r, r, r)
+            lo = wp.min(a, b) - reach
+            hi = wp.max(a, b) + reach
+            b4 = with_w(b, b4[3])
+        elif kind == TRIANGLE:
+            b = wp.transform_point(pose, xyz(b4))
+            c = wp.transform_point(pose, xyz(c4))
+            lo = wp.min(wp.min(a, b), c)
+            hi = wp.max(wp.max(a, b), c)
+            b4 = with_w(b, b4[3])
+            c4 = with_w(c, c4[3])
+        else:
+            turn = q * as_quat(b4)
+            r = wp.length(wp.vec3(a4[3], c4[0], c4[1]))
+            reach = wp.vec3(r, r, r)
+            lo = a - reach
+            hi = a + reach
+            b4 = wp.vec4(turn[0], turn[1], turn[2], turn[3])
+        if clusters.shown[cluster] == 0:
+            lo = wp.vec3(0.0, 0.0, HIDDEN)
+            hi = lo
+        a_out[i] = a4
+        b_out[i] = b4
+        c_out[i] = c4
+        d_out[i] = d4
+        lower_out[i] = lo
+        upper_out[i] = hi
+        lowest = wp.min(lowest, lo)
+        highest = wp.max(highest, hi)
+    centre = (lowest + highest) * 0.5
+    ball_out[cluster] = with_w(centre, wp.where(clusters.shown[cluster] == 0, -1.0, wp.length(highest - centre)))

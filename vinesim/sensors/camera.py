@@ -1,0 +1,170 @@
+"""RGB-D cameras: exact depth and labels, and a picture.
+
+Depth follows REP-118: metres along the optical axis; -Inf nearer than the sensor can measure, +Inf farther than it can,
+which includes the open sky; NaN is kept for a pixel that should have measured and did not (noise models).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import warp as wp
+
+from vinesim import frames
+from vinesim.kernels import shade, shapes, visibility
+from vinesim.sensors import specs
+from vinesim.sensors.primitives import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE, Primitives
+from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight
+from vinesim.world.ids import Organ, label
+from vinesim.world.values import CameraFrame, CameraInfo
+from vinesim.world.vine import Number
+
+REACH = 500.0
+"""Nothing is drawn beyond this depth [m]."""
+_RASTER = (
+    (visibility.raster_cones, (CONE,)),
+    (visibility.raster_spheroids, (SPHEROID,)),
+    (visibility.raster_triangles, (TRIANGLE,)),
+    (visibility.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
+    (visibility.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
+)
+
+
+class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One kind of camera (``data/cameras``)."""
+
+    model: str
+    width: Annotated[Number, "px"]
+    height: Annotated[Number, "px"]
+    fx: Annotated[Number, "px"]
+    fy: Annotated[Number, "px"]
+    nearest: Annotated[Number, "m"]
+    """Smallest depth that is measured."""
+    farthest: Annotated[Number, "m"]
+    """Largest depth that is measured."""
+    rate: Annotated[Number, "Hz"]
+
+    @classmethod
+    def load(cls, name: str) -> CameraSpec:
+        """The spec in a file, or the one of that name in ``data/cameras``."""
+        return specs.load("cameras", name, cls)
+
+    def info(self, frame_id: str, scale: float = 1.0) -> CameraInfo:
+        """Intrinsics with the principal point in the middle; ``scale`` enlarges the picture."""
+        width, height = round(self.width.value * scale), round(self.height.value * scale)
+        return CameraInfo(
+            width, height, self.fx.value * scale, self.fy.value * scale, 0.5 * (width - 1), 0.5 * (height - 1), frame_id,
+        )  # fmt: skip
+
+
+def pinhole(info: CameraInfo, pose: np.ndarray) -> visibility.Pinhole:
+    """Intrinsics and pose [7] of the optical frame as kernels need them."""
+    if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
+        raise ValueError(
+            f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; all must be positive"
+        )
+    pose = np.asarray(pose, float)
+    if not np.isfinite(pose).all():
+        raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
+    lens = visibility.Pinhole()
+    lens.eye = wp.vec3(*map(float, pose[:3]))
+    lens.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+    lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
+    lens.width, lens.height, lens.reach = int(info.width), int(info.height), REACH
+    wide = max(info.cx, info.width - info.cx) / info.fx
+    high = max(info.cy, info.height - info.cy) / info.fy
+    lens.close = float(visibility.CLOSE) * float(np.sqrt(1.0 + wide * wide + high * high))
+    return lens
+
+
+class Visibility:
+    """Nearest primitive of every pixel; the buffers of one camera."""
+
+    def __init__(self, width: int, height: int, device: str = "cpu") -> None:
+        count = width * height
+        self.width, self.height, self.device = width, height, device
+        self.keys = wp.empty(count, dtype=wp.int64, device=device)
+        self.primitive = wp.empty(count, dtype=wp.int32, device=device)
+        self.depth = wp.empty(count, dtype=float, device=device)
+        self.labels = wp.empty(count, dtype=wp.int32, device=device)
+        self._distance = wp.empty(0, dtype=float, device=device)
+
+    def draw(
+        self, primitives: Primitives, lens: visibility.Pinhole, nearest: float = 0.0, farthest: float = REACH
+    ) -> None:
+        """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
+        clusters = len(primitives.cluster_first)
+        if len(self._distance) != clusters:
+            self._distance = wp.empty(clusters, dtype=float, device=self.device)
+        self.keys.fill_(int(visibility.EMPTY))
+        wp.launch(
+            visibility.cull, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
+        )
+        distance = self._distance.numpy()
+        seen = np.flatnonzero(distance < float(shapes.FAR))
+        seen = seen[np.argsort(distance[seen], kind="stable")].astype(np.int32)
+        kind = primitives.cluster_kind[seen]
+        lanes = 1 if self.device == "cpu" else 48
+        for kernel, kinds in _RASTER:
+            mine = seen[np.isin(kind, kinds)]
+            if len(mine):
+                wp.launch(
+                    kernel, (len(mine), lanes),
+                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, lanes],
+                    outputs=[self.keys], device=self.device,
+                )  # fmt: skip
+        wp.launch(
+            visibility.resolve, self.width * self.height,
+            inputs=[
+                primitives.labels, self.keys, lens, label(Organ.GROUND, 0), float(nearest), float(farthest), -float("inf"), float("inf"),
+            ],
+            outputs=[self.primitive, self.depth, self.labels], device=self.device,
+        )  # fmt: skip
+
+
+@dataclasses.dataclass
+class Camera:
+    """One RGB-D camera."""
+
+    spec: CameraSpec
+    info: CameraInfo
+    name: str = "camera"
+    sun: tuple[float, float, float] = DEFAULT_SUN
+    taps: int = 4
+    """Shadow samples a pixel: 4 live, 16 for pictures."""
+    shadow_period: float = 0.2
+    """Moving things get new shadows this often [s]; 0 for every frame."""
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        self.visibility = Visibility(self.info.width, self.info.height, self.device)
+        self._sunlight = Sunlight(self.sun, taps=self.taps, period=self.shadow_period, device=self.device)
+        self._rgb = wp.empty((self.info.width * self.info.height, 3), dtype=wp.uint8, device=self.device)
+
+    @property
+    def rate(self) -> float:
+        """Frames a second [Hz]."""
+        return self.spec.rate.value
+
+    def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> CameraFrame:
+        """The frame seen from ``pose`` [7], the optical frame in the world."""
+        pose = np.array(pose, float)
+        lens = pinhole(self.info, pose)
+        seen = self.visibility
+        seen.draw(primitives, lens, self.spec.nearest.value, self.spec.farthest.value)
+        forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
+        near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
+        wp.launch(
+            shade.shade, self.info.width * self.info.height,
+            inputs=[primitives.shapes, primitives.looks, self._sunlight.light, near, far, lens, seen.primitive, seen.keys],
+            outputs=[self._rgb], device=self.device,
+        )  # fmt: skip
+        shape = (self.info.height, self.info.width)
+        return CameraFrame(
+            time=float(time), name=self.name, info=self.info, pose=pose,
+            rgb=self._rgb.numpy().reshape(*shape, 3).copy(), depth=seen.depth.numpy().reshape(shape).copy(),
+            labels=seen.labels.numpy().reshape(shape).copy(),
+        )  # fmt: skip
