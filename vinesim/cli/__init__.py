@@ -10,6 +10,7 @@ Exit codes: 0 done; 2 wrong use or bad input; 3 a part is missing on this machin
 from __future__ import annotations
 
 import logging
+import os
 import pathlib
 import sys
 from typing import Annotated
@@ -99,9 +100,10 @@ def client(
       vinesim client --role robot --connect tcp/127.0.0.1:7447 --name picker --spawn 1
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
     """
+    options = dict(locals())
     from vinesim.cli.join import run
 
-    raise typer.Exit(run(**locals()))
+    raise typer.Exit(run(**options))
 
 
 @scene_app.command("show")
@@ -165,6 +167,8 @@ def options(
 
 def main() -> None:
     """Entry point. An error that vinesim raises itself is one line in words; any other is a defect with a traceback."""
+    # Small matrices gain nothing from BLAS threads, and those would take the other core from the eyes.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()
     except KeyboardInterrupt:

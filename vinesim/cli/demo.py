@@ -164,7 +164,7 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
             raise visitor.failed()
         heard = {}
         if stranger is not None:
-            stranger.child.communicate("", timeout=None) if False else _close(stranger)
+            _close(stranger)
             heard = json.loads(stranger.line(10.0))
     summary = summarise(out, bunch, heard, no_ros, scene, plan.seed, seconds)
     console.print(_result(summary))

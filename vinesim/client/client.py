@@ -109,6 +109,7 @@ class Client:
     def sense(self) -> None:
         """Note the watched bunch, and tell everybody who listens."""
         if self.trace is not None:
+            self.physics.refresh()
             body = self.trace.body
             force = np.zeros(3)
             for contact in self.physics.contacts:

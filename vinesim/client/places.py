@@ -51,3 +51,10 @@ def bunch_in_reach(model: Model, pose: np.ndarray) -> int:
             f"at {HEIGHT[0]} to {HEIGHT[1]} m height; choose another start place or seed"
         )
     return int(np.argmin(np.where(fits, np.abs(distance - 0.6) + 0.2 * sideways, np.inf)))
+
+
+def checked_bunch(model: Model, bunch: int | None) -> int | None:
+    """The bunch, if the vineyard has it."""
+    if bunch is not None and not 0 <= bunch < len(model.bunch_body):
+        raise NoPlace(f"no bunch {bunch}: this vineyard has 0 to {len(model.bunch_body) - 1}")
+    return bunch

@@ -43,6 +43,10 @@ class Trace:
         self._force[row] = force
         self.length += 1
 
+    def centre(self) -> np.ndarray:
+        """Where the bunch's centre was at the end of the newest row, or at rest [3] m."""
+        return self._position[self.length - 1].copy() if self.length else self._rest.copy()
+
     @property
     def displacement(self) -> float:
         """Of the newest row, from rest [m]."""

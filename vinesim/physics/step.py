@@ -28,6 +28,7 @@ class Physics:
         self.touching = Touching(model, self.plants, self.rigid)
         self.tick = 0
         self._body_q: np.ndarray | None = None
+        self._fresh = True
         self.stages: tuple[tuple[str, Callable[[], None]], ...] = (
             ("rigid: predict without plants", self.rigid.prep),
             ("touching: wake what is near", self.touching.find),
@@ -60,10 +61,16 @@ class Physics:
         """(tree, actor) for every tree pressed on in the last tick, sorted."""
         return self.touching.touched
 
+    def refresh(self) -> None:
+        """Bring ``state.body_q`` from the start of the last tick to its end."""
+        if not self._fresh:
+            self.plants.kinematics()
+            self._fresh = True
+
     def view(self) -> View:
         """The world after the last tick. While no tree is awake, views share one array of plant poses."""
         if self._body_q is None:
-            self.plants.kinematics()
+            self.refresh()
             self._body_q = self.state.body_q.copy()
         return View(
             time=self.time,
@@ -90,7 +97,7 @@ class Physics:
     def _commit(self) -> None:
         self.plants.commit(self.touching.bodies, self.touching.wrenches)
         if len(self.plants.awake):
-            self._body_q = None
+            self._body_q, self._fresh = None, False
 
     def _finish(self) -> None:
         self.rigid.finish(self.touching.force)

@@ -145,3 +145,12 @@ def _trouble(scene: Scene) -> str:
         if name in names[:i]:
             return f"spawns[{i}].name is {name!r}, as spawns[{names.index(name)}].name; give each its own name"
     return ""
+
+
+def reseeded(scene: Scene, seed: int | None) -> Scene:
+    """The same scene grown from another seed; None keeps its own."""
+    if seed is None:
+        return scene
+    if seed < 0:
+        raise SceneError(f"seed is {seed}: give 0 or more")
+    return msgspec.structs.replace(scene, seed=seed)

@@ -1,0 +1,120 @@
+"""``vinesim client``: join a vineyard as one actor."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import pathlib
+import signal
+import threading
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+STATUS_PERIOD = 1.0
+"""Between two status lines [s]."""
+
+
+class WrongUse(ValueError):  # noqa: N818
+    """Options that cannot be meant; the text says which."""
+
+
+def run(
+    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int, back: float,
+    namespace: str, ros: bool, push: int | None, watch: int | None, near: float, seconds: float | None,
+    out: pathlib.Path | None, status: str, device: str,
+) -> int:  # fmt: skip
+    """Build the client from its options, tick until told to stop, then write what was asked for."""
+    if role != "robot":
+        built = "is not built yet" if role in ("human", "spectator") else "is none of robot, human, spectator"
+        raise WrongUse(f"role {role!r} {built}; give --role robot")
+    if status not in ("text", "json", "none"):
+        raise WrongUse(f"--status {status!r}: give text, json or none")
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+
+    from vinesim.client.client import Client
+    from vinesim.client.jobs import DriveTo
+    from vinesim.client.pace import Pace
+    from vinesim.client.places import checked_bunch, spawn_pose
+    from vinesim.client.senses import Senses
+    from vinesim.client.status import Status
+    from vinesim.client.trace import Trace
+    from vinesim.net.bus import MemoryHub
+    from vinesim.robot.description import load as load_robot
+    from vinesim.robot.reach import ReachAndPush
+    from vinesim.world.generate import generate
+    from vinesim.world.scene import load as load_scene
+    from vinesim.world.scene import reseeded
+
+    plan = reseeded(load_scene(scene), seed)
+    description = load_robot(robot)
+    start, goal = spawn_pose(plan, spawn, back), spawn_pose(plan, spawn)
+    model = generate(plan)
+    name = name or f"robot-{os.getpid()}"
+    for bunch in (push, watch):
+        checked_bunch(model, bunch)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+
+    with contextlib.ExitStack() as stack:
+        if connect is None:
+            bus: Any = stack.enter_context(MemoryHub().bus(name))
+        else:
+            from vinesim.net.zenoh_bus import ZenohBus
+
+            bus = stack.enter_context(ZenohBus(name, connect=connect))
+        client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device)
+        senses = stack.enter_context(Senses(client, namespace=namespace, ros=ros, keep_pictures=out is not None))
+        pace = Pace(client.physics.dt)
+        watched = watch if watch is not None else push
+        if watched is not None:
+            body = int(model.bunch_body[watched])
+            client.trace = Trace(model, watched, client.physics.state.body_q[body].copy(), 1 << 17)
+        if back > 0.0:
+            client.jobs.append(DriveTo(client.robot, goal))
+        if push is not None and client.trace is not None:
+            reach = ReachAndPush(client.robot, senses.side_of(client.trace.centre()), client.trace.centre)
+            client.jobs.append(reach.control)
+        reporter = Status(client, pace, senses.sent)
+        speaker = threading.Thread(target=_speak, args=(reporter, senses, status, stop), name="status")
+        speaker.start()
+        stack.callback(speaker.join)
+        stack.callback(stop.set)
+        limit = None if seconds is None else round(seconds / client.physics.dt)
+        while not stop.is_set() and (limit is None or pace.ticks < limit):
+            pace.begin()
+            client.tick()
+            pace.end()
+        if out is not None:
+            report = reporter.report() | senses.report()
+            senses.save(out)
+            if client.trace is not None:
+                client.trace.rows().save(out / "trace.npz")
+            partial = out / "report.json.part"
+            partial.write_text(json.dumps(report, indent=2) + "\n")
+            partial.replace(out / "report.json")
+    return 0
+
+
+def _speak(reporter: Any, senses: Any, status: str, stop: threading.Event) -> None:
+    """Once a second, say how it goes: to the terminal and to ROS."""
+    try:
+        while not stop.wait(STATUS_PERIOD):
+            figures = reporter.now()
+            senses.diagnose(figures)
+            if status == "json":
+                print(json.dumps(figures), flush=True)
+            elif status == "text":
+                print(
+                    f"{figures['time']:7.1f} s  {figures['tick_hz']:6.2f} Hz  p99 {figures['tick_p99_ms']:5.2f} ms  "
+                    f"awake {figures['awake']:3d}  force {figures['force']:6.2f} N  "
+                    f"in {figures['bytes_in']} B  out {figures['bytes_out']} B  with {', '.join(figures['others']) or 'nobody'}",
+                    flush=True,
+                )
+    except BrokenPipeError:  # whoever listened is gone: that ends the run, not the log
+        stop.set()
