@@ -3,4 +3,4 @@
 import warp as wp
 
 # Standard output belongs to the command that runs; Warp would greet there.
-wp.config.quiet = True
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
