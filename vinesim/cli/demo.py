@@ -78,6 +78,15 @@ class Process:
             raise self.failed()
         return line
 
+    def last_words(self, timeout: float) -> str:
+        """Close its input, and all that it prints until its end."""
+        assert self.child.stdin is not None
+        self.child.stdin.close()
+        words = []
+        while line := self.lines.get(timeout=timeout):
+            words.append(line)
+        return "\n".join(words)
+
     def failed(self) -> DemoFailed:
         """Why it ended too early."""
         self.child.wait(GRACE)
@@ -164,17 +173,11 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
             raise visitor.failed()
         heard = {}
         if stranger is not None:
-            _close(stranger)
-            heard = json.loads(stranger.line(10.0))
+            heard = json.loads(stranger.last_words(10.0))
     summary = summarise(out, bunch, heard, no_ros, scene, plan.seed, seconds)
     console.print(_result(summary))
     console.print(f"pictures, plot and summary.json are in {out}/")
     return 0
-
-
-def _close(process: Process) -> None:
-    assert process.child.stdin is not None
-    process.child.stdin.close()
 
 
 def watch(
