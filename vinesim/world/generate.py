@@ -634,8 +634,8 @@ def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, 
         leaf["pose"][shown],
         leaf["age"][shown],
     )
-    blade = np.array([leaves.area(shape) for shape in range(leaves.SHAPES)])
-    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade[leaves.shape_of(np.arange(len(carrier)))])
+    blade = np.mean([leaves.area(shape) for shape in range(leaves.SHAPES)])
+    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade)
 
     for name, value in wood.fixed.items():
         getattr(model, name)[:] = value
