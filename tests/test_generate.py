@@ -47,6 +47,21 @@ def test_a_longer_row_leaves_its_first_vine_as_it_was(vineyard):
         assert np.array_equal(getattr(model, name)[old], getattr(more, name)[new]), name
 
 
+@pytest.mark.parametrize("training", ["tendone", "vsp"])
+def test_the_smallest_and_barest_vineyard_stands(training):
+    bare = scenes.Scene(
+        name="bare",
+        seed=0,
+        training=training,
+        layout=scenes.Layout(rows=1, vines=1, row_spacing=0.2, vine_spacing=0.2, height=0.5),
+        season=scenes.Season(leafiness=0.0),
+        fruit=scenes.Fruit(bunches=(0, 0), varieties=("black",)),
+    )
+    counts = generate(bare).counts()
+    assert (counts["bunch"], counts["leaf"], counts["box"]) == (0, 0, 0)
+    assert counts["tree"] > 20
+
+
 def test_bodies_of_a_tree_lie_together_parents_first(vineyard):
     model = vineyard[1]
     for tree in range(len(model.tree_first)):
