@@ -264,8 +264,8 @@ def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
     leaf_chance = np.moveaxis(uniform(NODES + SIDE_NODES, 4), -1, 0)
     return _Shoots(
         vine=owner, ref=ref, points=points, length=length, base=base, side=side, side_at=side_at,
-        side_points=side_points, bunch=chosen, bunch_at=at, stalk=stalk, hang=hang, roll=roll, fruit=fruit, nodes=nodes, leaf_luck=leaf_luck,
-        leaf_chance=leaf_chance,
+        side_points=side_points, bunch=chosen, bunch_at=at, stalk=stalk, hang=hang, roll=roll, fruit=fruit,
+        nodes=nodes, leaf_luck=leaf_luck, leaf_chance=leaf_chance,
     )  # fmt: skip
 
 
