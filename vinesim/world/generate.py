@@ -149,8 +149,8 @@ def _wires(scene: Scene, parts: vine.Vine) -> list[dict[str, np.ndarray]]:
     ys = np.unique([-over_y, *(np.arange(layout.rows) * layout.row_spacing), deep + over_y])
     radius = 0.5 * trellis.wire_diameter.value
     if scene.training == "tendone":
-        step_y = layout.row_spacing / round(layout.row_spacing / trellis.tendone_wire_spacing.value)
-        step_x = layout.vine_spacing / round(layout.vine_spacing / trellis.tendone_wire_spacing.value)
+        step_y = layout.row_spacing / max(round(layout.row_spacing / trellis.tendone_wire_spacing.value), 1)
+        step_x = layout.vine_spacing / max(round(layout.vine_spacing / trellis.tendone_wire_spacing.value), 1)
         at_y = np.arange(-over_y, deep + over_y + 1e-6, step_y)
         at_x = np.arange(-over_x, wide + over_x + 1e-6, step_x)
         along_x = np.stack(np.broadcast_arrays(xs[None], at_y[:, None], layout.height), -1)
@@ -204,8 +204,10 @@ class _Shoots:
     """[shoot, BUNCHES] mass, count, length, radius, seed, variety, pull, thick"""
     nodes: np.ndarray
     """[shoot] nodes of the main axis"""
-    luck: np.ndarray
-    """[shoot, NODES + SIDE_NODES, 12] standard normal numbers of the leaves"""
+    leaf_luck: np.ndarray
+    """[8, shoot, NODES + SIDE_NODES] standard normal numbers"""
+    leaf_chance: np.ndarray
+    """[4, shoot, NODES + SIDE_NODES] uniform numbers"""
 
 
 def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
@@ -243,22 +245,14 @@ def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
         across = np.cross([0.0, 0.0, 1.0], along)
         heading = along * lean[:, :1] + across * lean[:, 1:] + [0.0, 0.0, 1.0]
         ref = along
-    points = _main_axis(
-        scene, start, heading, length, normal(PIECES, 3), wood.foot[np.repeat(np.arange(vines), per_vine)]
-    )
+    owner = np.repeat(np.arange(vines), per_vine)
+    points = _main_axis(scene, start, heading, length, normal(PIECES, 3), wood.foot[owner])
 
     side = uniform() < cane.lateral_share.value
     side_at = 6 + (5 * uniform()).astype(int)
-    side_points = _side_axis(
-        points,
-        side_at,
-        ref,
-        cane.lateral_length.at(uniform()),
-        np.where(uniform() < 0.5, 1, -1),
-        normal(SIDE_PIECES, 3),
-    )
+    side_long, hand = cane.lateral_length.at(uniform()), np.where(uniform() < 0.5, 1, -1)
+    side_points = _side_axis(points, side_at, ref, side_long, hand, normal(SIDE_PIECES, 3))
 
-    owner = np.repeat(np.arange(vines), per_vine)
     nodes = np.floor(cane.nodes.value[0] + (cane.nodes.value[1] - cane.nodes.value[0] + 1) * uniform()).astype(int)
     nodes = np.minimum(nodes, NODES)
     fruit, at, stalk, hang, roll = _draw_fruit(scene, parts, points, nodes, wood.row[owner], uniform, normal)
@@ -266,10 +260,13 @@ def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
     stiffness = cane.woody_modulus.value * np.pi / 4.0 * base**4
     burden = fruit["mass"] * -grow.GRAVITY[2] * rise**2 / stiffness[:, None]
     chosen = _choose_bunches(scene, wood, per_vine, stalk, burden, fruit)
-    luck = normal(NODES + SIDE_NODES, 12)
+    leaf_luck = np.moveaxis(normal(NODES + SIDE_NODES, 8), -1, 0)
+    leaf_chance = np.moveaxis(uniform(NODES + SIDE_NODES, 4), -1, 0)
     return _Shoots(
-        owner, ref, points, length, base, side, side_at, side_points, chosen, at, stalk, hang, roll, fruit, nodes, luck
-    )
+        vine=owner, ref=ref, points=points, length=length, base=base, side=side, side_at=side_at,
+        side_points=side_points, bunch=chosen, bunch_at=at, stalk=stalk, hang=hang, roll=roll, fruit=fruit,
+        nodes=nodes, leaf_luck=leaf_luck, leaf_chance=leaf_chance,
+    )  # fmt: skip
 
 
 def _main_axis(
@@ -522,9 +519,9 @@ def _leaves(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str,
     many = np.where(main, s.nodes[:, None], SIDE_NODES)
     rank = np.where(main, node, node - NODES)
     share = np.minimum((rank + 0.7) / many, 0.999)
-    luck = s.luck
-    kept = _to_uniform(luck[..., 0]) < scene.season.leafiness
-    present = (rank < many) & kept & (main | s.side[:, None])
+    forward, rise, droop, swing, *lean, ageing = s.leaf_luck[..., None]
+    fate, turned, far, large = s.leaf_chance
+    present = (rank < many) & (fate < scene.season.leafiness) & (main | s.side[:, None])
 
     pieces = np.where(main, PIECES, SIDE_PIECES)
     piece = (share * pieces).astype(int)
@@ -534,40 +531,33 @@ def _leaves(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str,
     x = (share * pieces - piece) * length
     thick = b.radius[pick, slot, 0]
 
+    tendone = scene.training == "tendone"
     axis = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))
-    up = np.broadcast_to([0.0, 0.0, 1.0], axis.shape)
+    up = np.array([0.0, 0.0, 1.0])
     sideways = frames.normalize(np.cross(s.ref[:, None], axis))
     hand = np.where((rank + s.side_at[:, None]) % 2, 1.0, -1.0)[..., None]
-    lift = up if scene.training == "tendone" else 0.35 * up
-    out = frames.normalize(
-        hand * sideways + 0.35 * luck[..., 1, None] * axis + (0.55 + 0.3 * luck[..., 2, None]) * lift
-    )
-    petiole = leaf.petiole.at(_to_uniform(luck[..., 3]))
+    climb = (0.55 + 0.3 * rise) * (1.0 if tendone else 0.35)
+    out = frames.normalize(hand * sideways + 0.35 * forward * axis + climb * up)
     young = np.clip((share - 0.75) / 0.25, 0.0, 1.0)
     shrink = np.where(main, 1.0, 0.55) * (1.0 - (1.0 - leaf.young_area.value) * young)
-    area = leaf.area.at(_to_uniform(luck[..., 4])) * shrink
-    base = np.stack([x, 0.0 * x, 0.0 * x], -1) + thick[..., None] * frames.rotate(frames.conjugate(turn), out)
-    blade = base + (petiole * np.sqrt(shrink))[..., None] * frames.rotate(frames.conjugate(turn), out)
+    area = leaf.area.at(large) * shrink
+    petiole = leaf.petiole.at(far) * np.sqrt(shrink)
+    local = frames.rotate(frames.conjugate(turn), out)
+    base = np.stack([x, 0.0 * x, 0.0 * x], -1) + thick[..., None] * local
+    blade = base + petiole[..., None] * local
 
+    # blades lie on the light: flat over the net, hanging and facing outwards in a hedge
     flat = frames.normalize(out * [1.0, 1.0, 0.0])
-    droop = (-0.45 + 0.3 * luck[..., 5, None]) if scene.training == "tendone" else (-1.0 + 0.4 * luck[..., 5, None])
-    midrib = frames.normalize(flat + 0.3 * luck[..., 6, None] * axis + droop * up)
-    upper = up + (0.0 if scene.training == "tendone" else 0.9) * flat + 0.3 * luck[..., 7:10]
+    midrib = frames.normalize(flat + 0.3 * swing * axis + ((-0.45 if tendone else -1.0) + 0.3 * droop) * up)
+    upper = up + (0.0 if tendone else 0.9) * flat + 0.3 * np.concatenate(lean, -1)
     pose = np.concatenate([blade, frames.multiply(frames.conjugate(turn), frames.aligned(midrib, upper))], -1)
-
-    yellow = _to_uniform(luck[..., 11]) < scene.season.yellow
-    age = np.where(yellow, 0.75 + 0.08 * luck[..., 10], 0.45 * (1.0 - share) + 0.05 + 0.08 * luck[..., 10])
+    age = np.where(turned < scene.season.yellow, 0.75, 0.05 + 0.45 * (1.0 - share)) + 0.08 * ageing[..., 0]
 
     weight = np.where(present, leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink), 0.0)
     _load(b, slot, weight, blade)
     return {
         "present": present, "slot": slot, "base": base, "pose": pose, "area": area, "age": np.clip(age, 0.0, 1.0)
     }  # fmt: skip
-
-
-def _to_uniform(z: np.ndarray) -> np.ndarray:
-    """Standard normal numbers to uniform ones (logistic fit of the normal distribution, within 1e-3)."""
-    return 1.0 / (1.0 + np.exp(-1.5976 * z - 0.07056 * z**3))
 
 
 def _load(b: _Bodies, slot: np.ndarray, weight: np.ndarray, where: np.ndarray) -> None:
@@ -634,8 +624,8 @@ def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, 
         leaf["pose"][shown],
         leaf["age"][shown],
     )
-    blade = np.array([leaves.area(shape) for shape in range(leaves.SHAPES)])
-    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade[leaves.shape_of(np.arange(len(carrier)))])
+    blade = np.mean([leaves.area(shape) for shape in range(leaves.SHAPES)])
+    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade)
 
     for name, value in wood.fixed.items():
         getattr(model, name)[:] = value
