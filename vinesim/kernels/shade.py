@@ -89,6 +89,10 @@ class Light:
     exposure: float
     taps: int
     """Shadow samples a pixel."""
+    spiral: wp.array(dtype=wp.vec2)
+    """[taps] Vogel's spiral in the unit disc."""
+    turns: wp.array(dtype=wp.vec2)
+    """[64] cosine and sine of 64 angles."""
     table: wp.array2d(dtype=wp.vec3)
     tone: wp.array(dtype=wp.uint8)
 
@@ -292,7 +296,7 @@ def cast_shadows(
 
 
 @wp.func
-def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: float, taps: int) -> float:
+def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.array(dtype=wp.vec2), taps: int) -> float:
     """Share of the sun's disc seen from ``p``; -1 outside the map. Soft by the distance of what stands between."""
     facing = wp.abs(wp.dot(n, m.sun))
     e = p + n * (m.texel * (1.0 + 1.6 * (1.0 - facing))) - m.corner
@@ -312,10 +316,8 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: float, taps: int) -> f
         z -= spread * m.texel * 0.3
         lit = wp.where(gap > 0.0, 0.0, 1.0)
         for k in range(taps):
-            # Vogel's spiral
-            angle = 2.399963 * float(k) + turn
-            r = spread * wp.sqrt((float(k) + 0.5) / float(taps))
-            if m.depth[int(y + r * wp.sin(angle)) * m.side + int(x + r * wp.cos(angle))] > z:
+            v = spiral[k] * spread
+            if m.depth[int(y + v[0] * turn[1] + v[1] * turn[0]) * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])] > z:
                 lit += 1.0
         lit = lit / (float(taps) + 1.0)
     return lit
@@ -711,7 +713,7 @@ def shine(
     p: wp.vec3,
     d: wp.vec3,
     t: float,
-    turn: float,
+    turn: wp.vec2,
 ) -> wp.vec3:
     """Light that leaves a surface at ``p`` against the unit ray ``d``."""
     n = s.normal
@@ -725,9 +727,9 @@ def shine(
         away = plain
         if wp.dot(plain, light.sun) < 0.0:
             away = -plain
-        lit = lit_share(near, p, away, turn, light.taps)
+        lit = lit_share(near, p, away, turn, light.spiral, light.taps)
         if lit < 0.0:
-            lit = lit_share(far, p, away, turn, 4)
+            lit = lit_share(far, p, away, turn, light.spiral, light.taps)
             if lit < 0.0:
                 lit = wp.where(s.sky > 0.7, 1.0, s.sky)
     direct = wp.vec3(
@@ -784,44 +786,46 @@ def shade(
     lens: Pinhole,
     primitive: wp.array(dtype=wp.int32),
     keys: wp.array(dtype=wp.int64),
+    run: int,
     # out
     rgb_out: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread colours one pixel from the primitive it sees."""
-    pixel = wp.tid()
-    x = pixel % lens.width
-    y = pixel // lens.width
-    i = primitive[pixel]
-    ray = wp.transpose(lens.turn) * ray_of(lens, x, y)
-    scale = wp.length(ray)
-    d = ray / scale
-    colour = wp.vec3(0.0, 0.0, 0.0)
-    if i == -1:
-        colour = sky_light(light, d)
-    else:
-        z = float(keys[pixel] >> wp.int64(32)) * 1.0e-6
-        if i == -2:
-            z = -lens.eye[2] / ray[2]
-        p = lens.eye + ray * z
-        footprint = z / lens.fx
-        # interleaved gradient noise (Jimenez 2014) turns the shadow samples from pixel to pixel
-        f = 0.06711056 * float(x) + 0.00583715 * float(y)
-        f = 52.9829189 * (f - wp.floor(f))
-        turn = 6.2831853 * (f - wp.floor(f))
-        kind = int(-1)
-        s = Surface()
-        if i >= 0:
-            kind = shapes.kind[i]
-            if kind == LEAF:
-                s = leaf_surface(shapes, looks, i, p, d, footprint)
-            elif kind == SPHEROID and looks.material[i] == BERRY:
-                s = berry_surface(shapes, looks, i, p, footprint)
-            else:
-                s = solid_surface(shapes, looks, i, p, footprint)
+    """One thread colours ``run`` neighbouring pixels from the primitives they see."""
+    first = wp.tid() * run
+    for pixel in range(first, first + run):
+        x = pixel % lens.width
+        y = pixel // lens.width
+        i = primitive[pixel]
+        ray = wp.transpose(lens.turn) * ray_of(lens, x, y)
+        scale = wp.length(ray)
+        d = ray / scale
+        colour = wp.vec3(0.0, 0.0, 0.0)
+        if i == -1:
+            colour = sky_light(light, d)
         else:
-            s = ground_surface(looks, p, footprint)
-        colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
-    for k in range(3):
-        rgb_out[pixel, k] = light.tone[
-            wp.clamp(int(wp.sqrt(wp.max(colour[k], 0.0) * light.exposure) * 1024.0), 0, 4095)
-        ]
+            z = float(keys[pixel] >> wp.int64(32)) * 1.0e-6
+            if i == -2:
+                z = -lens.eye[2] / ray[2]
+            p = lens.eye + ray * z
+            footprint = z / lens.fx
+            # interleaved gradient noise (Jimenez 2014) turns the shadow samples from pixel to pixel
+            f = 0.06711056 * float(x) + 0.00583715 * float(y)
+            f = 52.9829189 * (f - wp.floor(f))
+            turn = light.turns[int((f - wp.floor(f)) * 64.0) & 63]
+            kind = int(-1)
+            s = Surface()
+            if i >= 0:
+                kind = shapes.kind[i]
+                if kind == LEAF:
+                    s = leaf_surface(shapes, looks, i, p, d, footprint)
+                elif kind == SPHEROID and looks.material[i] == BERRY:
+                    s = berry_surface(shapes, looks, i, p, footprint)
+                else:
+                    s = solid_surface(shapes, looks, i, p, footprint)
+            else:
+                s = ground_surface(looks, p, footprint)
+            colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
+        for k in range(3):
+            rgb_out[pixel, k] = light.tone[
+                wp.clamp(int(wp.sqrt(wp.max(colour[k], 0.0) * light.exposure) * 1024.0), 0, 4095)
+            ]

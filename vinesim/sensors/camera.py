@@ -87,6 +87,7 @@ class Visibility:
         count = width * height
         self.width, self.height, self.device = width, height, device
         self.keys = wp.empty(count, dtype=wp.int64, device=device)
+        self._keys = self.keys.numpy() if device == "cpu" else None
         self.primitive = wp.empty(count, dtype=wp.int32, device=device)
         self.depth = wp.empty(count, dtype=float, device=device)
         self.labels = wp.empty(count, dtype=wp.int32, device=device)
@@ -99,7 +100,10 @@ class Visibility:
         clusters = len(primitives.cluster_first)
         if len(self._distance) != clusters:
             self._distance = wp.empty(clusters, dtype=float, device=self.device)
-        self.keys.fill_(int(visibility.EMPTY))
+        if self.device == "cpu":
+            self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
+        else:
+            self.keys.fill_(int(visibility.EMPTY))
         wp.launch(
             visibility.cull, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
         )
@@ -157,9 +161,10 @@ class Camera:
         seen.draw(primitives, lens, self.spec.nearest.value, self.spec.farthest.value)
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
+        run = self.info.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
-            shade.shade, self.info.width * self.info.height,
-            inputs=[primitives.shapes, primitives.looks, self._sunlight.light, near, far, lens, seen.primitive, seen.keys],
+            shade.shade, self.info.width * self.info.height // run,
+            inputs=[primitives.shapes, primitives.looks, self._sunlight.light, near, far, lens, seen.primitive, seen.keys, run],
             outputs=[self._rgb], device=self.device,
         )  # fmt: skip
         shape = (self.info.height, self.info.width)

@@ -40,10 +40,12 @@ KINDS = {
     "triangle": TRIANGLE,
 }
 
-_CLUSTER = 48
+_CLUSTER = 24
 """Most primitives of one cluster."""
 _CELL = 2.5
 """Side of the squares in which things that stand still are clustered [m]."""
+_PIECE = 0.5
+"""Longest piece of a post or wire [m]."""
 _MESH_FACES = 4000
 """Most triangles of one mesh; finer ones are simplified."""
 
@@ -240,16 +242,24 @@ def _cell_of(position: np.ndarray, first: int) -> np.ndarray:
 def _fixed(model: Model, still: int) -> _Batch | None:
     if not len(model.fixed_organ):
         return None
-    organ = model.fixed_organ
-    material, tint = (np.array([_WOOD[Organ(int(o))][k] for o in organ]) for k in (0, 1))
+    # long wires in pieces: a box around a whole one holds half of the vineyard
+    length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)
+    pieces = np.maximum(np.ceil(length / _PIECE), 1).astype(int)
+    whole = np.repeat(np.arange(len(pieces)), pieces)
+    share = np.arange(len(whole)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    ends = [(share + k)[:, None] / pieces[whole][:, None] for k in (0, 1)]
+    start, end = (model.fixed_start[whole] * (1.0 - s) + model.fixed_end[whole] * s for s in ends)
+    thick, thin = (model.fixed_radius[whole, :1] * (1.0 - s) + model.fixed_radius[whole, 1:] * s for s in ends)
+    organ, index = model.fixed_organ[whole], model.fixed_index[whole]
+    table = {o: _WOOD[Organ(int(o))] for o in np.unique(organ)}
+    material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
     rng = np.random.default_rng(3)
-    seed = rng.uniform(size=int(model.fixed_index.max()) + 1)[model.fixed_index] * 7.0
-    zero = np.zeros(len(organ))
-    height = np.minimum(model.fixed_start[:, 2], model.fixed_end[:, 2])
+    seed = rng.uniform(size=int(index.max()) + 1)[index] * 7.0
+    # bark runs through from piece to piece: distances count from the foot of a post, along a wire
+    along = np.where(np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1), start[:, 2], length[whole] * ends[0][:, 0])
     return _batch(
-        CONE, _columns(model.fixed_start, model.fixed_radius[:, 0]), b=_columns(model.fixed_end, model.fixed_radius[:, 1]),
-        c=_columns(height, seed, zero, zero), material=material, tint=tint, organ=organ, label=organ * label(Organ(1), 0) + model.fixed_index,
-        carrier=still, group=_cell_of((model.fixed_start + model.fixed_end) * 0.5, 0),
+        CONE, _columns(start, thick), b=_columns(end, thin), c=_columns(along, seed, 0.0, 0.0), material=material, tint=tint, organ=organ,
+        label=organ * label(Organ(1), 0) + index, carrier=still, group=_cell_of((start + end) * 0.5, 0),
     )  # fmt: skip
 
 
@@ -493,7 +503,7 @@ class Primitives:
         self._poses = poses
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._links = links
-        self._plant_count = total - sum(len(b) for b in rigid)
+        self.plant_count = total - sum(len(b) for b in rigid)
         self.built += 1
 
     def _bake(self, low: np.ndarray, high: np.ndarray) -> None:

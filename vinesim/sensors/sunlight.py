@@ -22,6 +22,10 @@ def _vector(v: np.ndarray) -> wp.vec3:
     return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
 
 
+def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
+    return wp.array(np.stack([x, y], 1).astype(np.float32), dtype=wp.vec2, device=device)
+
+
 class _Map:
     """One square of depths seen from the sun, around a focus that moves in steps."""
 
@@ -98,6 +102,11 @@ class Sunlight:
         light.haze = wp.vec3(0.56 * dim, 0.66 * dim, 0.78 * dim)
         light.exposure, light.taps = 0.75, taps
         light.table = wp.array(textures.sky(tuple(direction)) * np.float32(dim), dtype=wp.vec3, device=device)
+        k = np.arange(max(taps, 1))
+        angle, radius = 2.399963 * k, np.sqrt((k + 0.5) / len(k))
+        light.spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
+        turn = np.arange(64) * (2.0 * np.pi / 64)
+        light.turns = _pairs(np.cos(turn), np.sin(turn), device)
         light.tone = wp.array(textures.tone_curve(), dtype=wp.uint8, device=device)
         self.light = light
         raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])
