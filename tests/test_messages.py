@@ -1,0 +1,259 @@
+"""Messages: round trips within their stated error, and nothing but MessageError whatever arrives."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vinesim import frames
+from vinesim.net import messages
+from vinesim.net.authority import Claim
+from vinesim.net.messages import Hello, MessageError, Trees, WrongVersion
+from vinesim.world.values import RobotUpdate
+
+
+def robot(rng: np.random.Generator, joints: int = 14) -> RobotUpdate:
+    base = np.concatenate([rng.uniform(-100, 100, 3), frames.normalize(rng.standard_normal(4))])
+    velocity = rng.uniform(-3, 3, joints)
+    return RobotUpdate("tiago", 12.5, base, rng.uniform(-2, 2, 6), rng.uniform(-3, 3, joints), velocity)
+
+
+def trees(rng: np.random.Generator, sizes: list[int], rate: float = 5.0) -> Trees:
+    count, bodies = len(sizes), sum(sizes)
+    q = frames.exp(rng.uniform(-1.7, 1.7, (bodies, 3)))
+    ids = np.sort(rng.choice(1000, count, replace=False))
+    sequences = rng.integers(0, 65536, (2, count))
+    qd = rng.uniform(-rate, rate, (bodies, 3))
+    return Trees(3.25, ids, *sequences, rng.integers(0, 4, count), np.array(sizes), q, qd)
+
+
+def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(frames.log(frames.multiply(a, frames.conjugate(b))), axis=-1)
+
+
+def one_message(batch: Trees) -> bytes:
+    (payload,), _ = messages.encode_trees(batch)
+    return payload
+
+
+@pytest.mark.parametrize("joints", [0, 1, 14, 256])
+def test_robot_comes_back_within_quantisation(joints):
+    sent = robot(np.random.default_rng(joints), joints)
+    payload = messages.encode_robot(sent)
+    heard = messages.decode_robot(payload, "tiago")
+    assert len(payload) == 44 + 6 * joints
+    assert (heard.actor, heard.time) == ("tiago", 12.5)
+    np.testing.assert_allclose(heard.base_q[:3], sent.base_q[:3], atol=1e-5)
+    assert between(heard.base_q[3:], sent.base_q[3:]) < np.radians(0.005)
+    np.testing.assert_allclose(heard.base_qd, sent.base_qd, atol=0.5e-3 + 1e-9)
+    np.testing.assert_allclose(heard.position, sent.position, atol=1e-6)
+    np.testing.assert_allclose(heard.velocity, sent.velocity, atol=0.5e-3 + 1e-9)
+
+
+def test_what_was_decoded_encodes_to_the_same_bytes():
+    payload = messages.encode_robot(robot(np.random.default_rng(1)))
+    assert messages.encode_robot(messages.decode_robot(payload, "tiago")) == payload
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e-3, 5.0, 60.0])
+def test_trees_come_back_within_quantisation(rate):
+    sent = trees(np.random.default_rng(7), [5, 1, 12], rate)
+    payload = one_message(sent)
+    heard = messages.decode_trees(payload)
+    assert heard.time == sent.time
+    for field in ("tree", "ownership", "authority", "flags", "bodies"):
+        np.testing.assert_array_equal(getattr(heard, field), getattr(sent, field))
+    assert between(heard.joint_q, sent.joint_q).max() < np.radians(0.005)
+    for part in (slice(0, 5), slice(5, 6), slice(6, 18)):
+        fastest = np.abs(sent.joint_qd[part]).max()
+        assert np.abs(heard.joint_qd[part] - sent.joint_qd[part]).max() <= 0.004 * fastest + 1.3e-3
+    assert len(payload) == 14 + 3 * 13 + 18 * 9
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(1, 20), min_size=1, max_size=40))
+@settings(max_examples=60, deadline=None)
+def test_owner_and_copies_agree_to_the_bit_in_messages_of_a_datagram(seed, sizes):
+    sent = trees(np.random.default_rng(seed), sizes)
+    payloads, foretold = messages.encode_trees(sent)
+    parts = [messages.decode_trees(payload) for payload in payloads]
+    assert all(len(payload) <= messages.SAMPLE for payload in payloads)
+    for field in ("tree", "ownership", "authority", "flags", "bodies"):
+        np.testing.assert_array_equal(np.concatenate([getattr(part, field) for part in parts]), getattr(sent, field))
+    for field in ("joint_q", "joint_qd"):
+        heard = np.concatenate([getattr(part, field) for part in parts])
+        assert heard.tobytes() == getattr(foretold, field).tobytes()
+    first = slice(0, sizes[0])
+    q, qd = messages.quantised(sent.joint_q[first], sent.joint_qd[first])
+    assert q.tobytes() == foretold.joint_q[first].tobytes()
+    assert qd.tobytes() == foretold.joint_qd[first].tobytes()
+
+
+@given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3))
+def test_lean_rotations_are_those_of_frames(vector):
+    v = np.array(vector)
+    np.testing.assert_allclose(messages.quaternion(v), frames.exp(v), atol=1e-12)
+    q = frames.exp(v)
+    # at half a turn both signs of the axis are right: compare the rotations, not the vectors
+    assert between(frames.exp(messages.rotation_vector(q)), q) < 1e-6
+
+
+def test_one_update_per_tree_with_its_own_joints():
+    batch = trees(np.random.default_rng(3), [2, 3])
+    first, second = batch.updates("ada")
+    assert (first.tree, first.owner, len(first.joint_q), len(second.joint_qd)) == (int(batch.tree[0]), "ada", 2, 3)
+    np.testing.assert_array_equal(second.joint_q, batch.joint_q[2:])
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"time": float("nan")}, "finite"),
+        ({"base_q": np.array([0, 0, np.nan, 0, 0, 0, 1.0])}, "finite"),
+        ({"base_q": np.array([0, 0, 1e12, 0, 0, 0, 1.0])}, "1e9"),
+        ({"base_q": np.zeros(7)}, "unit quaternion"),
+        ({"velocity": np.zeros(3)}, "velocities"),
+        ({"position": np.full(14, np.inf)}, "finite"),
+        ({"position": np.zeros(300), "velocity": np.zeros(300)}, "at most 256"),
+    ],
+)
+def test_what_is_not_sound_is_not_sent(change, word):
+    update = dataclasses.replace(robot(np.random.default_rng(0)), **change)
+    with pytest.raises(MessageError, match=word):
+        messages.encode_robot(update)
+
+
+def test_trees_that_are_not_sound_are_not_sent():
+    batch = trees(np.random.default_rng(0), [4, 4])
+    poisoned = batch.joint_q.copy()
+    poisoned[2, 1] = np.nan
+    for wrong in (
+        dataclasses.replace(batch, joint_q=poisoned),
+        dataclasses.replace(batch, tree=batch.tree[::-1]),
+        dataclasses.replace(batch, bodies=np.array([4, 5])),
+        dataclasses.replace(batch, time=float("inf")),
+    ):
+        with pytest.raises(MessageError):
+            messages.encode_trees(wrong)
+
+
+@pytest.mark.parametrize("cut", [0, 3, 4, 13, 14, 30, -1])
+def test_truncated_messages_are_refused(cut):
+    rng = np.random.default_rng(0)
+    pose, batch = messages.encode_robot(robot(rng)), one_message(trees(rng, [4, 4]))
+    with pytest.raises(MessageError):
+        messages.decode_robot(pose[:cut], "tiago")
+    with pytest.raises(MessageError):
+        messages.decode_trees(batch[:cut])
+    with pytest.raises(MessageError):
+        messages.decode_trees(batch + b"\0")
+
+
+def test_other_versions_kinds_and_programs_are_named():
+    payload = messages.encode_robot(robot(np.random.default_rng(0)))
+    with pytest.raises(WrongVersion, match=r"version 9.*speaks 1"):
+        messages.decode_robot(payload[:2] + b"\x09" + payload[3:], "tiago")
+    with pytest.raises(MessageError, match="not from vinesim"):
+        messages.decode_robot(b"GET / HTTP/1.1", "tiago")
+    with pytest.raises(MessageError, match="kind 1 where trees"):
+        messages.decode_trees(payload)
+    with pytest.raises(MessageError, match="at most"):
+        messages.kind_of(bytes(messages.LARGEST + 1))
+
+
+def test_records_are_held_against_the_vineyard():
+    batch = dataclasses.replace(trees(np.random.default_rng(0), [4, 6]), tree=np.array([1, 2]))
+    payload = one_message(batch)
+    messages.decode_trees(payload, np.array([9, 4, 6]))
+    with pytest.raises(MessageError, match="tree 2, this vineyard has 2"):
+        messages.decode_trees(payload, np.array([9, 4]))
+    with pytest.raises(MessageError, match="tree 2 with 6 bodies, this vineyard's has 5"):
+        messages.decode_trees(payload, np.array([9, 4, 5]))
+
+
+def test_a_pose_that_is_not_finite_or_turns_too_far_is_refused():
+    payload = bytearray(messages.encode_robot(robot(np.random.default_rng(0))))
+    nan = payload.copy()
+    nan[14:18] = np.float32(np.nan).tobytes()
+    with pytest.raises(MessageError, match="finite"):
+        messages.decode_robot(bytes(nan), "tiago")
+    turned = payload.copy()
+    turned[26:32] = np.full(3, 32767, "<i2").tobytes()
+    with pytest.raises(MessageError, match="half a turn"):
+        messages.decode_robot(bytes(turned), "tiago")
+
+
+def test_greeting_comes_back_and_strangers_are_refused():
+    hello = Hello("robot-1.a", "robot", "tiago", "<robot/>", "tendone", "0123456789abcdef", index=3, joints=14)
+    assert messages.decode_hello(messages.encode_hello(hello)) == hello
+    for name in ("", "a/b", "a*", "ä", "x" * 49):
+        with pytest.raises(MessageError, match="actor name"):
+            messages.encode_hello(Hello(name))
+    with pytest.raises(WrongVersion, match="version 2"):
+        messages.decode_hello(messages.encode_hello(Hello("a", protocol=2)))
+    with pytest.raises(MessageError, match="too long"):
+        messages.encode_hello(Hello("a", urdf="x" * messages.LARGEST))
+
+
+def test_claims_come_back_and_impossible_ones_are_refused():
+    claims = [(3, Claim(1, 65535, "ada"), True), (4, Claim(0, 7, ""), False)]
+    assert messages.decode_claims(messages.encode_claims(claims), 5) == claims
+    for wrong in (
+        (5, Claim(), False),
+        (-1, Claim(), False),
+        (0, Claim(65536, 0, "a"), False),
+        (0, Claim(0, 0, "a/b"), True),
+    ):
+        with pytest.raises(MessageError):
+            messages.decode_claims(messages.encode_claims([wrong]), 5)
+
+
+def test_clock_messages_come_back():
+    assert messages.decode_time(messages.encode_time(1.5, 2.5)) == (1.5, 2.5)
+    with pytest.raises(MessageError, match="finite"):
+        messages.decode_time(messages.encode_time(float("nan")))
+
+
+DECODERS = (
+    lambda payload: messages.decode_robot(payload, "a"),
+    lambda payload: messages.decode_trees(payload, np.array([3, 4])),
+    messages.decode_trees,
+    messages.decode_hello,
+    lambda payload: messages.decode_claims(payload, 5),
+    messages.decode_time,
+    messages.kind_of,
+)
+
+
+def hold(payload: bytes) -> None:
+    """Every decoder either understands or raises MessageError."""
+    for decode in DECODERS:
+        with contextlib.suppress(MessageError):
+            decode(payload)
+
+
+@given(st.binary(max_size=200), st.sampled_from([1, 2, 3, 16, 17]), st.booleans())
+@settings(max_examples=1500, deadline=None)
+def test_arbitrary_bytes_raise_nothing_else(tail, kind, framed):
+    hold((b"VS\x01" + bytes([kind]) if framed else b"") + tail)
+
+
+@given(st.data())
+@settings(max_examples=1500, deadline=None)
+def test_damaged_messages_raise_nothing_else(data):
+    rng = np.random.default_rng(5)
+    sound = [
+        messages.encode_robot(robot(rng, 3)),
+        one_message(trees(rng, [3, 4])),
+        messages.encode_hello(Hello("a", urdf="<robot/>")),
+        messages.encode_claims([(1, Claim(1, 2, "a"), True)]),
+        messages.encode_time(1.0, 2.0),
+    ]
+    payload = bytearray(data.draw(st.sampled_from(sound)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    hold(bytes(payload[: data.draw(st.integers(0, len(payload)))]) if data.draw(st.booleans()) else bytes(payload))

@@ -1,0 +1,65 @@
+"""Dead reckoning against exact rotation, its caps, and the fading of corrections."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vinesim import frames
+from vinesim.net import smooth
+
+vectors = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
+
+
+@given(vectors, vectors)
+def test_spin_is_the_derivative_of_turning(turn, omega):
+    q, h = frames.exp(turn), 1e-5
+    after, before = (frames.multiply(frames.exp(s * h * omega), q) for s in (1.0, -1.0))
+    np.testing.assert_allclose(smooth.spin(q, omega), (after - before) / (2 * h), atol=1e-8)
+
+
+@given(vectors, vectors, st.floats(0, 0.15))
+def test_ahead_turns_almost_exactly(turn, omega, dt):
+    q = frames.exp(turn)
+    exact = frames.multiply(frames.exp(omega * dt), q)
+    found = smooth.ahead(q, smooth.spin(q, omega), dt)
+    assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-12)
+    assert smooth.angle_between(found, exact) <= np.radians(0.4)
+
+
+def test_ahead_takes_an_age_for_each():
+    q = np.tile(frames.IDENTITY, (2, 1))
+    found = smooth.ahead(q, smooth.spin(q, np.ones((2, 3))), np.array([[0.0], [0.1]]))
+    np.testing.assert_array_equal(found[0], frames.IDENTITY)
+    assert found[1, 0] > 0.04
+
+
+@given(vectors, st.floats(0, np.pi))
+def test_angle_between_is_the_angle_of_the_difference(turn, angle):
+    q = frames.exp(turn)
+    turned = frames.multiply(frames.exp(np.array([0.0, 0.6, 0.8]) * angle), q)
+    assert smooth.angle_between(turned, q) == pytest.approx(angle, abs=1e-6)
+    assert smooth.angle_between(-turned, q) == pytest.approx(angle, abs=1e-6)
+
+
+def test_extrapolation_stops_at_150_ms_and_never_runs_back():
+    np.testing.assert_allclose(smooth.horizon(np.array([-1.0, 0.0, 0.1, 0.15, 9.0])), [0, 0, 0.1, 0.15, 0.15])
+
+
+def test_due_by_distance_by_angle_and_by_silence():
+    quiet = np.zeros(1)
+    assert not smooth.due(np.array([0.0049]), np.radians([0.99]), np.array([0.99]))[0]
+    assert smooth.due(np.array([0.0051]), quiet, quiet)[0]
+    assert smooth.due(quiet, np.radians([1.01]), quiet)[0]
+    assert smooth.due(quiet, quiet, np.array([1.0]))[0]
+
+
+def test_a_correction_fades_within_100_ms():
+    assert smooth.remaining(0.0) == 1.0
+    assert smooth.remaining(0.05) == pytest.approx(0.5)
+    assert smooth.remaining(0.1) == smooth.remaining(5.0) == 0.0
+    left = smooth.remaining(np.linspace(0, 0.1, 50))
+    assert (np.diff(left) <= 0).all()
+    assert np.abs(np.diff(left)).max() < 0.04
