@@ -54,6 +54,8 @@ class _Robot:
     target: np.ndarray
     """[joint] position the drives pull to."""
     target_velocity: np.ndarray
+    forward: np.ndarray
+    """[joint] effort beside that of the springs [N m or N]."""
     base_target: np.ndarray
     """[3] x, y, yaw where the tracks hold; moves with ``base_velocity``."""
     base_velocity: np.ndarray
@@ -139,6 +141,7 @@ class Rigid:
             effort=np.array([d.effort for d in spec.drives], float),
             target=np.array(spec.home, float),
             target_velocity=np.zeros(len(spec.drives)),
+            forward=np.zeros(len(spec.drives)),
             base_target=np.array([pose[0], pose[1], _yaw(pose)]),
             base_velocity=np.zeros(3),
         )
@@ -175,6 +178,16 @@ class Rigid:
         robot = self._robot(name)
         robot.target[:] = position
         robot.target_velocity[:] = 0.0 if velocity is None else velocity
+
+    def tune(self, name: str, stiffness: np.ndarray, damping: np.ndarray, effort: np.ndarray) -> None:
+        """Give the servos other gains, and an ``effort`` beside (all [joint]): zero gains make a joint effort-driven.
+
+        The effort is added within the drive's limit. Gains stay until they are given anew.
+        """
+        robot = self._robot(name)
+        robot.stiffness[:], robot.damping[:], robot.forward[:] = stiffness, damping, effort
+        self.world.actuator_biasprm[robot.actuator, 1] = -robot.stiffness
+        self.world.actuator_biasprm[robot.actuator, 2] = -robot.damping
 
     def drive_base(self, name: str, velocity: tuple[float, float, float]) -> None:
         """Ask the tracks for (vx, vy, wz) [m/s, m/s, rad/s] in the base's axes; zero holds the place."""
@@ -215,7 +228,7 @@ class Rigid:
         robot, d = self._robot(name), self.data
         position, velocity = d.qpos[robot.q], d.qvel[robot.v]
         servo = robot.stiffness * (robot.target - position) + robot.damping * (robot.target_velocity - velocity)
-        servo = np.clip(servo, -robot.effort, robot.effort)
+        servo = np.clip(servo + robot.forward, -robot.effort, robot.effort)
         # implicit servos: over the tick they gave the force of its end, not that of its start
         effort = np.clip(servo + d.qfrc_gravcomp[robot.v], -robot.effort, robot.effort)
         return position, velocity, effort, self._contact[robot.v]
@@ -335,7 +348,8 @@ class Rigid:
         """Turn every robot's targets into MuJoCo's controls."""
         d = self.data
         for robot in self._robots.values():
-            d.ctrl[robot.actuator] = robot.stiffness * robot.target + robot.damping * robot.target_velocity
+            pull = robot.stiffness * robot.target + robot.damping * robot.target_velocity
+            d.ctrl[robot.actuator] = pull + robot.forward
             stiffness, damping = _tracks(robot.spec)
             q = d.qpos[robot.base_q]
             c, s = np.cos(q[2]), np.sin(q[2])
@@ -552,6 +566,7 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         if joint.name in driven:
             joint.actgravcomp = True
+            joint.armature = driven[joint.name].rotor
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
     base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, float(given.pose[2])])
@@ -560,8 +575,8 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
     for axis, kind, direction in axes:
         base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
     spec.attach(child, prefix=f"{name}/", frame=base.add_frame())
-    for drive in given.drives:
-        _add_servo(spec, f"{name}/{drive.joint}", drive.stiffness, drive.damping, drive.effort)
+    for drive, stiffness, damping in zip(given.drives, robot.stiffness, robot.damping, strict=True):
+        _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
     stiffness, damping = _tracks(given)
     for i, axis in enumerate(_PLANAR):
         _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])

@@ -57,6 +57,11 @@ class Drive:
     lower: float
     upper: float
     """Limits of the joint [rad or m]."""
+    rotor: float = 0.0
+    """Inertia of motor and gear seen from the joint [kg m2 or kg]: the gear ratio squared makes it the larger part.
+
+    A stiff servo at its effort limit needs it: a bare hand of 0.02 kg m2 under 40 N m gains 20 rad/s in a tick.
+    """
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
