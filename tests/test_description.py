@@ -174,7 +174,7 @@ def robot(links: str = "", joints: str = "", arm_mass: str = "1", arm_joint: str
     """A URDF of a base and one arm, with room for faults."""
     limits = '<limit lower="-1" upper="2" effort="10" velocity="1"/>'
     moments = 'ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"'
-    return f"""<robot name="simple"><link name="base"/>
+    return f"""<robot name="simple"><link name="base"><inertial><mass value="9"/><inertia {moments}/></inertial></link>
       <link name="arm"><inertial><mass value="{arm_mass}"/><inertia {moments}/></inertial></link>
       <joint name="shoulder_joint" type="revolute"><parent link="base"/><child link="arm"/>
       <axis xyz="0 0 1"/>{arm_joint or limits}</joint>{links}{joints}</robot>"""
@@ -195,7 +195,8 @@ def test_defaults_without_a_sidecar(tmp_path: pathlib.Path) -> None:
     assert simple.joints == ("shoulder_joint", "turret_joint")
     shoulder, turret = simple.drives
     assert shoulder.stiffness * 0.05 == pytest.approx(shoulder.effort)
-    assert shoulder.damping == pytest.approx(2.0 * np.sqrt(200.0 * 0.1))
+    assert shoulder.rotor == pytest.approx(0.02 * 10.0 / 1.0)
+    assert shoulder.damping == pytest.approx(2.0 * np.sqrt(200.0 * (0.1 + 0.2)))
     assert (turret.lower, turret.upper) == (-np.inf, np.inf)
     assert simple.cameras[0].frame == "camera_optical_frame"
     assert any("caster" in note for note in simple.notes)
@@ -271,6 +272,7 @@ FAULTS = {
     "upside-down limits": (robot(arm_joint="<limit lower='1' upper='0' effort='1' velocity='1'/>"), "limits 1 to 0"),
     "no effort": (robot(arm_joint="<limit lower='0' upper='1' effort='0' velocity='1'/>"), "effort 0"),
     "zero mass": (robot(arm_mass="0"), "no mass"),
+    "weightless base": (robot().replace('value="9"', 'value="0"'), "'base' moves but has no mass"),
     "negative mass": (robot(arm_mass="-2"), "mass of -2"),
     "impossible inertia": (robot().replace('izz="0.1"', 'izz="-0.1"'), "positive definite"),
     "missing mesh": (

@@ -18,6 +18,7 @@ import math
 import pathlib
 import re
 import sys
+from collections.abc import Container
 
 import msgspec
 import numpy as np
@@ -65,6 +66,8 @@ class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Position gains [N m/rad or N/m]."""
     damping: tuple[float, ...] | None = None
     """Velocity gains [N m s/rad or N s/m]."""
+    rotor: tuple[float, ...] | None = None
+    """Inertias of motor and gear seen from the joint [kg m2 or kg]."""
     home: tuple[float, ...] | None = None
     """[rad or m]"""
     tool: str = ""
@@ -463,11 +466,9 @@ def _check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: path
                 )
             if moments[0] + moments[1] < moments[2] * (1.0 - 1e-6):
                 lopsided.append(link.name)
-    for joint in order:
-        if joint.type != "fixed" and carried.get(joint.child, 0.0) <= 0.0:
-            raise _error(
-                file, f"link {joint.child!r} moves but has no mass", "give it an <inertial> with a mass above 0"
-            )
+    for link in [order[0].parent, *(joint.child for joint in order if joint.type != "fixed")]:
+        if carried.get(link, 0.0) <= 0.0:
+            raise _error(file, f"link {link!r} moves but has no mass", "give it an <inertial> with a mass above 0")
     if lopsided:
         notes.append(f"{len(lopsided)} inertias no real body has (triangle inequality), first {lopsided[0]!r}")
 
@@ -502,7 +503,7 @@ def _assemble(
         base=base,
         drives=(),
         home=home,
-        groups=sidecar.groups or _guess_groups([joint.name for joint in driven]),
+        groups=sidecar.groups or _guess_groups([joint.name for joint in driven], anchors),
         moving=moving,
         fixed=tuple((joint.parent, joint.child) for joint in fixed),
         fixed_q=np.array([_origin(joint) for joint in fixed]).reshape(-1, 7),
@@ -516,18 +517,22 @@ def _assemble(
         notes=(),
     )
     _check_sidecar(description, {joint.name for joint in driven}, file.with_suffix(".toml"))
-    gains = {}
+    gains, rotors = {}, {}
     for group in description.groups.values():
         for i, joint in enumerate(group.joints):
             if group.home is not None:
                 home[[drive.name for drive in driven].index(joint)] = group.home[i]
             if group.stiffness is not None and group.damping is not None:
                 gains[joint] = group.stiffness[i], group.damping[i]
+            if group.rotor is not None:
+                rotors[joint] = group.rotor[i]
     inertia = _carried_inertia(robot, description)
     guessed = [joint.name for joint in driven if joint.name not in gains]
     if guessed:
         notes.append(f"servo gains of {len(guessed)} joints are derived from effort limits and inertia")
-    drives = tuple(_drive(joint, gains.get(joint.name), inertia[joint.name]) for joint in driven)
+    drives = tuple(
+        _drive(joint, gains.get(joint.name), rotors.get(joint.name), inertia[joint.name]) for joint in driven
+    )
     return dataclasses.replace(description, drives=drives, notes=tuple(notes))
 
 
@@ -556,14 +561,19 @@ def _resting(joint: yourdfpy.Joint) -> float:
     return 0.5 * (joint.limit.lower + joint.limit.upper)
 
 
-def _guess_groups(joints: list[str]) -> dict[str, Group]:
+def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, Group]:
     """Groups from names in PAL style: ``arm_left_3_joint`` is of ``arm_left``, ``gripper_left_...`` of its gripper."""
+
+    def tool(group: str) -> str:
+        names = (group.replace("arm", "gripper") + "_grasping_link", group + "_tool_link")
+        return next((name for name in names if name in links), "")
+
     groups: dict[str, list[str]] = {}
     for joint in joints:
         hand = re.match(r"(gripper|hand)_(left|right)", joint)
         stem = hand.group() if hand else re.sub(r"(_lift)?(_?\d+)?(_joint)?$", "", joint)
         groups.setdefault(stem or joint, []).append(joint)
-    return {name: Group(joints=tuple(members)) for name, members in groups.items()}
+    return {name: Group(joints=tuple(members), tool=tool(name)) for name, members in groups.items()}
 
 
 def _guess_cameras(root: etree._Element, notes: list[str]) -> tuple[Mount, ...]:
@@ -604,7 +614,7 @@ def _check_sidecar(description: Description, driven: set[str], file: pathlib.Pat
         for joint in group.joints:
             if joint not in driven:
                 raise _error(file, f"group {name!r} names {joint!r}, which no drive moves", "name driven joints only")
-        for key in ("stiffness", "damping", "home"):
+        for key in ("stiffness", "damping", "rotor", "home"):
             values = getattr(group, key)
             if values is not None and len(values) != len(group.joints):
                 raise _error(
@@ -650,13 +660,16 @@ def _is_beyond(link: str, joint_child: str, above: dict[str, str]) -> bool:
     return link == joint_child
 
 
-def _drive(joint: yourdfpy.Joint, gains: tuple[float, float] | None, inertia: float) -> Drive:
+def _drive(joint: yourdfpy.Joint, gains: tuple[float, float] | None, rotor: float | None, inertia: float) -> Drive:
     limit = joint.limit
     endless = joint.type == "continuous"
+    if rotor is None:
+        # full effort brings the bare drive to full speed in 20 ms
+        rotor = 0.02 * limit.effort / limit.velocity
     if gains is None:
         # full effort at 0.05 rad or 5 mm off, and critical damping
         stiffness = limit.effort / (0.005 if joint.type == "prismatic" else 0.05)
-        gains = stiffness, 2.0 * math.sqrt(stiffness * max(inertia, 1e-4))
+        gains = stiffness, 2.0 * math.sqrt(stiffness * (inertia + rotor))
     return Drive(
         joint=joint.name,
         stiffness=gains[0],
@@ -665,4 +678,5 @@ def _drive(joint: yourdfpy.Joint, gains: tuple[float, float] | None, inertia: fl
         velocity=limit.velocity,
         lower=-math.inf if endless else limit.lower,
         upper=math.inf if endless else limit.upper,
+        rotor=rotor,
     )

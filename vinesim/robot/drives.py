@@ -113,8 +113,7 @@ class Robot(Embodied):
         self.interface = np.full(len(self.setpoint), Interface.POSITION)
         """[joint] :class:`Interface` by which each was commanded last"""
         self._goal = self.setpoint.copy()
-        self._velocity = np.zeros_like(self.setpoint)
-        self._last_velocity = np.zeros_like(self.setpoint)
+        self._retuned = True
         self._base_goal = np.zeros(2)
         self._base_velocity = np.zeros(2)
         self._base_time = -np.inf
@@ -139,7 +138,7 @@ class Robot(Embodied):
         """Go to positions [rad or m] as fast as the joints may; beyond a limit means to the limit."""
         i, values = self._checked(position, joints)
         self._goal[i] = np.clip(values, self.lower[i], self.upper[i])
-        self.interface[i] = Interface.POSITION
+        self._switch(i, Interface.POSITION)
 
     def command_velocity(
         self, velocity: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None = None
@@ -147,19 +146,15 @@ class Robot(Embodied):
         """Move with velocities [rad/s or m/s] until the joints' limits."""
         i, values = self._checked(velocity, joints)
         self._goal[i] = np.clip(values, -self.speed[i], self.speed[i])
-        self.interface[i] = Interface.VELOCITY
+        self._switch(i, Interface.VELOCITY)
 
     def command_effort(
         self, effort: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None = None
     ) -> None:
-        """Transmit efforts [N m or N] beyond the weight, which the drives carry; zero lets the joint be moved.
-
-        Exact at rest and in steady motion; a change of speed is felt with a lag of some ticks, because the servo
-        that transmits it has the joint's damping.
-        """
+        """Transmit efforts [N m or N] beyond the weight, which the drives carry; zero lets the joint be moved."""
         i, values = self._checked(effort, joints)
         self._goal[i] = np.clip(values, -self.effort[i], self.effort[i])
-        self.interface[i] = Interface.EFFORT
+        self._switch(i, Interface.EFFORT)
 
     def command_gripper(self, group: str, opening: float) -> None:
         """Open a gripper's fingers to ``opening`` [m] between them (sum over prismatic fingers) or [rad]."""
@@ -177,6 +172,28 @@ class Robot(Embodied):
         )
         self._base_time = time
 
+    def command_impedance(
+        self,
+        stiffness: Sequence[float] | np.ndarray,
+        damping: Sequence[float] | np.ndarray,
+        joints: Sequence[str] | np.ndarray | None = None,
+    ) -> None:
+        """Be compliant: gains [N m/rad, N m s/rad or N/m, N s/m] of joints commanded by position or velocity.
+
+        D6.4 section 3.1. Kept until given anew; :meth:`stop` leaves them.
+        """
+        i, stiff = self._checked(stiffness, joints)
+        _, damp = self._checked(damping, joints)
+        if (stiff < 0.0).any() or (damp < 0.0).any():
+            raise CommandError(f"{self.name}: gains below zero would feed energy in; give 0 or more")
+        self._stiffness[i], self._damping[i] = stiff, damp
+        self._retuned = True
+
+    def _switch(self, joints: np.ndarray, interface: Interface) -> None:
+        if interface == Interface.EFFORT or (self.interface[joints] == Interface.EFFORT).any():
+            self._retuned = True
+        self.interface[joints] = interface
+
     def _checked(
         self, values: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -193,28 +210,25 @@ class Robot(Embodied):
     def control(self, time: float) -> None:
         """Hand set-points for the tick that starts at ``time`` [s] to the servos; call it before physics steps."""
         dt = self.rigid.dt
-        position, velocity, _, _ = self.rigid.read(self.name)
+        position = self.rigid.read(self.name)[0]
         by_velocity = self.interface == Interface.VELOCITY
         by_effort = self.interface == Interface.EFFORT
 
         # A servo that already gives all it has gives no more when asked for more, but would overshoot when let go.
-        lead = self.effort / self._stiffness + self.speed * dt
-        start = np.clip(self.setpoint, position - lead, position + lead)
-        start = np.where(by_effort, position, start)
-        step = np.where(by_velocity, self._goal * dt, self._goal - start)
+        lead = self.effort / np.maximum(self._stiffness, 1e-9) + self.speed * dt
+        start = np.where(by_effort, position, np.clip(self.setpoint, position - lead, position + lead))
+        step = np.where(by_velocity, self._goal * dt, np.where(by_effort, 0.0, self._goal - start))
         target = np.clip(start + np.clip(step, -self.speed * dt, self.speed * dt), self.lower, self.upper)
-        target_velocity = (target - start) / dt
-
-        if by_effort.any():
-            # Ask the implicit servo for what gives this effort at the end of the tick, were the last tick's
-            # acceleration to go on: with c = (dt D + dt^2 K) / M, dv = dt tau / M (1 + c)^-1 + c (1 + c)^-1 dv_last.
-            expected = np.clip(2.0 * velocity - self._last_velocity, -self.speed, self.speed)
-            pull = position + dt * expected + self._goal / self._stiffness
-            target = np.where(by_effort, pull, target)
-            target_velocity = np.where(by_effort, expected, target_velocity)
-        self._last_velocity = velocity
         self.setpoint = target
-        self.rigid.command(self.name, target, target_velocity)
+        self.rigid.command(self.name, target, np.where(by_effort, 0.0, (target - start) / dt))
+        if self._retuned:
+            self.rigid.tune(
+                self.name,
+                np.where(by_effort, 0.0, self._stiffness),
+                np.where(by_effort, 0.0, self._damping),
+                np.where(by_effort, self._goal, 0.0),
+            )
+            self._retuned = False
 
         limits = self.description.base_limits
         goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
