@@ -4,11 +4,11 @@ import pytest
 from vinesim.client.trace import Rows, remote_error, touch_to_motion
 
 
-def rows(clock, x, force):
+def rows(clock, x, force, told=True):
     x, force = np.asarray(x, float), np.asarray(force, float)
     zero = np.zeros_like(x)
     clock = np.asarray(clock, float)
-    return Rows(clock, clock, np.stack([x, zero, zero], -1), np.stack([zero, force, zero], -1))
+    return Rows(clock, clock, np.stack([x, zero, zero], -1), np.stack([zero, force, zero], -1), np.full(len(x), told))
 
 
 def test_motion_in_the_tick_of_the_touch_counts_zero():
@@ -48,3 +48,12 @@ def test_rows_survive_a_file(tmp_path):
     after = Rows.load(tmp_path / "trace.npz")
     assert np.array_equal(after.displacement, before.displacement)
     assert np.array_equal(after.clock, before.clock)
+
+
+def test_remote_error_is_judged_only_while_the_copy_was_told():
+    t = np.arange(0, 4, 0.01)
+    owner = rows(t, 0.1 * t, np.ones_like(t))
+    assert remote_error(owner, rows(t, 0 * t, 0 * t, told=False)) is None
+    half = rows(t, np.where(t < 2, 0.0, 0.1 * t), 0 * t)
+    half.told[t < 2] = False
+    assert remote_error(owner, half)["max"] < 0.01

@@ -71,6 +71,7 @@ class Client:
         self.senses: list[Callable[[Client], None]] = []
         """Called every tick after the step: ROS, cameras, whoever wants to know."""
         self.trace: Trace | None = None
+        """If set, what happens to one bunch is noted in it."""
         self.far = Faraway()
         self._clock = clock
         self._copies: dict[int, TreeUpdate] = {}
@@ -115,7 +116,8 @@ class Client:
             for contact in self.physics.contacts:
                 if contact.body == body:
                     force -= contact.force
-            self.trace.add(self.physics.time, self.physics.state.body_q[body], force)
+            told = int(self.model.body_tree[body]) in self._copies
+            self.trace.add(self.physics.time, self.physics.state.body_q[body], force, told)
         for sense in self.senses:
             sense(self)
 

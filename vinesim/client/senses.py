@@ -54,6 +54,7 @@ class Senses:
                 self.client.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=namespace,
                 static_transforms=fixed, cameras=[m.name for m in description.cameras],
                 lidars=[m.name for m in description.lidars], base=description.base,
+                clock=not namespace,  # one clock in a ROS domain: that of the client without a namespace
             )
         )  # fmt: skip
         poles = np.flatnonzero(self.client.model.fixed_organ == Organ.POLE)

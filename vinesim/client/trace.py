@@ -24,6 +24,7 @@ class Trace:
         self._time = np.zeros(capacity)
         self._force = np.zeros((capacity, 3))
         self._position = np.zeros((capacity, 3))
+        self._told = np.zeros(capacity, bool)
         self.length = 0
 
     def _centre(self, pose: np.ndarray) -> np.ndarray:
@@ -32,8 +33,10 @@ class Trace:
         axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
         return pose[:3] + axis * self._com[0]
 
-    def add(self, sim_time: float, pose: np.ndarray, force: np.ndarray) -> None:
-        """Note the pose [7] after a tick and the force [3] N that acted on the bunch during it."""
+    def add(self, sim_time: float, pose: np.ndarray, force: np.ndarray, told: bool = False) -> None:
+        """Note the pose [7] after a tick, the force [3] N that acted on the bunch during it, and whether another
+        client owned it and told of it.
+        """
         if self.length == len(self._clock):
             return
         row = self.length
@@ -41,6 +44,7 @@ class Trace:
         self._time[row] = sim_time
         self._position[row] = self._centre(pose)
         self._force[row] = force
+        self._told[row] = told
         self.length += 1
 
     def centre(self) -> np.ndarray:
@@ -55,7 +59,7 @@ class Trace:
     def rows(self) -> Rows:
         """Everything noted so far."""
         n = self.length
-        return Rows(self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n])
+        return Rows(self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._told[:n])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +74,8 @@ class Rows:
     """[tick, 3] m from rest, of the bunch's centre."""
     force: np.ndarray
     """[tick, 3] N on the bunch."""
+    told: np.ndarray
+    """[tick] bool: another client owned the bunch and told of it."""
 
     def save(self, path: pathlib.Path) -> None:
         """Write as .npz."""
@@ -103,19 +109,24 @@ def touch_to_motion(rows: Rows) -> int | None:
 def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[str, float] | None:
     """How far the remote copy of the bunch was from the owner's, at the same instant of the host's clock [mm].
 
-    Judged while the owner's bunch was displaced by more than ``threshold`` [m] and both clients ran. The network's
-    delay is in it. None if there is no such time.
+    Judged while the owner's bunch was displaced by more than ``threshold`` [m] and the other client was told of it.
+    The network's delay is in it. None if there is no such time.
     """
-    inside = (local.clock >= remote.clock[0]) & (local.clock <= remote.clock[-1]) if len(remote.clock) else np.zeros(0, bool)
-    inside = inside & (np.linalg.norm(local.displacement, axis=1) > threshold) if len(inside) else inside
-    if not inside.any():
+    if len(remote.clock) < 2:
         return None
-    at = local.clock[inside]
+    after = np.clip(np.searchsorted(remote.clock, local.clock), 1, len(remote.clock) - 1)
+    common = (local.clock >= remote.clock[0]) & (local.clock <= remote.clock[-1])
+    common &= remote.told[after] & remote.told[after - 1]
+    common &= np.linalg.norm(local.displacement, axis=1) > threshold
+    if not common.any():
+        return None
+    at = local.clock[common]
     seen = np.stack([np.interp(at, remote.clock, remote.displacement[:, k]) for k in range(3)], -1)
-    error = 1e3 * np.linalg.norm(seen - local.displacement[inside], axis=1)
+    error = 1e3 * np.linalg.norm(seen - local.displacement[common], axis=1)
     return {
         "p50": float(np.percentile(error, 50)),
         "p95": float(np.percentile(error, 95)),
         "max": float(error.max()),
-        "peak_displacement": 1e3 * float(np.linalg.norm(local.displacement[inside], axis=1).max()),
+        "seconds": float(common.sum() * np.median(np.diff(local.clock))),
+        "peak_displacement": 1e3 * float(np.linalg.norm(local.displacement[common], axis=1).max()),
     }

@@ -1,0 +1,154 @@
+"""The whole way of a touch, in one process over the in-memory bus: every part but the network's wire is the real one."""
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.client.client import Client
+from vinesim.client.places import bunch_centres, bunch_in_reach, spawn_pose
+from vinesim.client.trace import Trace, remote_error, touch_to_motion
+from vinesim.net.bus import MemoryHub
+from vinesim.robot.description import load as load_robot
+from vinesim.robot.reach import ReachAndPush
+from vinesim.world.generate import generate
+from vinesim.world.scene import load
+
+DT = 0.01
+DELAY = 0.02
+
+
+class World:
+    """Two clients on one bus, ticked in turn by one clock."""
+
+    def __init__(self, visitor_back=0.0):
+        self.now = 100.0
+        self.scene = load("demo")
+        self.model = generate(self.scene)
+        self.hub = MemoryHub(delay=DELAY, jitter=0.005, seed=1)
+        vinebot = load_robot("vinebot")
+        start = spawn_pose(self.scene, 0)
+        self.bunch = bunch_in_reach(self.model, start)
+        self.body = int(self.model.bunch_body[self.bunch])
+        self.tree = int(self.model.body_tree[self.body])
+        places = {"picker": start, "visitor": spawn_pose(self.scene, 1, visitor_back)}
+        self.clients = {
+            name: Client(
+                self.scene, self.model, vinebot, self.hub.bus(name), name=name, pose=pose, clock=lambda: self.now
+            )
+            for name, pose in places.items()
+        }
+        self.picker, self.visitor = self.clients.values()
+        for client in self.clients.values():
+            client.trace = Trace(self.model, self.bunch, client.physics.state.body_q[self.body].copy(), 20000)
+        base = self.picker.robot.rigid.base("picker")[0]
+        sideways = frames.rotate(frames.conjugate(base[3:]), self.picker.trace.centre() - base[:3])[1]
+        side = "left" if sideways >= 0 else "right"
+        self.reach = ReachAndPush(self.picker.robot, side, self.picker.trace.centre, repeat=False)
+        self.picker.jobs.append(self.reach.control)
+
+    def tick(self):
+        for client in self.clients.values():
+            client.tick()
+        self.hub.advance(DT)
+        self.now += DT
+
+    def until(self, condition, limit=20.0):
+        for _ in range(round(limit / DT)):
+            self.tick()
+            if condition():
+                return
+        pytest.fail(f"did not come true within {limit} s of simulated time")
+
+    def touching(self):
+        return [c for c in self.picker.physics.contacts if c.actor == "picker" and c.body == self.body]
+
+
+@pytest.fixture(scope="module")
+def world():
+    world = World()
+    yield world
+    for client in world.clients.values():
+        client.exchange.bus.close()
+
+
+def test_the_whole_way(world):
+    picker, visitor = world.picker, world.visitor
+    world.until(lambda: "visitor" in picker.others and "picker" in visitor.others, 3.0)
+
+    # 1, 2: a finger meets the bunch: equal and opposite forces, in the same tick
+    rest = picker.trace.centre()
+    world.until(world.touching)
+    assert touch_to_motion(picker.trace.rows()) == 0
+    # 3: the drives carry the reaction
+    world.until(lambda: sum(np.linalg.norm(c.force) for c in world.touching()) > 1.0)
+    sample = picker.robot.sample(picker.physics.time, picker.physics.contacts)
+    assert np.abs(sample.joints.contact).max() > 0.05
+    # 4: what is near is awake, and nothing else
+    awake = picker.physics.plants.awake
+    assert world.tree in awake
+    roots = world.model.tree_pose[awake, :3]
+    base = picker.robot.rigid.base("picker")[0][:3]
+    assert np.linalg.norm(roots[:, :2] - base[:2], axis=1).max() < 3.5
+    assert len(awake) < 0.2 * len(world.model.tree_first)
+
+    # 5: the one who touches owns, everywhere
+    world.until(lambda: visitor.exchange.owner(world.tree) == "picker", 1.0)
+    assert picker.exchange.owner(world.tree) == "picker"
+    assert picker.exchange.counters.environment.bytes_out > 0
+
+    # 6: the copy follows while the bunch is held away from where it hung
+    world.until(lambda: picker.trace.displacement > 0.03)
+    for _ in range(50):
+        world.tick()
+    error = remote_error(picker.trace.rows(), visitor.trace.rows())
+    assert error["p50"] < 4.0
+    assert error["peak_displacement"] > 30.0
+    assert visitor.trace.displacement > 0.6 * picker.trace.displacement
+
+    # the hand goes, the bunch swings out and sleeps, all copies agree, and silence follows
+    world.until(lambda: world.reach.phase.value == "done", 20.0)
+    picker.jobs.clear()
+    away = picker.robot.description.home
+    picker.robot.command_position(away)
+    world.until(lambda: world.tree not in picker.physics.plants.awake, 60.0)
+    world.until(lambda: visitor.exchange.owner(world.tree) is None, 2.0)
+    here = world.model.bodies_of(world.tree)
+    mine, theirs = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]
+    assert np.abs(np.abs((mine * theirs).sum(1)) - 1.0).max() < 1e-6
+    sent = picker.exchange.counters.environment.bytes_out
+    for _ in range(100):
+        world.tick()
+    assert picker.exchange.counters.environment.bytes_out == sent
+    assert np.linalg.norm(picker.trace.centre() - rest) < 0.01
+
+
+def test_nobody_near_hears_nothing():
+    world = World(visitor_back=20.0)
+    world.until(lambda: "visitor" in world.picker.others)
+    world.until(lambda: world.picker.trace.displacement > 0.03)
+    assert world.picker.far.ticks_touching > 0
+    assert world.picker.far.bytes == 0
+    assert world.picker.exchange.counters.environment.bytes_out == 0
+    assert world.visitor.exchange.counters.environment.bytes_in == 0
+    assert world.picker.exchange.counters.actor.bytes_out > 0
+
+
+def test_twice_the_same_bits():
+    """F11: the same inputs give the same state, bit for bit, on one machine."""
+
+    def run():
+        world = World()
+        for _ in range(1000):
+            world.tick()
+        mine, theirs = (client.physics.state for client in world.clients.values())
+        return np.concatenate([mine.joint_q.ravel(), mine.joint_qd.ravel(), theirs.joint_q.ravel()])
+
+    assert np.array_equal(run(), run())
+
+
+def test_the_chosen_bunch_can_be_reached():
+    scene = load("demo")
+    model = generate(scene)
+    pose = spawn_pose(scene, 0)
+    centre = bunch_centres(model)[bunch_in_reach(model, pose)]
+    assert 0.35 < np.hypot(*(centre - pose[:3])[:2]) < 0.85
