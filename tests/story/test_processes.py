@@ -1,0 +1,101 @@
+"""The same way over real processes, with real Zenoh and ROS 2: what `vinesim demo` does."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+DEMO = [sys.executable, "-m", "vinesim.cli", "demo", "--headless"]
+
+
+def children_of(marker):
+    """Processes whose command line holds ``marker``."""
+    found = []
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            with open(f"/proc/{pid}/cmdline", "rb") as file:
+                line = file.read().decode(errors="replace")
+        except OSError:
+            continue
+        if marker in line and int(pid) != os.getpid():
+            found.append(line.replace("\0", " "))
+    return found
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo")
+    done = subprocess.run([*DEMO, "--seconds", "16", "--out", str(out)], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return out, json.loads((out / "summary.json").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+class TestDemo:
+    def test_the_touch_moves_the_bunch_at_once(self, run):
+        _, summary = run
+        assert summary["touch_to_motion_ticks"] <= 1
+        assert 1.0 < summary["force_peak_n"] < 200.0
+
+    def test_nobody_near_no_byte(self, run):
+        _, summary = run
+        assert summary["ticks_touching_when_far"] > 0
+        assert summary["environment_bytes_when_far"] == 0
+        assert summary["environment_bytes_out"] > 0
+
+    def test_the_copy_moved_too(self, run):
+        _, summary = run
+        error = summary["remote_displacement_error_mm"]
+        assert error["peak_displacement"] > 10.0
+        assert error["p50"] < 0.5 * error["peak_displacement"]
+
+    def test_a_stranger_heard_every_kind_of_topic(self, run):
+        _, summary = run
+        heard = summary["ros_received"]
+        camera = "/head_front_camera"
+        for topic in (
+            "/clock", "/joint_states", "/tf", "/tf_static", "/robot_description", "/tf_environment", "/lidar/points",
+            f"{camera}/rgb/image_raw", f"{camera}/rgb/camera_info", f"{camera}/depth/image_raw",
+            f"{camera}/depth/camera_info", f"{camera}/depth/points", f"{camera}/labels", "/visitor/joint_states",
+        ):  # fmt: skip
+            assert heard.get(topic, 0) > 0, topic
+
+    def test_pictures_and_plot_are_there(self, run):
+        out, _ = run
+        rgb = cv2.imread(str(out / "rgb.png"))
+        assert rgb.shape == (480, 640, 3)
+        assert rgb.std() > 10.0
+        depth = cv2.imread(str(out / "depth_mm.png"), cv2.IMREAD_UNCHANGED)
+        assert depth.dtype == np.uint16
+        assert 300 < np.median(depth[depth > 0]) < 10_000
+        for name in ("labels.png", "depth.png", "touch.png"):
+            assert cv2.imread(str(out / name)) is not None
+
+    def test_no_process_is_left(self, run):
+        out, _ = run
+        assert children_of(str(out)) == []
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_everything(tmp_path):
+    out = tmp_path / "interrupted"
+    demo = subprocess.Popen([*DEMO, "--seconds", "60", "--out", str(out)], stderr=subprocess.PIPE, text=True)
+    try:
+        for line in demo.stderr:
+            if " Hz " in line:
+                break
+        assert children_of(str(out))
+        demo.send_signal(signal.SIGINT)
+        _, rest = demo.communicate(timeout=60)
+    finally:
+        demo.kill()
+    assert demo.returncode == 130
+    assert "Traceback" not in rest
+    assert children_of(str(out)) == []
+    assert not (out / "summary.json").exists()
