@@ -24,23 +24,25 @@ ARM = """<robot name="arm">
 <joint name="stand" type="fixed"><parent link="base_footprint"/><child link="chassis"/><origin xyz="0 0 0.25"/></joint>
 <link name="upper"><inertial><origin xyz="0.2 0 0"/><mass value="4"/>
   <inertia ixx="0.01" iyy="0.06" izz="0.06" ixy="0" ixz="0" iyz="0"/></inertial>
- <collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/><geometry><cylinder radius="0.04" length="0.4"/></geometry></collision>
-</link>
+ <collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/><geometry><cylinder radius="0.04" length="0.4"/></geometry>
+ </collision></link>
 <joint name="shoulder" type="revolute"><parent link="chassis"/><child link="upper"/><origin xyz="0.3 0 0.5"/>
  <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="90" velocity="2"/></joint>
 <link name="lower"><inertial><origin xyz="0.2 0 0"/><mass value="2"/>
   <inertia ixx="0.005" iyy="0.03" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial>
- <collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/><geometry><cylinder radius="0.03" length="0.4"/></geometry></collision>
-</link>
+ <collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/><geometry><cylinder radius="0.03" length="0.4"/></geometry>
+ </collision></link>
 <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/>
  <axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="60" velocity="2"/></joint>
-<link name="slider"><inertial><mass value="0.5"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+<link name="slider"><inertial><mass value="0.5"/>
+  <inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
  <collision><geometry><sphere radius="0.04"/></geometry></collision></link>
 <joint name="extend" type="prismatic"><parent link="lower"/><child link="slider"/><origin xyz="0.4 0 0"/>
  <axis xyz="1 0 0"/><limit lower="0" upper="0.1" effort="80" velocity="0.5"/></joint>
 <link name="tool"/>
 <joint name="mount" type="fixed"><parent link="slider"/><child link="tool"/><origin xyz="0.06 0 0"/></joint>
-<link name="wheel"><inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="wheel"><inertial><mass value="1"/>
+  <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="axle" type="continuous"><parent link="chassis"/><child link="wheel"/><axis xyz="0 1 0"/></joint>
 </robot>"""
 
@@ -103,7 +105,7 @@ def test_split_step_is_mj_step_to_the_bit():
 def test_prediction_and_response_are_what_the_second_half_does():
     rigid = Rigid(yard())
     rigid.add_robot(arm())
-    rigid.command("anna", HOME + [0.2, -0.3, 0.02])
+    rigid.command("anna", HOME + np.array([0.2, -0.3, 0.02]))
     step(rigid, 5)
     rng = np.random.default_rng(1)
     force = np.zeros(rigid.world.nv)
@@ -217,7 +219,7 @@ def test_base_turns_in_its_own_axes():
 def test_joining_in_mid_motion_carries_every_number_over():
     rigid = Rigid(yard(boxes=1))
     rigid.add_robot(arm())
-    rigid.command("anna", HOME + [0.5, 0.5, -0.04], np.array([0.5, 0.0, 0.0]))
+    rigid.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
     rigid.drive_base("anna", (0.2, 0.0, 0.1))
     rigid.push("anna", "lower", np.array([0.0, 5.0, 0.0]))
     step(rigid, 13)
@@ -229,7 +231,7 @@ def test_joining_in_mid_motion_carries_every_number_over():
     )
     alone = Rigid(yard(boxes=1))
     alone.add_robot(arm())
-    alone.command("anna", HOME + [0.5, 0.5, -0.04], np.array([0.5, 0.0, 0.0]))
+    alone.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
     alone.drive_base("anna", (0.2, 0.0, 0.1))
     alone.push("anna", "lower", np.array([0.0, 5.0, 0.0]))
     step(alone, 13)

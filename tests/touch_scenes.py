@@ -45,13 +45,16 @@ def cane(at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, h
 
 def _inertial(mass: float) -> str:
     i = 0.004 * mass
-    return f'<inertial><mass value="{mass}"/><inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>'
+    return (
+        f'<inertial><mass value="{mass}"/><inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
 
 
 def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0") -> str:
     return (
-        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/>'
-        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1000" velocity="5"/></joint>'
+        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{origin}"/>'
+        f'<axis xyz="{axis}"/><limit lower="-2" upper="2" effort="1000" velocity="5"/></joint>'
     )
 
 
@@ -60,7 +63,8 @@ GRIPPER = f"""<robot name="gripper"><link name="base_footprint">{_inertial(50)}<
 {_slide("shift", "base_footprint", "carriage", "0 1 0")}{_slide("lift", "carriage", "hand", "0 0 1")}
 <link name="left">{_inertial(0.1)}<collision><geometry><box size="0.04 0.02 0.07"/></geometry></collision></link>
 <link name="right">{_inertial(0.1)}<collision><geometry><box size="0.04 0.02 0.07"/></geometry></collision></link>
-{_slide("close_left", "hand", "left", "0 -1 0", "0 0.085 0")}{_slide("close_right", "hand", "right", "0 1 0", "0 -0.085 0")}
+{_slide("close_left", "hand", "left", "0 -1 0", "0 0.085 0")}
+{_slide("close_right", "hand", "right", "0 1 0", "0 -0.085 0")}
 </robot>"""
 
 

@@ -199,8 +199,8 @@ def bound_trees(
     start_out: wp.array(dtype=wp.vec3),
     end_out: wp.array(dtype=wp.vec3),
     speed_out: wp.array(dtype=float),
-    low_out: wp.array2d(dtype=float),
-    high_out: wp.array2d(dtype=float),
+    low_out: wp.array(dtype=wp.vec3),
+    high_out: wp.array(dtype=wp.vec3),
 ):
     """Put the shapes of one tree into the world and find the box around them, grown by how far they come in a tick."""
     tree = trees[wp.tid()]
@@ -220,9 +220,78 @@ def bound_trees(
         start_out[s] = start
         end_out[s] = end
         speed_out[s] = speed
-    for i in range(3):
-        low_out[i, tree] = low[i]
-        high_out[i, tree] = high[i]
+    low_out[tree] = low
+    high_out[tree] = high
+
+
+@wp.kernel
+def bound_actors(
+    # model
+    stir: wp.float64,
+    actor_first: wp.array(dtype=wp.int32),
+    actor_lies: wp.array(dtype=wp.bool),
+    # in
+    geom_speed: wp.array(dtype=wp.float64),
+    geom_low: wp.array(dtype=wp.vec3),
+    geom_high: wp.array(dtype=wp.vec3),
+    # out
+    low_out: wp.array(dtype=wp.vec3),
+    high_out: wp.array(dtype=wp.vec3),
+):
+    """Box in the world around one actor; an empty one if it is of the kind that lies about and does not stir."""
+    actor = wp.tid()
+    low = wp.vec3(1.0e30)
+    high = wp.vec3(-1.0e30)
+    fastest = wp.float64(0.0)
+    for g in range(actor_first[actor], actor_first[actor + 1]):
+        low = wp.min(low, geom_low[g])
+        high = wp.max(high, geom_high[g])
+        fastest = wp.max(fastest, geom_speed[g])
+    if actor_lies[actor] and fastest < stir:
+        low = wp.vec3(1.0e30)
+        high = wp.vec3(-1.0e30)
+    low_out[actor] = low
+    high_out[actor] = high
+
+
+@wp.func
+def apart(a_low: wp.vec3, a_high: wp.vec3, b_low: wp.vec3, b_high: wp.vec3):
+    """Whether two boxes have nothing in common."""
+    return (
+        a_low[0] > b_high[0]
+        or a_low[1] > b_high[1]
+        or a_low[2] > b_high[2]
+        or b_low[0] > a_high[0]
+        or b_low[1] > a_high[1]
+        or b_low[2] > a_high[2]
+    )
+
+
+@wp.kernel
+def reach(
+    # model
+    actor_first: wp.array(dtype=wp.int32),
+    # in
+    tree_low: wp.array(dtype=wp.vec3),
+    tree_high: wp.array(dtype=wp.vec3),
+    actor_low: wp.array(dtype=wp.vec3),
+    actor_high: wp.array(dtype=wp.vec3),
+    geom_low: wp.array(dtype=wp.vec3),
+    geom_high: wp.array(dtype=wp.vec3),
+    # out
+    near_out: wp.array(dtype=wp.bool),
+):
+    """Say of one tree whether some shape of an actor reaches into its box."""
+    tree = wp.tid()
+    low = tree_low[tree]
+    high = tree_high[tree]
+    near = bool(False)
+    for actor in range(actor_first.shape[0] - 1):
+        if not apart(low, high, actor_low[actor], actor_high[actor]):
+            for g in range(actor_first[actor], actor_first[actor + 1]):
+                if not apart(low, high, geom_low[g], geom_high[g]):
+                    near = True
+    near_out[tree] = near
 
 
 @wp.kernel
@@ -230,6 +299,7 @@ def meet(
     # model
     dt: wp.float64,
     slots: int,
+    tree_shape: wp.array(dtype=wp.int32),
     shape_bunch: wp.array(dtype=wp.int32),
     shape_radius: wp.array(dtype=float),
     geom_id: wp.array(dtype=wp.int32),
@@ -239,9 +309,9 @@ def meet(
     geom_radius: wp.array(dtype=wp.float64),
     # in
     bunch_attached: wp.array(dtype=wp.bool),
-    shapes: wp.array(dtype=wp.int32),
-    geoms: wp.array(dtype=wp.int32),
-    geom_count: wp.array(dtype=wp.int32),
+    trees: wp.array(dtype=wp.int32),
+    tree_low: wp.array(dtype=wp.vec3),
+    tree_high: wp.array(dtype=wp.vec3),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
     shape_speed: wp.array(dtype=float),
@@ -249,53 +319,65 @@ def meet(
     xmat: wp.array(dtype=wp.mat33d),
     middle: wp.array(dtype=wp.vec3d),
     geom_speed: wp.array(dtype=wp.float64),
+    geom_low: wp.array(dtype=wp.vec3),
+    geom_high: wp.array(dtype=wp.vec3),
     # out
-    hit_geom_out: wp.array(dtype=wp.int32),
-    hit_gap_out: wp.array(dtype=wp.float64),
-    hit_normal_out: wp.array(dtype=wp.vec3d),
-    hit_point_out: wp.array(dtype=wp.vec3d),
+    close_out: wp.array2d(dtype=wp.int32),
+    hit_shape_out: wp.array2d(dtype=wp.int32),
+    hit_geom_out: wp.array2d(dtype=wp.int32),
+    hit_gap_out: wp.array2d(dtype=wp.float64),
+    hit_normal_out: wp.array2d(dtype=wp.vec3d),
+    hit_point_out: wp.array2d(dtype=wp.vec3d),
     missed_out: wp.array(dtype=wp.int32),
 ):
-    """Find the rigid shapes that one plant shape touches or may touch before the tick ends."""
+    """Find where one tree touches rigid shapes or may touch them before the tick ends, by (shape, geom)."""
     i = wp.tid()
-    s = shapes[i]
-    for k in range(slots):
-        hit_geom_out[i * slots + k] = -1
-    missed_out[i] = 0
-    bunch = shape_bunch[s]
-    if bunch >= 0:
-        if not bunch_attached[bunch]:
-            return
-    radius = wp.float64(shape_radius[s])
-    a = to_double(start[s])
-    b = to_double(end[s])
-    center = wp.float64(0.5) * (a + b)
-    bound = wp.float64(0.5) * wp.length(b - a) + radius
-    found = int(0)  # noqa: RUF046 (Warp's way to say that it will change)
-    for k in range(geom_count[0]):
-        g = geoms[k]
-        margin = SKIN + (wp.float64(shape_speed[s]) + geom_speed[g]) * dt
-        apart = center - middle[g]
-        limit = bound + geom_radius[g] + margin
-        if wp.dot(apart, apart) < limit * limit:
-            rotation = xmat[geom_id[g]]
-            back = wp.transpose(rotation)
-            at = xpos[geom_id[g]]
-            local_a = back * (a - at) - geom_center[g]
-            local_b = back * (b - at) - geom_center[g]
-            t = closest(geom_kind[g], geom_size[g], local_a, local_b)
-            n = distance(geom_kind[g], geom_size[g], local_a + t * (local_b - local_a))
-            gap = n[3] - radius
-            if gap < margin:
-                if found < slots:
-                    h = i * slots + found
-                    normal = rotation * wp.vec3d(n[0], n[1], n[2])
-                    hit_geom_out[h] = g
-                    hit_gap_out[h] = gap
-                    hit_normal_out[h] = normal
-                    hit_point_out[h] = a + t * (b - a) - (radius + wp.float64(0.5) * gap) * normal
-                found = found + 1
+    tree = trees[i]
+    close = int(0)  # noqa: RUF046 (Warp's way to say that it will change)
+    for g in range(geom_id.shape[0]):
+        if not apart(tree_low[tree], tree_high[tree], geom_low[g], geom_high[g]):
+            close_out[i, close] = g
+            close = close + 1
+    found = int(0)  # noqa: RUF046
+    last = tree_shape[tree + 1]
+    if close == 0:
+        last = tree_shape[tree]
+    for s in range(tree_shape[tree], last):
+        there = bool(True)
+        if shape_bunch[s] >= 0:
+            there = bunch_attached[shape_bunch[s]]
+        if there:
+            radius = wp.float64(shape_radius[s])
+            a = to_double(start[s])
+            b = to_double(end[s])
+            center = wp.float64(0.5) * (a + b)
+            bound = wp.float64(0.5) * wp.length(b - a) + radius
+            for k in range(close):
+                g = close_out[i, k]
+                margin = SKIN + (wp.float64(shape_speed[s]) + geom_speed[g]) * dt
+                between = center - middle[g]
+                limit = bound + geom_radius[g] + margin
+                if wp.dot(between, between) < limit * limit:
+                    rotation = xmat[geom_id[g]]
+                    back = wp.transpose(rotation)
+                    at = xpos[geom_id[g]]
+                    local_a = back * (a - at) - geom_center[g]
+                    local_b = back * (b - at) - geom_center[g]
+                    t = closest(geom_kind[g], geom_size[g], local_a, local_b)
+                    n = distance(geom_kind[g], geom_size[g], local_a + t * (local_b - local_a))
+                    gap = n[3] - radius
+                    if gap < margin:
+                        if found < slots:
+                            normal = rotation * wp.vec3d(n[0], n[1], n[2])
+                            hit_shape_out[i, found] = s
+                            hit_geom_out[i, found] = g
+                            hit_gap_out[i, found] = gap
+                            hit_normal_out[i, found] = normal
+                            hit_point_out[i, found] = a + t * (b - a) - (radius + wp.float64(0.5) * gap) * normal
+                        found = found + 1
     missed_out[i] = wp.max(found - slots, 0)
+    for k in range(wp.min(found, slots), slots):
+        hit_shape_out[i, k] = -1
 
 
 @wp.kernel

@@ -43,6 +43,9 @@ class Plants:
         phi: 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"``; the views need memory that both sides see.
         brisk: [rad/s] see :data:`BRISK`.
+        bound: [rad/s] see :data:`BOUND`.
+        tension: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without it a heavy
+            bunch on a soft peduncle gains energy every tick; off only to compare with solvers that do without.
     """
 
     def __init__(
@@ -55,6 +58,7 @@ class Plants:
         device: str = "cpu",
         brisk: float = BRISK,
         bound: float = BOUND,
+        tension: bool = True,
     ) -> None:
         if device != "cpu":
             raise ValueError(f"device {device!r}: plants share memory with NumPy; use 'cpu'")
@@ -76,9 +80,6 @@ class Plants:
         """Acceleration over the last tick [body, 6] m/s^2, rad/s^2, world axes."""
         self.body_mass = model.body_mass.copy()
         self.body_inertia = model.body_inertia.copy()
-        self._hang = np.zeros((bodies, 3), np.float32)
-        for tree in range(trees):
-            self._weigh(tree)
         self._onset = np.zeros(trees, np.int32)
         self._touched = np.full(trees, -2, np.int64)  # tick of the last touch
         self._tick = 0
@@ -88,7 +89,7 @@ class Plants:
         self._subset = np.zeros(trees, np.int32)
         self._stepped = np.zeros(0, np.int32)
         self._capacity = 0
-        self._record()
+        self._record(tension)
         self._pack()
 
     # who is awake
@@ -183,7 +184,7 @@ class Plants:
         self._launch(self._place, len(trees))
 
     def pull(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
-        """Move one tree towards a state seen elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
+        """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
         bodies = self.model.bodies_of(tree)
         there, rates = np.asarray(joint_q, np.float32), np.asarray(joint_qd, np.float32)
         here = self.state.joint_q[bodies]
@@ -234,21 +235,8 @@ class Plants:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
         self.body_inertia[body] *= mass / self.body_mass[body]
         self.body_mass[body] = mass
-        self._weigh(int(self.model.body_tree[body]))
 
     # memory and launches
-
-    def _weigh(self, tree: int) -> None:
-        """Mass moment of each body about its origin, all bodies beyond it lumped where they hang on it [kg m]."""
-        model, bodies = self.model, self.model.bodies_of(tree)
-        subtree = self.body_mass[bodies].astype(float)
-        hang = subtree[:, None] * model.body_com[bodies]
-        for i in reversed(range(len(subtree))):
-            parent = int(model.body_parent[bodies.start + i]) - bodies.start
-            if parent >= 0:
-                subtree[parent] += subtree[i]
-                hang[parent] += subtree[i] * model.body_offset[bodies.start + i]
-        self._hang[bodies] = hang
 
     def _pack(self) -> None:
         self._list = np.flatnonzero(self.state.tree_awake).astype(np.int32)
@@ -265,7 +253,7 @@ class Plants:
             command.set_dim(threads)
             command.launch()
 
-    def _record(self) -> None:
+    def _record(self, tension: bool) -> None:
         """Bind every kernel to the arrays once: a recorded launch costs a fifth of a plain one."""
         model, state = self.model, self.state
         kinds = {
@@ -275,7 +263,7 @@ class Plants:
             float: {"body_mass": self.body_mass, "tree_phi": self.tree_phi, "tree_rate": self.tree_rate},
             wp.bool: {"tree_awake": state.tree_awake},
             wp.vec3: {"body_offset": model.body_offset, "body_com": model.body_com, "body_inertia": self.body_inertia,
-                      "body_hang": self._hang, "joint_stiffness": model.joint_stiffness,
+                      "joint_stiffness": model.joint_stiffness,
                       "joint_damping": model.joint_damping, "joint_qd": state.joint_qd},
             wp.quat: {"body_rest": model.body_rest, "joint_q": state.joint_q},
             wp.transform: {"tree_pose": model.tree_pose, "body_q": state.body_q},
@@ -289,7 +277,7 @@ class Plants:
         }
         bodies, trees = len(model.body_mass), len(model.tree_first)
         scratch = {
-            wp.vec3: ("lever", "Du", "joint_qd_free"),
+            wp.vec3: ("lever", "drawn", "Du", "joint_qd_free"),
             wp.quat: ("axes",),
             wp.mat33: ("J", "H", "M", "D", "DJ", "DH"),
             wp.spatial_vector: ("bias", "spread"),
@@ -309,10 +297,10 @@ class Plants:
             plant.place, *tree, "tree_pose", *joint, "subset", "joint_q", "joint_qd", "body_q", "body_qd"
         )
         self._free = record(
-            plant.free, dt, self.brisk, gravity, *tree, "tree_pose", *joint, "body_mass", "body_com", "body_inertia",
-            "body_hang", "joint_stiffness", "joint_damping", "stepping", "tree_phi", "onset", "body_load", "joint_q",
-            "joint_qd", "body_q", "body_qd", "phi_used", "axes", "lever", "J", "H", "M", "bias", "D", "DJ", "DH", "Du",
-            "acceleration", "joint_qd_free", "velocity_free",
+            plant.free, dt, self.brisk, float(tension), gravity, *tree, "tree_pose", *joint, "body_mass", "body_com",
+            "body_inertia", "joint_stiffness", "joint_damping", "stepping", "tree_phi", "onset", "body_load", "wrench",
+            "joint_q", "joint_qd", "body_q", "body_qd", "phi_used", "axes", "lever", "J", "H", "M", "bias", "drawn",
+            "D", "DJ", "DH", "Du", "acceleration", "joint_qd_free", "velocity_free",
         )  # fmt: skip
         self._push = record(
             plant.push, dt, *tree, "body_parent", "subset", "wrench", *factors, "spread", "Du", "acceleration",

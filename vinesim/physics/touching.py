@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels import contact as kernels
+from vinesim.kernels.launch import bind
 from vinesim.physics.plants import Plants
 from vinesim.physics.rigid import Rigid
 from vinesim.world.model import Model
@@ -24,8 +25,8 @@ SWEEPS = 50
 """Gauss-Seidel sweeps at most; warm-started, ten to twenty are usual."""
 TOLERANCE = 1e-7
 """Of the largest impulse: a smaller change in a sweep ends them."""
-SLOTS = 6
-"""Rigid shapes that one plant shape can touch at once."""
+SLOTS = 64
+"""Contacts that one tree can have at once."""
 ISLANDS = 24
 """Up to so many contacts are solved as one block; more are parted into islands that do not feel each other."""
 STIR = 1e-3
@@ -131,20 +132,13 @@ class Touching:
         """Wake the trees that a robot or a moving box is about to reach; the rest cost one comparison each."""
         if self._generation != self.rigid.generation:
             self._renew()
-        self._launch(self._bound_geoms, len(self._geoms.id))
-        asleep_now = self._awake[~self.plants.state.tree_awake[self._awake]]
-        if len(asleep_now):
-            self._bound(asleep_now)
-        near = []
-        for actor in range(len(self._actor_first)):
-            mine = slice(self._actor_first[actor], self._actor_end[actor])
-            if self._actor_lies[actor] and self._geom_speed[mine].max() < STIR:
-                continue
-            low, high = self._geom_low[mine], self._geom_high[mine]
-            trees = self._reached(low.min(0), high.max(0))
-            if len(trees):
-                near.append(trees[self._overlap(trees, low, high).any(1)])
-        self.near = np.unique(np.concatenate(near)).astype(np.int32) if near else self.near[:0]
+        fallen_asleep = self._awake[~self.plants.state.tree_awake[self._awake]]
+        if len(fallen_asleep):
+            self._bound(fallen_asleep)
+        self._bound_geoms(len(self._geoms.id))
+        self._bound_actors(len(self._actor_lies))
+        self._reach(len(self._near))
+        self.near = np.flatnonzero(self._near)
         if len(self.near) and not self.plants.state.tree_awake[self.near].all():
             self.plants.wake(self.near)
 
@@ -155,10 +149,7 @@ class Touching:
         self._values: tuple[Contact, ...] | None = ()
         if len(awake) and len(self._geoms.id):
             self._bound(awake)
-            overlap = self._overlap(awake, self._geom_low, self._geom_high)
-            trees = awake[overlap.any(1)]
-            if len(trees):
-                self._meet(trees, np.flatnonzero(overlap.any(0)))
+            self._meet(len(awake))
         if self.count:
             self._press()
         else:
@@ -190,48 +181,30 @@ class Touching:
     # ------------------------------------------------------------------ who is close
 
     def _bound(self, trees: np.ndarray) -> None:
+        """Bring the boxes around some trees up to their bodies."""
         self._trees[: len(trees)] = trees
-        self._launch(self._bound_trees, len(trees))
+        self._bound_trees(len(trees))
 
-    def _reached(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Trees whose box overlaps one box."""
-        a, b = self._tree_low, self._tree_high
-        inside = a[0] <= high[0]
-        for outside in (a[1] <= high[1], a[2] <= high[2], b[0] >= low[0], b[1] >= low[1], b[2] >= low[2]):
-            inside &= outside
-        return np.flatnonzero(inside)
-
-    def _overlap(self, trees: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """[tree, geom] whether their boxes overlap."""
-        a, b = self._tree_low[:, trees, None], self._tree_high[:, trees, None]
-        return ((a <= high.T[:, None]) & (b >= low.T[:, None])).all(0)
-
-    def _meet(self, trees: np.ndarray, geoms: np.ndarray) -> None:
-        """Contacts of all shapes of some trees with some geoms."""
-        first = self.shapes.tree
-        near = np.concatenate([np.arange(first[t], first[t + 1], dtype=np.int32) for t in trees])
-        if len(near) > self._room:
-            self._make_room(2 * len(near))
-        n = len(near)
-        self._near_shapes[:n] = near
-        self._near_geoms[: len(geoms)] = geoms
-        self._geom_count[0] = len(geoms)
-        self._launch(self._meeting, n)
-        hits = np.flatnonzero(self._hit_geom[: n * SLOTS] >= 0)
-        dropped = int(self._missed[:n].sum())
+    def _meet(self, trees: int) -> None:
+        """List the contacts of the trees that were just bounded."""
+        if trees > self._room:
+            self._make_room(2 * trees)
+        self._meeting(trees)
+        hits = np.flatnonzero(self._hit_shape[:trees].ravel() >= 0)
+        dropped = int(self._missed[:trees].sum())
         if len(hits) > self.capacity:
             dropped += len(hits) - self.capacity
-            deepest = np.argsort(self._hit_gap[hits], kind="stable")[: self.capacity]
+            deepest = np.argsort(self._hit_gap.ravel()[hits], kind="stable")[: self.capacity]
             hits = np.sort(hits[deepest])
         if dropped:
             self.dropped += dropped
             self.complaint = (
-                f"{dropped} of {len(hits) + dropped} contacts of one tick were left out, the shallowest; "
-                f"room is for {self.capacity}, and for {SLOTS} at one shape: raise Touching's capacity"
+                f"{dropped} of {len(hits) + dropped} contacts of one tick were left out, the shallowest; there is room "
+                f"for {self.capacity}, and for {SLOTS} at one tree: raise Touching's capacity or touch less at once"
             )
         self.count = len(hits)
         self._hits[: len(hits)] = hits
-        self._contact_shape[: len(hits)] = near[hits // SLOTS]
+        self._contact_shape[: len(hits)] = self._hit_shape.ravel()[hits]
 
     # ------------------------------------------------------------------ with what force
 
@@ -240,24 +213,25 @@ class Touching:
         n, rows = self.count, 3 * self.count
         shape = self._contact_shape[:n]
         body = self._contact_body[:n] = self.shapes.body[shape]
-        bodies, slot = np.unique(body, return_inverse=True)
-        self._contact_column[:n] = 6 * slot
+        new = np.append(True, body[1:] != body[:-1])  # they come sorted by body
+        bodies = body[new]
+        self._contact_column[:n] = 6 * (np.cumsum(new) - 1)
         columns = 6 * len(bodies)
         plant_rows, rigid_rows = self._plant_rows[:rows, :columns], self._rigid_rows[:rows]
         plant_rows[:] = 0.0
         rigid_rows[:] = 0.0
         self._dof_free[:] = self.rigid.velocity_free
-        self._launch(self._coupling, n)
+        self._coupling(n)
 
         response = self.plants.response(bodies).reshape(columns, columns).astype(float)
         A = self._A[:rows, :rows]
         A[:] = plant_rows @ response @ plant_rows.T + rigid_rows @ self.rigid.inverse(rigid_rows)
-        self._launch(self._relaxing, self._part(n))
+        self._relaxing(self._part(n))
         self.sweeps = int(self._sweeps.max())
 
         impulse = self._impulse[:rows]
         self._known_count[0] = n
-        self._launch(self._remembering, n)
+        self._remembering(n)
         self.bodies = bodies
         self.wrenches = (impulse @ plant_rows / self.dt).reshape(-1, 6)
         self.force = impulse @ rigid_rows / -self.dt
@@ -271,7 +245,7 @@ class Touching:
             self._island_member[:n] = np.arange(n)
             return 1
         tree = self.model.body_tree[self._contact_body[:n]]
-        thing = self.rigid.group[self._geoms.id[self._hit_geom[self._hits[:n]]]]
+        thing = self.rigid.group[self._geoms.id[self._geom[:n]]]
         label: dict[int, int] = {}
 
         def root(x: int) -> int:
@@ -291,17 +265,12 @@ class Touching:
 
     # ------------------------------------------------------------------ memory and launches
 
-    @staticmethod
-    def _launch(command: wp.Launch, threads: int) -> None:
-        if threads:
-            command.set_dim(threads)
-            command.launch()
-
     def _allocate(self) -> None:
         """Everything whose size does not depend on who is here."""
         n, trees, shapes = self.capacity, len(self.model.tree_first), len(self.shapes.body)
         self._trees = np.zeros(trees, np.int32)
-        self._tree_low, self._tree_high = np.zeros((3, trees), np.float32), np.zeros((3, trees), np.float32)
+        self._tree_low, self._tree_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
+        self._near = np.zeros(trees, np.bool_)
         self._start, self._end = np.zeros((shapes, 3), np.float32), np.zeros((shapes, 3), np.float32)
         self._shape_speed = np.zeros(shapes, np.float32)
         for name in ("hits", "contact_shape", "contact_body", "contact_column", "geom", "known_shape", "known_geom"):
@@ -316,17 +285,19 @@ class Touching:
         self._plant_rows, self._A = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3 * n))
         self._island_first, self._island_member = np.zeros(n + 1, np.int32), np.zeros(n, np.int32)
         self._sweeps = np.zeros(n, np.int32)
-        self._known_count, self._geom_count = np.zeros(1, np.int32), np.zeros(1, np.int32)
+        self._known_count = np.zeros(1, np.int32)
         self._values = ()
         self._room = 0
         self._geoms = None
 
-    def _make_room(self, shapes: int) -> None:
-        """Room for the hits of so many plant shapes near something rigid."""
-        self._room = shapes
-        self._near_shapes, self._missed = np.zeros(shapes, np.int32), np.zeros(shapes, np.int32)
-        self._hit_geom, self._hit_gap = np.zeros(shapes * SLOTS, np.int32), np.zeros(shapes * SLOTS)
-        self._hit_normal, self._hit_point = np.zeros((shapes * SLOTS, 3)), np.zeros((shapes * SLOTS, 3))
+    def _make_room(self, trees: int) -> None:
+        """Room for the contacts of so many awake trees."""
+        self._room = trees
+        self._close = np.zeros((trees, len(self._geoms.id)), np.int32)
+        self._missed = np.zeros(trees, np.int32)
+        self._hit_shape, self._hit_geom = np.zeros((trees, SLOTS), np.int32), np.zeros((trees, SLOTS), np.int32)
+        self._hit_gap = np.zeros((trees, SLOTS))
+        self._hit_normal, self._hit_point = np.zeros((trees, SLOTS, 3)), np.zeros((trees, SLOTS, 3))
         self._record()
 
     def _renew(self) -> None:
@@ -342,15 +313,15 @@ class Touching:
         count = len(g.id)
         self._geom_middle, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
         self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-        self._near_geoms = np.zeros(count, np.int32)
         self._rigid_rows = np.zeros((3 * self.capacity, self.rigid.world.nv))
         self._dof_free = np.zeros(self.rigid.world.nv)
         self._dof_parent = self.rigid.world.dof_parentid
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
         first = [i for i in range(count) if i == 0 or g.actor[i] != g.actor[i - 1]]
-        self._actor_first, self._actor_end = first, [*first[1:], count]
-        self._actor_lies = [g.actor[i].startswith("box/") for i in first]
-        self._make_room(max(self._room, 256))
+        self._actor_first = np.array([*first, count], np.int32)
+        self._actor_lies = np.array([g.actor[i].startswith("box/") for i in first], np.bool_)
+        self._actor_low, self._actor_high = np.zeros((len(first), 3), np.float32), np.zeros((len(first), 3), np.float32)
+        self._make_room(max(self._room, 64))
 
     def _record(self) -> None:
         """Bind every kernel to its arrays once: a recorded launch costs a fifth of a plain one."""
@@ -358,9 +329,6 @@ class Touching:
 
         def shared(data: np.ndarray, dtype: type) -> wp.array:
             return wp.array(data, dtype=dtype, device="cpu", copy=False)
-
-        def record(kernel: wp.Kernel, inputs: list, outputs: list) -> wp.Launch:
-            return wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
 
         def ints(*names: str) -> list[wp.array]:
             return [shared(getattr(self, "_" + name), wp.int32) for name in names]
@@ -375,6 +343,10 @@ class Touching:
         g_kind, g_dof = shared(g.kind, wp.int32), shared(g.dof, wp.int32)
         g_center, g_half, g_size = (shared(x, wp.vec3d) for x in (g.center, g.half, g.size))
         g_radius, g_friction = shared(g.radius, wp.float64), shared(g.friction, wp.float64)
+        g_box = [shared(x, wp.vec3) for x in (self._geom_low, self._geom_high)]
+        t_box = [shared(x, wp.vec3) for x in (self._tree_low, self._tree_high)]
+        a_box = [shared(x, wp.vec3) for x in (self._actor_low, self._actor_high)]
+        a_first, a_lies = shared(self._actor_first, wp.int32), shared(self._actor_lies, wp.bool)
         s_tree, s_body, s_bunch = (shared(x, wp.int32) for x in (s.tree, s.body, s.bunch))
         s_radius, s_speed = shared(s.radius, float), shared(self._shape_speed, float)
         s_at = [shared(x, wp.vec3) for x in (self._start, self._end)]
@@ -383,46 +355,54 @@ class Touching:
         cvel, cdof = shared(mj["cvel"], wp.float64), shared(mj["cdof"], wp.float64)
         body_q, body_qd = shared(state.body_q, wp.transform), shared(state.body_qd, wp.spatial_vector)
         body_qd_free = shared(self.plants.velocity_free, wp.spatial_vector)
+        attached = shared(state.bunch_attached, wp.bool)
+        moving, speed = vectors("geom_middle")[0], doubles("geom_speed")[0]
         dt, k, c = self.dt, self.stiffness, self.damping
         softness = 1.0 / (dt * (k * dt + c))
 
-        self._bound_geoms = record(
+        self._bound_geoms = bind(
             kernels.bound_geoms,
             [dt, g_id, g_body, g_root, g_center, g_half, xpos, xmat, cvel, com],
-            [*vectors("geom_middle"), *doubles("geom_speed"), shared(self._geom_low, wp.vec3),
-             shared(self._geom_high, wp.vec3)],
-        )  # fmt: skip
-        self._bound_trees = record(
+            [moving, speed, *g_box],
+        )
+        self._bound_actors = bind(kernels.bound_actors, [STIR, a_first, a_lies, speed, *g_box], a_box)
+        self._bound_trees = bind(
             kernels.bound_trees,
             [dt, s_tree, s_body, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius, *ints("trees"), body_q,
              body_qd],
-            [*s_at, s_speed, shared(self._tree_low, float), shared(self._tree_high, float)],
+            [*s_at, s_speed, *t_box],
         )  # fmt: skip
-        self._meeting = record(
+        self._reach = bind(kernels.reach, [a_first, *t_box, *a_box, *g_box], [shared(self._near, wp.bool)])
+        hit = [shared(x, wp.int32) for x in (self._hit_shape, self._hit_geom)]
+        hit += [
+            shared(self._hit_gap, wp.float64),
+            shared(self._hit_normal, wp.vec3d),
+            shared(self._hit_point, wp.vec3d),
+        ]
+        self._meeting = bind(
             kernels.meet,
-            [dt, SLOTS, s_bunch, s_radius, g_id, g_kind, g_size, g_center, g_radius,
-             shared(state.bunch_attached, wp.bool), *ints("near_shapes", "near_geoms", "geom_count"), *s_at, s_speed,
-             xpos, xmat, *vectors("geom_middle"), *doubles("geom_speed")],
-            [*ints("hit_geom"), *doubles("hit_gap"), *vectors("hit_normal", "hit_point"), *ints("missed")],
+            [dt, SLOTS, s_tree, s_bunch, s_radius, g_id, g_kind, g_size, g_center, g_radius, attached, *ints("trees"),
+             *t_box, *s_at, s_speed, xpos, xmat, moving, speed, *g_box],
+            [*ints("close"), *hit, *ints("missed")],
         )  # fmt: skip
+        flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_geom"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
         axes = shared(self._axes, wp.mat33d)
-        self._coupling = record(
+        self._coupling = bind(
             kernels.couple,
-            [dt, k, c, g_dof, g_root, shared(self._dof_parent, wp.int32), *ints("hits", "hit_geom"),
-             *doubles("hit_gap"), *vectors("hit_normal", "hit_point"),
+            [dt, k, c, g_dof, g_root, shared(self._dof_parent, wp.int32), *ints("hits"), *flat[1:],
              *ints("contact_shape", "contact_body", "contact_column"), body_q, body_qd_free, *doubles("dof_free"), cdof,
              com, *ints("known_count"), *known],
             [*ints("geom"), *doubles("gap"), *vectors("point"), axes,
              *doubles("plant_rows", "rigid_rows", "free", "offset", "impulse")],
         )  # fmt: skip
-        self._relaxing = record(
+        self._relaxing = bind(
             kernels.relax,
             [softness, SWEEPS, TOLERANCE, g_friction, *ints("island_first", "island_member", "geom"),
              *doubles("A", "free", "offset")],
             [*doubles("impulse"), *ints("sweeps")],
         )  # fmt: skip
-        self._remembering = record(
+        self._remembering = bind(
             kernels.remember,
             [dt, k, c, *ints("known_count", "contact_shape", "geom"), axes, *doubles("A", "free", "impulse")],
             [*vectors("force"), *known],
