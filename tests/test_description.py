@@ -327,3 +327,9 @@ def test_sidecar_faults_name_the_toml(toml: str, words: str, tmp_path: pathlib.P
         load(file)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_an_extra_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vinesim.robot.description._resource", lambda path: None)
+    with pytest.raises(DescriptionError, match=r"tiago_pro: .*pip install vinesim\[tiago\]"):
+        load("tiago_pro")
