@@ -268,7 +268,7 @@ def test_wrong_commands_are_named(yard: Yard) -> None:
 def test_remote_copy_follows_its_original(vinebot: Description) -> None:
     here = Yard(vinebot)
     far = Rigid(assemble([]))
-    copy = RemoteRobot(far, vinebot, "anna", pose=frames.pose([50.0, 0.0, 0.0]))
+    copy = RemoteRobot(far, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
     home = vinebot.home.copy()
     reach = here.robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint", "torso_lift_joint"])
     joints, bases = [], []
@@ -284,6 +284,7 @@ def test_remote_copy_follows_its_original(vinebot: Description) -> None:
             bases.append(np.linalg.norm(far.base("anna")[0][:3] - here.rigid.base("anna")[0][:3]))
     assert max(joints) < 0.01
     assert max(bases) < 0.03
+    assert copy.sample(0.0).base_q[2] == 0.0
     with pytest.raises(CommandError, match="same robot on both clients"):
         copy.follow(RobotUpdate("anna", 0.0, np.zeros(7), np.zeros(6), np.zeros(3), np.zeros(3)))
 

@@ -9,7 +9,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid import Rigid
-from vinesim.robot.description import Description, load
+from vinesim.robot.description import Description, DescriptionError, load
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.reach import Phase, ReachAndPush, prioritized
 from vinesim.world.grow import assemble
@@ -53,7 +53,7 @@ class Run:
 
 
 # 0.45 to 0.9 m ahead, 1.3 to 1.8 m high, across the half of the alley that an arm works in
-GRID = list(itertools.product((0.45, 0.6, 0.75, 0.9), (0.1, 0.35), (1.3, 1.55, 1.8)))
+GRID = list(itertools.product((0.45, 0.65, 0.9), (0.1, 0.35), (1.3, 1.55, 1.8)))
 
 
 @pytest.mark.parametrize("target", GRID, ids=str)
@@ -175,6 +175,18 @@ def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: Description) -> Non
 def test_an_arm_without_a_tool_is_refused(robot: Robot) -> None:
     with pytest.raises(CommandError, match="'arm_middle' with a tool"):
         ReachAndPush(robot, "middle", lambda: np.zeros(3))
+
+
+def test_a_foreign_robot_reaches_by_its_names_alone() -> None:
+    try:
+        tiago = load("tiago_pro")
+    except DescriptionError as error:
+        if "not installed" in str(error):
+            pytest.skip(str(error))
+        raise
+    run = Run(Robot(Rigid(assemble([])), tiago, "anna"), "left", np.array([0.55, 0.25, 1.1]))
+    assert run.reach.cycles == 1
+    assert run.errors[Phase.TOUCH] < 0.01
 
 
 def test_priorities_hold() -> None:

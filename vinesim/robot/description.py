@@ -555,10 +555,12 @@ def _moving(robot: yourdfpy.Robot, driven: list[str]) -> MovingJoints:
 
 
 def _resting(joint: yourdfpy.Joint) -> float:
-    """Zero if the joint can be there, else the middle of its range."""
-    if joint.type == "continuous" or joint.limit.lower <= 0.0 <= joint.limit.upper:
+    """Middle of the range: away from limits, and elbows bent the way they bend. Zero if that is near or endless."""
+    if joint.type == "continuous":
         return 0.0
-    return 0.5 * (joint.limit.lower + joint.limit.upper)
+    lower, upper = joint.limit.lower, joint.limit.upper
+    middle = 0.5 * (lower + upper)
+    return middle if abs(middle) > 0.1 * (upper - lower) else 0.0
 
 
 def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, Group]:

@@ -50,6 +50,7 @@ class Embodied:
         self.rigid = rigid
         self.description = description
         self.name = name or description.name
+        self._index = index
         spec = description.spec(self.name, index, pose)
         rigid.add_robot(spec)
         back = frames.conjugate(spec.pose[3:])
@@ -259,5 +260,11 @@ class RemoteRobot(Embodied):
             )
         here, _ = self.rigid.base(self.name)
         if np.linalg.norm(update.base_q[:3] - here[:3]) > self.SNAP:
-            self.rigid.place(self.name, update.base_q, update.position)
+            self._set_down(update, here)
         self.rigid.follow(self.name, update.base_q, update.base_qd, update.position, update.velocity)
+
+    def _set_down(self, update: RobotUpdate, here: np.ndarray) -> None:
+        if abs(update.base_q[2] - here[2]) > 1e-3:  # a base rolls on its plane; another height is another world
+            self.rigid.remove_robot(self.name)
+            self.rigid.add_robot(self.description.spec(self.name, self._index, update.base_q))
+        self.rigid.place(self.name, update.base_q, update.position)

@@ -34,8 +34,6 @@ TURN = 1.0
 """Fastest turn of the fingers [rad/s]."""
 RISE = 0.35
 """Fingers point up by this angle [rad]: forearm and wrist stay below the leaves."""
-LIFT_SHARE = 0.3
-"""The slow lift moves 0.3 m where a joint of the arm would turn by 1 rad."""
 SHOULDER_BELOW = 0.10
 """The posture has the shoulder this far below the target [m]."""
 SINGULAR = 0.06
@@ -106,7 +104,9 @@ class ReachAndPush:
 
         self._joints = robot.joint_indices([*lifts, *arm.joints])
         self._lifts = len(lifts)
-        self._share = np.array([LIFT_SHARE] * len(lifts) + [1.0] * len(arm.joints))
+        speed_of = robot.speed[self._joints]
+        self._share = speed_of / speed_of.max()
+        """How readily a joint is used: the slow lift less than the arm."""
         self._home = description.home[self._joints]
         moving = description.moving
         self._shoulder = moving.frames[moving.names.index(arm.joints[0])][1]
@@ -221,7 +221,7 @@ class ReachAndPush:
         lower, upper, fastest = robot.lower[self._joints], robot.upper[self._joints], robot.speed[self._joints]
         rates = prioritized(
             [(jacobian[:3], move), (axes[1:] @ jacobian[3:], _at_most(GAIN * turn, TURN))],
-            np.clip(POSTURE * (np.clip(home, lower, upper) - now), -0.5 * fastest, 0.5 * fastest),
+            np.clip(POSTURE * (np.clip(home, lower, upper) - now), -0.8 * fastest, 0.8 * fastest),
             (lower - now) / dt,
             (upper - now) / dt,
             self._share,
