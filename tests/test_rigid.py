@@ -328,3 +328,60 @@ def test_what_is_wrong_with_a_robot_is_said_and_the_world_goes_on(change, says):
         rigid.read("anna")
     with pytest.raises(RobotError, match="already here"):
         rigid.add_robot(arm("other"))
+
+
+def test_a_mimicking_finger_copies_the_one_that_is_driven():
+    twin = ARM.replace(
+        '<link name="tool"/>',
+        '<link name="thumb"><inertial><mass value="0.2"/>'
+        '<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="oppose" type="prismatic"><parent link="lower"/><child link="thumb"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="10" velocity="1"/><mimic joint="extend" multiplier="-2" offset="0.3"/>'
+        '</joint><link name="tool"/>',
+    )
+    rigid = Rigid(yard())
+    rigid.add_robot(dataclasses.replace(arm(), urdf=twin))
+    thumb = rigid.data.joint("anna/oppose")
+    assert thumb.qpos[0] == pytest.approx(0.3 - 2 * 0.05)
+    rigid.command("anna", np.array([0.4, -0.9, 0.09]))
+    step(rigid, 200)
+    assert rigid.read("anna")[0][2] == pytest.approx(0.09, abs=1e-4)
+    assert rigid.data.joint("anna/oppose").qpos[0] == pytest.approx(0.3 - 2 * 0.09, abs=1e-3)
+
+
+def test_a_mesh_is_touched_as_the_box_around_it(tmp_path):
+    """An STL of a brick, off its link's origin: plants feel a box of its edges, sensors are told the file."""
+    low, high = np.array([0.1, -0.05, 0.2]), np.array([0.16, 0.07, 0.5])
+    corner = [np.where([i & 1, i & 2, i & 4], high, low) for i in range(8)]
+    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    record = np.zeros(12, dtype=[("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+    record["corner"] = [[corner[i] for i in t] for t in triangles]
+    file = tmp_path / "brick.stl"
+    file.write_bytes(b" " * 80 + np.uint32(12).tobytes() + record.tobytes())
+    mesh = f'<mesh filename="{file}"/>'
+    urdf = ARM.replace('<sphere radius="0.04"/>', mesh)
+    rigid = Rigid(yard())
+    rigid.add_robot(dataclasses.replace(arm(), urdf=urdf))
+    rigid.prep()
+    geom = rigid.geoms.link.index("slider")
+    assert rigid.geoms.kind[geom] == 6
+    np.testing.assert_allclose(np.sort(rigid.geoms.size[geom]), np.sort((high - low) / 2), atol=1e-6)
+    index = rigid.geoms.id[geom]
+    center = rigid.data.geom_xpos[index] + rigid.data.geom_xmat[index].reshape(3, 3) @ rigid.geoms.center[geom]
+    pose = rigid.link_pose("anna", "slider")
+    np.testing.assert_allclose(center, pose[:3] + frames.rotate(pose[3:], (low + high) / 2), atol=1e-6)
+    shape = next(link for link in rigid.links() if link.name == "anna/slider").shapes[0]
+    assert (shape.kind, shape.file, shape.size) == ("mesh", str(file), (1.0, 1.0, 1.0))
+
+
+def test_gains_can_be_tuned_and_survive_a_newcomer():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.tune("anna", np.array([4000.0, 0.0, 8000.0]), np.array([250.0, 5.0, 400.0]), np.array([0.0, 2.0, 0.0]))
+    rigid.add_robot(arm("bert", 1, y=3.0))
+    step(rigid, 20)
+    _, velocity, effort, _ = rigid.read("anna")
+    gravity = rigid.data.qfrc_gravcomp[rigid._robots["anna"].v[1]]
+    assert effort[1] - gravity == pytest.approx(2.0 - 5.0 * velocity[1], abs=1e-9)
+    assert velocity[1] > 0.1

@@ -26,8 +26,8 @@ def cane(modulus: float, *, beta: float = 0.0, tip: float = 0.0, up: bool = Fals
     pieces = tree.rod(-1, LENGTH, (RADIUS, RADIUS), Wood(modulus, DENSITY, beta), PIECES)
     last = tree.bodies[pieces[-1]]
     tree.add(
-        pieces[-1], offset=(last["length"], 0, 0), mass=max(tip, 1e-6), inertia=[max(tip, 1e-6) * 1e-6] * 3, length=1e-3,
-        stiffness=[1e-3] * 3, damping=[1e-3] * 3,
+        pieces[-1], offset=(last["length"], 0, 0), mass=max(tip, 1e-6), inertia=[max(tip, 1e-6) * 1e-6] * 3,
+        length=1e-3, stiffness=[1e-3] * 3, damping=[1e-3] * 3,
     )  # fmt: skip
     return tree
 

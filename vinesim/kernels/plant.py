@@ -8,7 +8,11 @@ the *metric* phi dt (phi dt K + D) and stiffness cannot make the tick unstable. 
 
 What hangs is stiff too: a force F drawing out a lever d resists turning with (d.F)(1 - dd^T / d.d). Taken explicitly
 it gives a swing of rate w the damping ratio -(1 - phi) dt w / 2 (-0.018 for a bunch on 15 cm), and where a peduncle is
-softer than what it carries it blows up; so it enters as springs do, from weight, load and the last tick's contacts.
+softer than what it carries it blows up. So it enters the inertia with phi^2 dt^2, and the force's moment is taken where
+the lever will be (1 - phi) dt later: a swing then neither gains nor loses. F is weight, load and the last contacts.
+
+Gyroscopic and centrifugal terms stay explicit and err by about dt w^2 a second. A body turning faster than ``brisk``
+is therefore held back by a drag dt (w^2 - brisk^2) times its momentum, and no joint is integrated beyond ``limit``.
 
 Signs and frames: world axes; velocities and accelerations are (linear of the body's origin, angular), wrenches (force
 at the origin, moment about it). The inertia of a body or subtree about the body's origin is held as three blocks,
@@ -171,7 +175,8 @@ def free(
     if fastest > brisk * brisk or tree_onset[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
-    reach = tension * phi * dt
+    ahead = tension * (1.0 - phi) * dt
+    reach = tension * phi * phi * dt * dt
 
     for k in range(first, first + size):
         parent = body_parent[k]
@@ -186,7 +191,8 @@ def free(
         pose = axes * joint_q[k]
         omega = turning + wp.quat_rotate(axes, joint_qd[k])
         body_q_out[k] = wp.transform(wp.transform_get_translation(above) + lever, pose)
-        body_qd_out[k] = wp.spatial_vector(wp.spatial_top(motion) + wp.cross(turning, lever), omega)
+        velocity = wp.spatial_top(motion) + wp.cross(turning, lever)
+        body_qd_out[k] = wp.spatial_vector(velocity, omega)
         axes_out[k] = axes
         lever_out[k] = lever
 
@@ -195,16 +201,22 @@ def free(
         com = rotation * body_com[k]
         inertia = turned(rotation, body_inertia[k])
         load = body_load[k]
-        force = mass * (wp.cross(omega, wp.cross(omega, com)) - gravity)
-        hanging = reach * taut(com, mass * gravity)
-        moment = wp.cross(omega, inertia * omega) + wp.cross(com, force) + hanging * omega
+        slip = wp.cross(omega, com)
+        drag = dt * wp.max(wp.length_sq(omega) - brisk * brisk, 0.0)
+        burden = 1.0 + dt * drag
+        force = mass * (wp.cross(omega, slip) + drag * (velocity + slip) - gravity)
+        moment = (
+            wp.cross(omega, inertia * omega)
+            + wp.cross(com, force)
+            + drag * (inertia * omega)
+            - ahead * wp.cross(slip, mass * gravity)
+        )
         bias_out[k] = wp.spatial_vector(force, moment) - load
         drawn_out[k] = mass * gravity + wp.spatial_top(load) + wp.spatial_top(body_wrench[k])
-        J_out[k] = (
-            inertia + reach * hanging + mass * (wp.dot(com, com) * wp.identity(n=3, dtype=float) - wp.outer(com, com))
-        )
-        H_out[k] = mass * wp.skew(com)
-        M_out[k] = mass * wp.identity(n=3, dtype=float)
+        still = inertia + mass * (wp.dot(com, com) * wp.identity(n=3, dtype=float) - wp.outer(com, com))
+        J_out[k] = burden * still + reach * taut(com, mass * gravity)
+        H_out[k] = burden * mass * wp.skew(com)
+        M_out[k] = burden * mass * wp.identity(n=3, dtype=float)
 
     # inward: eliminate each joint and hand what is left of the subtree to the parent
     for i in range(size):
@@ -243,16 +255,22 @@ def free(
             force = wp.spatial_top(bias) + wp.transpose(H) * Du + M_left * centripetal
             moment = wp.spatial_bottom(bias) + J * Du + H_left * centripetal + wp.cross(lever, force)
             drawn = drawn_out[k]
-            hanging = reach * taut(lever, drawn)
             drawn_out[parent] = drawn_out[parent] + drawn
             M_arm = wp.transpose(crossed(M_left, lever))
             H_arm = crossed(H_left, lever)
             J_out[parent] = (
-                J_out[parent] + reach * hanging + J_left + crossed(M_arm, lever) - H_arm - wp.transpose(H_arm)
+                J_out[parent]
+                + reach * taut(lever, drawn)
+                + J_left
+                + crossed(M_arm, lever)
+                - H_arm
+                - wp.transpose(H_arm)
             )
             H_out[parent] = H_out[parent] + H_left - M_arm
             M_out[parent] = M_out[parent] + M_left
-            bias_out[parent] = bias_out[parent] + wp.spatial_vector(force, moment + hanging * turning)
+            bias_out[parent] = bias_out[parent] + wp.spatial_vector(
+                force, moment - ahead * wp.cross(wp.cross(turning, lever), drawn)
+            )
 
     # outward: accelerations, and the rates and velocities they lead to
     for k in range(first, first + size):
@@ -426,6 +444,7 @@ def push(
 def integrate(
     # model
     dt: float,
+    limit: float,
     bound: float,
     tree_first: wp.array(dtype=wp.int32),
     tree_size: wp.array(dtype=wp.int32),
@@ -458,6 +477,7 @@ def integrate(
     for k in range(first, last):
         if sound:
             rate = joint_qd_free[k]
+            rate = rate / wp.max(1.0, wp.length(rate) / limit)
             mean = (1.0 - phi) * joint_qd_out[k] + phi * rate
             joint_qd_out[k] = rate
             joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q_out[k])

@@ -21,13 +21,16 @@ from vinesim.world.model import Model
 from vinesim.world.state import State
 
 BRISK = 5.0
-"""[rad/s] A tree with a joint faster than this is stepped with phi = 1."""
+"""[rad/s] A tree with a joint faster than this is stepped with phi = 1; a body turning faster feels drag."""
 
 ONSET = 3
 """[tick] How long a tree is stepped with phi = 1 after something began to touch it."""
 
-BOUND = 500.0
-"""[rad/s] A tree with a joint faster than this is not integrated: see :mod:`vinesim.physics.guard`."""
+LIMIT = 50.0
+"""[rad/s] No joint is integrated faster than this: half a radian in a tick of 10 ms."""
+
+BOUND = 5000.0
+"""[rad/s] A tree of which a joint would turn faster than this is not integrated: see :mod:`vinesim.physics.guard`."""
 
 
 class Plants:
@@ -43,6 +46,7 @@ class Plants:
         phi: 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"``; the views need memory that both sides see.
         brisk: [rad/s] see :data:`BRISK`.
+        limit: [rad/s] see :data:`LIMIT`.
         bound: [rad/s] see :data:`BOUND`.
         tension: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without it a heavy
             bunch on a soft peduncle gains energy every tick; off only to compare with solvers that do without.
@@ -57,6 +61,7 @@ class Plants:
         phi: float = 0.55,
         device: str = "cpu",
         brisk: float = BRISK,
+        limit: float = LIMIT,
         bound: float = BOUND,
         tension: bool = True,
     ) -> None:
@@ -66,12 +71,12 @@ class Plants:
             raise ValueError(f"dt {dt} s, phi {phi}: need dt above 0 and phi from 0.5 to 1")
         check(model, state)
         self.model, self.state = model, state
-        self.dt, self.brisk, self.bound = dt, brisk, bound
+        self.dt, self.brisk, self.limit, self.bound = dt, brisk, limit, bound
         trees, bodies = len(model.tree_first), len(model.body_mass)
         self.tree_phi = np.full(trees, phi, np.float32)
         """phi asked for each tree [tree]; set it as you like."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """Fastest joint after the last commit [tree] rad/s; NaN or above ``bound`` for a tree that was stopped."""
+        """Fastest joint that the last commit found [tree] rad/s; NaN or above ``bound`` for a tree that it stopped."""
         self.body_load = np.zeros((bodies, 6), np.float32)
         """Wrenches that last until changed (wind, a rope): force [N], moment about the body's origin [N m], world."""
         self.velocity_free = np.zeros((bodies, 6), np.float32)
@@ -307,8 +312,8 @@ class Plants:
             "joint_qd_free",
         )  # fmt: skip
         self._integrate = record(
-            plant.integrate, dt, self.bound, *tree, "stepping", "tree_awake", "phi_used", "joint_qd_free", "tree_rate",
-            "onset", "joint_q", "joint_qd",
+            plant.integrate, dt, self.limit, self.bound, *tree, "stepping", "tree_awake", "phi_used", "joint_qd_free",
+            "tree_rate", "onset", "joint_q", "joint_qd",
         )  # fmt: skip
         self._bind = record
 

@@ -11,6 +11,7 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -60,6 +61,8 @@ class _Robot:
     """[3] x, y, yaw where the tracks hold; moves with ``base_velocity``."""
     base_velocity: np.ndarray
     """[3] vx, vy, wz in the base's own axes."""
+    tracks: tuple[np.ndarray, np.ndarray]
+    """Stiffness and damping [3] of the base's servos along x, y and about z."""
     give: float = GIVE
     q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     v: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
@@ -144,6 +147,7 @@ class Rigid:
             forward=np.zeros(len(spec.drives)),
             base_target=np.array([pose[0], pose[1], _yaw(pose)]),
             base_velocity=np.zeros(3),
+            tracks=_tracks(spec),
         )
         self._robots[spec.name] = robot
         try:
@@ -350,13 +354,14 @@ class Rigid:
         for robot in self._robots.values():
             pull = robot.stiffness * robot.target + robot.damping * robot.target_velocity
             d.ctrl[robot.actuator] = pull + robot.forward
-            stiffness, damping = _tracks(robot.spec)
             q = d.qpos[robot.base_q]
-            c, s = np.cos(q[2]), np.sin(q[2])
-            vx, vy, wz = robot.base_velocity
+            c, s = math.cos(q[2]), math.sin(q[2])
+            vx, vy, wz = robot.base_velocity.tolist()
             velocity = np.array([c * vx - s * vy, s * vx + c * vy, wz])
             # held back too far, the tracks slip: the place they hold comes along
-            robot.base_target[:] = np.clip(robot.base_target + self.dt * velocity, q - robot.give, q + robot.give)
+            held = np.minimum(robot.base_target + self.dt * velocity, q + robot.give)
+            np.maximum(held, q - robot.give, out=robot.base_target)
+            stiffness, damping = robot.tracks
             d.ctrl[robot.base_actuator] = stiffness * robot.base_target + damping * velocity
 
     def _mimics(self, robot: _Robot) -> dict[str, tuple[str, np.ndarray]]:
@@ -577,7 +582,7 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
     spec.attach(child, prefix=f"{name}/", frame=base.add_frame())
     for drive, stiffness, damping in zip(given.drives, robot.stiffness, robot.damping, strict=True):
         _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
-    stiffness, damping = _tracks(given)
+    stiffness, damping = robot.tracks
     for i, axis in enumerate(_PLANAR):
         _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 

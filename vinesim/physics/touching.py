@@ -23,7 +23,7 @@ STIFFNESS = 2e4
 """[N/m] of every contact, normal and (as the anchor of friction) tangential; its damping is 2 dt times this."""
 SWEEPS = 50
 """Gauss-Seidel sweeps at most; warm-started, ten to twenty are usual."""
-TOLERANCE = 1e-7
+TOLERANCE = 1e-6
 """Of the largest impulse: a smaller change in a sweep ends them."""
 SLOTS = 64
 """Contacts that one tree can have at once."""
@@ -213,9 +213,10 @@ class Touching:
         n, rows = self.count, 3 * self.count
         shape = self._contact_shape[:n]
         body = self._contact_body[:n] = self.shapes.body[shape]
-        new = np.append(True, body[1:] != body[:-1])  # they come sorted by body
+        new = self._new_body[:n]  # they come sorted by body
+        np.not_equal(body[1:], body[:-1], out=new[1:])
         bodies = body[new]
-        self._contact_column[:n] = 6 * (np.cumsum(new) - 1)
+        np.multiply(new.cumsum() - 1, 6, out=self._contact_column[:n])
         columns = 6 * len(bodies)
         plant_rows, rigid_rows = self._plant_rows[:rows, :columns], self._rigid_rows[:rows]
         plant_rows[:] = 0.0
@@ -223,11 +224,12 @@ class Touching:
         self._dof_free[:] = self.rigid.velocity_free
         self._coupling(n)
 
-        response = self.plants.response(bodies).reshape(columns, columns).astype(float)
+        response = self.plants.response(bodies).reshape(columns, columns)
         A = self._A[:rows, :rows]
-        A[:] = plant_rows @ response @ plant_rows.T + rigid_rows @ self.rigid.inverse(rigid_rows)
-        self._relaxing(self._part(n))
-        self.sweeps = int(self._sweeps.max())
+        np.add(plant_rows @ response @ plant_rows.T, rigid_rows @ self.rigid.inverse(rigid_rows), out=A)
+        islands = self._part(n)
+        self._relaxing(islands)
+        self.sweeps = int(self._sweeps[:islands].max())
 
         impulse = self._impulse[:rows]
         self._known_count[0] = n
@@ -239,10 +241,9 @@ class Touching:
 
     def _part(self, n: int) -> int:
         """Split the contacts into islands that share no body; returns how many there are."""
-        self._sweeps[:] = 0
         if n <= ISLANDS:
             self._island_first[1] = n
-            self._island_member[:n] = np.arange(n)
+            self._island_member[:n] = self._every[:n]
             return 1
         tree = self.model.body_tree[self._contact_body[:n]]
         thing = self.rigid.group[self._geoms.id[self._geom[:n]]]
@@ -282,9 +283,10 @@ class Touching:
         for name in ("free", "offset", "impulse"):
             setattr(self, "_" + name, np.zeros(3 * n))
         self._axes = np.zeros((n, 3, 3))
+        self._new_body = np.ones(n, np.bool_)
         self._plant_rows, self._A = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3 * n))
         self._island_first, self._island_member = np.zeros(n + 1, np.int32), np.zeros(n, np.int32)
-        self._sweeps = np.zeros(n, np.int32)
+        self._sweeps, self._every = np.zeros(n, np.int32), np.arange(n, dtype=np.int32)
         self._known_count = np.zeros(1, np.int32)
         self._values = ()
         self._room = 0

@@ -1,0 +1,278 @@
+"""Forked trees in space against MuJoCo, against conservation laws, and against themselves."""
+
+from __future__ import annotations
+
+import hashlib
+
+import mujoco
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.physics.oracle import compile_plants, copy_state
+from vinesim.physics.plants import Plants
+from vinesim.world.grow import GRAVITY, Tree, Wood, assemble
+from vinesim.world.model import Model
+from vinesim.world.state import State
+
+DT = 0.01
+
+
+def forked(rng: np.random.Generator, *, beta: float = 0.012, isotropic: bool = True, soft: float = 1.0) -> Tree:
+    """Thirteen crooked bodies with two forks, nothing aligned with anything."""
+    tree = Tree(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
+
+    def grow(parent: int, count: int) -> list[int]:
+        grown = []
+        for _ in range(count):
+            mass = rng.uniform(0.01, 0.05)
+            stiffness = soft * rng.uniform(2.0, 20.0, 1 if isotropic else 3) * np.ones(3)
+            parent = tree.add(
+                parent, offset=(0.06, *rng.normal(size=2) * 0.004), rest=frames.exp(rng.normal(size=3) * 0.4),
+                mass=mass, com=(0.03, 0.004, -0.003), inertia=mass * rng.uniform(5e-4, 9e-4, 3), length=0.06,
+                stiffness=stiffness, damping=beta * stiffness,
+            )  # fmt: skip
+            grown.append(parent)
+        return grown
+
+    trunk = grow(-1, 6)
+    branch = grow(trunk[2], 4)
+    grow(branch[1], 3)
+    return tree
+
+
+def random_state(model: Model, rng: np.random.Generator, rate: float) -> State:
+    state = State.at_rest(model)
+    state.joint_q[:] = frames.exp(rng.normal(size=(len(state.joint_q), 3)) * 0.2)
+    state.joint_qd[:] = frames.normalize(rng.normal(size=state.joint_qd.shape)) * rate
+    return state
+
+
+def awake(model: Model, state: State, **options: float) -> Plants:
+    plants = Plants(model, state, dt=DT, **options)
+    plants.wake(np.arange(len(model.tree_first)))
+    return plants
+
+
+def test_free_motion_in_space_is_mujocos() -> None:
+    """Backward Euler is MuJoCo's ``discrete``: 1e-5 m over 1 s, 5 rad/s in every joint, springs that nearly float."""
+    rng = np.random.default_rng(3)
+    model = assemble([forked(rng), forked(rng, soft=0.1)])
+    plants = awake(model, random_state(model, rng, 5.0), phi=1.0, tension=False, brisk=np.inf, limit=np.inf)
+    # our solver takes off the damping that its scheme adds; MuJoCo keeps both
+    peer = compile_plants(model, dt=DT, damping=model.joint_damping[:, 1] - DT * model.joint_stiffness[:, 1])
+    data = mujoco.MjData(peer)
+    copy_state(plants.state, data)
+    worst = travelled = 0.0
+    start = None
+    for _ in range(100):
+        plants.free()
+        mujoco.mj_kinematics(peer, data)
+        start = plants.state.body_q[:, :3].copy() if start is None else start
+        worst = max(worst, np.abs(data.xpos[1:] - plants.state.body_q[:, :3]).max())
+        travelled = max(travelled, np.abs(plants.state.body_q[:, :3] - start).max())
+        plants.commit()
+        mujoco.mj_step(peer, data)
+    assert travelled > 0.1
+    assert worst < 1e-5
+
+
+@pytest.mark.parametrize("phi", [0.55, 1.0])
+def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
+    """Y = J (M + metric)^-1 J^T with MuJoCo's J and M, metric = phi dt (phi dt K + D) in the joint frames."""
+    rng = np.random.default_rng(5)
+    model = assemble([forked(rng, isotropic=False), forked(rng, isotropic=False)])
+    plants = awake(model, random_state(model, rng, 1.0), phi=phi, tension=False)
+    state, size = plants.state, int(model.tree_size[0])
+    touched = np.array([4, size + 12, 9, size + 3], np.int32)
+    plants.free()
+    seen = plants.response(touched)
+
+    peer = compile_plants(model, dt=DT)
+    data = mujoco.MjData(peer)
+    copy_state(state, data)
+    mujoco.mj_forward(peer, data)
+    inertia = np.zeros((peer.nv, peer.nv))
+    mujoco.mj_fullM(peer, data, inertia)
+    stiffness = model.joint_stiffness.astype(float)
+    damping = np.maximum(model.joint_damping - (2 * phi - 1) * DT * stiffness, 0.0)
+    metric = phi * DT * (phi * DT * stiffness + damping)
+    axes = frames.matrix(state.joint_q.astype(float))
+    for body in range(len(metric)):
+        block = slice(3 * body, 3 * body + 3)
+        inertia[block, block] += axes[body].T @ np.diag(metric[body]) @ axes[body]
+    jacobian = np.zeros((len(touched), 6, peer.nv))
+    for row, body in zip(jacobian, touched, strict=True):
+        mujoco.mj_jacBody(peer, data, row[:3], row[3:], int(body) + 1)
+    flat = jacobian.reshape(-1, peer.nv)
+    truth = (flat @ np.linalg.solve(inertia, flat.T)).reshape(seen.shape)
+    np.testing.assert_allclose(seen, truth, rtol=0, atol=1e-4 * np.abs(truth).max())
+    blocks = np.linalg.norm(truth, axis=(1, 3))
+    np.testing.assert_array_less(np.linalg.norm(seen - truth, axis=(1, 3)), 1e-4 * blocks + 1e-12)
+    assert not seen[0, :, 1].any()  # different trees
+    assert seen[0, :, 2].any()
+
+
+def test_predicted_velocity_is_realised() -> None:
+    """velocity_free + response @ impulse is what the bodies have after commit, at the poses of the tick's start."""
+    rng = np.random.default_rng(7)
+    model = assemble([forked(rng, isotropic=False), forked(rng)])
+    plants = awake(model, random_state(model, rng, 2.0))
+    state = plants.state
+    plants.free()
+    touched = np.array([5, 8, 20, 5], np.int32)  # one body twice
+    wrenches = rng.normal(size=(4, 6)) * [1, 1, 1, 0.02, 0.02, 0.02]
+    predicted = plants.velocity_free.astype(float)
+    once, which = np.unique(touched, return_inverse=True)
+    impulse = np.zeros((len(once), 6))
+    np.add.at(impulse, which, wrenches * DT)
+    predicted = predicted[once] + np.einsum("uitj,tj->ui", plants.response(once), impulse)
+    before = state.joint_q.copy()
+    plants.commit(touched, wrenches)
+    state.joint_q[:] = before
+    plants.kinematics()
+    np.testing.assert_allclose(state.body_qd[once], predicted, atol=1e-4, rtol=1e-4)
+
+
+def energy(plants: Plants) -> float:
+    """Kinetic, of height, of springs [J]; right after free()."""
+    model, state = plants.model, plants.state
+    pose, speed = state.body_q.astype(float), state.body_qd.astype(float)
+    com = frames.rotate(pose[:, 3:], model.body_com.astype(float))
+    linear = speed[:, :3] + np.cross(speed[:, 3:], com)
+    angular = frames.rotate(frames.conjugate(pose[:, 3:]), speed[:, 3:])
+    theta = frames.log(state.joint_q.astype(float))
+    kinetic = 0.5 * (model.body_mass @ (linear**2).sum(1) + (model.body_inertia * angular**2).sum())
+    return kinetic - model.body_mass @ ((pose[:, :3] + com) @ GRAVITY) + 0.5 * (model.joint_stiffness * theta**2).sum()
+
+
+def pendulum(stiffness: float = 0.0) -> Tree:
+    """A bunch of 0.5 kg on a massless string of 15 cm, 17 degrees out."""
+    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, -1.0]))))
+    tree.add(-1, mass=0.5, com=(0.15, 0, 0), inertia=(1e-4, 3e-4, 3e-4), length=0.2, stiffness=[stiffness] * 3)
+    return tree
+
+
+@pytest.mark.parametrize(("phi", "loss"), [(0.5, 0.01), (0.55, 0.01)])
+def test_a_hanging_bunch_gains_no_energy(phi: float, loss: float) -> None:
+    """Undamped and without a spring, over 10 s: the energy stays within 1 %.
+
+    With the weight's stiffness taken explicitly the same bunch has twenty times its energy by then.
+    """
+    model = assemble([pendulum()])
+    rest = awake(model, State.at_rest(model))
+    rest.free()
+    state = State.at_rest(model)
+    state.joint_q[0] = frames.exp(np.array([0.0, 0.3, 0.0]))
+    plants = awake(model, state, phi=phi)
+    seen = []
+    for _ in range(1000):
+        plants.free()
+        seen.append(energy(plants) - energy(rest))
+        plants.commit()
+    assert max(seen) < 1.01 * seen[0]
+    assert min(seen) > (1.0 - loss) * seen[0]
+
+
+def test_energy_of_an_undamped_cane() -> None:
+    """phi 1/2, 60 s, swings below 1 rad/s: within 1 %."""
+    tree = Tree(frames.pose(np.zeros(3)))
+    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0), 16)
+    tree.settle()
+    model = assemble([tree])
+    rest = awake(model, State.at_rest(model), phi=0.5)
+    rest.free()
+    plants = awake(model, State.at_rest(model), phi=0.5)
+    plants.state.joint_qd[:, 1:] = np.array([0.5, 0.2]) / 16
+    seen = []
+    for _ in range(6000):
+        plants.free()
+        seen.append(energy(plants) - energy(rest))
+        plants.commit()
+    assert seen[0] > 1e-4
+    assert np.mean(seen[-200:]) == pytest.approx(np.mean(seen[:200]), rel=0.01)
+
+
+@pytest.mark.parametrize("mass", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("radius", [0.0015, 0.0025])
+def test_a_heavy_bunch_on_a_thin_peduncle_stays(mass: float, radius: float) -> None:
+    """Springs softer than the weight they carry, pulled by 60 N for a second, then let go: calm after 10 s."""
+    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, -1.0]))))
+    last = tree.rod(-1, 0.06, (radius, radius), Wood(0.5e9, 900.0, 0.02), 3)[-1]
+    spring = tree.bodies[last]
+    bunch = tree.add(
+        last, offset=(0.02, 0, 0), mass=mass, com=(0.08, 0, 0), inertia=np.array([1, 2, 2]) * 1e-3 * mass, length=0.16,
+        stiffness=spring["stiffness"], damping=spring["damping"],
+    )  # fmt: skip
+    model = assemble([tree])
+    state = State.at_rest(model)
+    state.joint_q[0] = frames.exp(np.array([0.0, 0.3, 0.0]))
+    plants = awake(model, state)
+    fastest = 0.0
+    for tick in range(1000):
+        plants.free()
+        pull = np.array([[30.0, 10.0, -50.0, 0.0, 0.0, 0.0]]) if tick < 100 else None
+        plants.commit(np.array([bunch]) if tick < 100 else None, pull)
+        fastest = plants.tree_rate[0] if tick >= 900 else fastest
+    assert fastest < 2.0
+
+
+@pytest.mark.parametrize(("phi", "rate"), [(0.55, 20.0), (1.0, 50.0)])
+def test_survives_violence(phi: float, rate: float) -> None:
+    rng = np.random.default_rng(11)
+    trees = []
+    for i in range(4):
+        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
+        tree.rod(-1, 1.0, (0.004, 0.003), Wood(5e9, 800.0, 0.004), 16)
+        trees.append(tree)
+    model = assemble([*trees, forked(rng, beta=0.004)])
+    plants = awake(model, random_state(model, rng, rate), phi=phi)
+    for _ in range(1000):
+        plants.free()
+        plants.commit()
+        assert (plants.tree_rate < plants.bound).all()  # false of NaN too
+    assert plants.tree_rate.max() < 1.0
+
+
+def test_joint_wrench_carries_weight_and_pull() -> None:
+    """At rest, statics: the joint bears everything beyond it."""
+    rng = np.random.default_rng(13)
+    model = assemble([forked(rng, beta=0.1)])
+    plants = awake(model, State.at_rest(model), phi=1.0)
+    plants.body_load[7] = [1.0, -2.0, 3.0, 0.01, 0.02, -0.03]
+    for _ in range(1500):
+        plants.free()
+        plants.commit()
+    assert plants.tree_rate.max() < 1e-3
+    pose = plants.state.body_q.astype(float)
+    com = pose[:, :3] + frames.rotate(pose[:, 3:], model.body_com.astype(float))
+    weight = model.body_mass[:, None] * GRAVITY
+    for joint, beyond in ((0, range(13)), (6, range(6, 13)), (8, [8, 9]), (10, [10, 11, 12])):
+        beyond = list(beyond)
+        force = weight[beyond].sum(0)
+        moment = np.cross(com[beyond] - pose[joint, :3], weight[beyond]).sum(0)
+        if 7 in beyond:
+            load = plants.body_load[7].astype(float)
+            force = force + load[:3]
+            moment = moment + load[3:] + np.cross(pose[7, :3] - pose[joint, :3], load[:3])
+        seen = plants.joint_wrench(np.array([joint]))[0]
+        np.testing.assert_allclose(seen[:3], -force, atol=2e-3)
+        np.testing.assert_allclose(seen[3:], -moment, atol=2e-3)
+
+
+def digest_of_a_run() -> str:
+    rng = np.random.default_rng(17)
+    model = assemble([forked(rng, isotropic=False) for _ in range(3)])
+    plants = awake(model, random_state(model, rng, 6.0))
+    h = hashlib.blake2b()
+    for tick in range(200):
+        plants.free()
+        touched = np.array([5, 20, 5], np.int32)
+        plants.commit(touched if tick % 3 else None, rng.normal(size=(3, 6)) * 0.1)
+        h.update(plants.state.joint_q.tobytes() + plants.state.joint_qd.tobytes() + plants.state.body_q.tobytes())
+        h.update(plants.response(touched[:2]).tobytes() if tick == 50 else b"")
+    return h.hexdigest()
+
+
+def test_two_runs_are_equal_bit_for_bit() -> None:
+    assert digest_of_a_run() == digest_of_a_run()
