@@ -143,7 +143,7 @@ class _Actor:
     def _shown(self, time: float) -> np.ndarray:
         assert self.update is not None
         shown = self._state + self._rate * smooth.horizon(time - self.update.time)
-        if len(self._off) and time - self.moved_at < smooth.BLEND:
+        if len(self._off):
             shown += self._off * smooth.remaining(time - self.moved_at)
         return shown
 

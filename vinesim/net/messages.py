@@ -265,7 +265,7 @@ def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> 
     """Whole steps of turn [n, 3] and of rate [n, 3] as floats, scales of rates [k], and the unit of rate [n, 1]."""
     if not (np.isfinite(joint_q).all() and np.isfinite(joint_qd).all()):
         raise MessageError("joint state of a tree is not finite")
-    fastest = np.maximum.reduceat(np.abs(joint_qd).max(axis=1), np.cumsum(bodies) - bodies)
+    fastest = np.maximum.reduceat(np.abs(joint_qd).ravel(), 3 * (np.cumsum(bodies) - bodies))
     scale = np.minimum(np.ceil(fastest / (127.0 * RATE)), 65535.0)
     unit = _unit(bodies, scale)
     turn = np.rint(rotation_vector(joint_q) / TURN) + 0.0  # an integer has no negative zero

@@ -59,6 +59,7 @@ def config(mode: str, **settings: Any) -> zenoh.Config:
         "mode": mode,
         "scouting__multicast__enabled": False,
         "scouting__gossip__enabled": False,
+        "scouting__delay": 0,
         "transport__link__tx__lease": LEASE,
         "transport__shared_memory__enabled": False,
         "transport__unicast__open_timeout": 1500,
