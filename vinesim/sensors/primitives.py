@@ -291,6 +291,14 @@ def _meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> _B
     )  # fmt: skip
 
 
+def _nothing(still: int) -> _Batch:
+    """A stand-in for a world without plants, far below the ground: no array is ever empty."""
+    return _batch(
+        CONE, [[0.0, 0.0, float(shapes.HIDDEN), 1e-6]], b=[[1e-3, 0.0, float(shapes.HIDDEN), 1e-6]], material=0, tint=0.0,
+        organ=0, label=0, carrier=still, group=0,
+    )  # fmt: skip
+
+
 # ---- robots, boxes, people -------------------------------------------------------------------------------------------
 
 
@@ -385,7 +393,7 @@ class Primitives:
             batches += _bunch(model, bunch, int(body), int(model.body_tree[body]))
         self._tree_batches = len(batches)
         batches += [b for b in (_fixed(model, bodies), _meadow(low, high, grass, bodies)) if b is not None]
-        self._plants = [b for b in batches if len(b)]
+        self._plants = [b for b in batches if len(b)] or [_nothing(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)

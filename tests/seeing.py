@@ -1,0 +1,79 @@
+"""Scenes that the tests of the sensors look at."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from vinesim import frames
+from vinesim.kernels import rays
+from vinesim.sensors.camera import CameraSpec, Visibility, pinhole
+from vinesim.sensors.picture import looking
+from vinesim.sensors.primitives import Primitives, still_view
+from vinesim.sensors.raycast import RayCaster
+from vinesim.world.generate import generate
+from vinesim.world.ids import Organ
+from vinesim.world.model import Model
+from vinesim.world.scene import load
+from vinesim.world.values import CameraInfo, Link, Shape, View
+
+IDEAL = CameraSpec.load("pinhole")
+SMALL = IDEAL.info("optical", 0.5)
+AHEAD = looking(np.zeros(3) + [0, 0, 1.0], np.array([1.0, 0.0, 1.0]))
+"""An optical frame 1 m above the origin that looks along +x."""
+
+
+@functools.cache
+def demo() -> Model:
+    return generate(load("demo"))
+
+
+@functools.cache
+def empty() -> Model:
+    return Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, box=0)
+
+
+def shape(kind: str, *size: float, at=(0.0, 0.0, 0.0), turn=frames.IDENTITY, **others) -> Shape:
+    return Shape(kind, tuple(size), frames.pose(np.array(at, float), turn), **others)
+
+
+def thing(*shapes: Shape, name: str = "thing", organ: Organ = Organ.ROBOT, index: int = 0) -> Link:
+    return Link(name, organ, index, tuple(shapes))
+
+
+def world(*links: Link, model: Model | None = None, at=None, grass: float = 0.0) -> tuple[Primitives, View]:
+    """Primitives that show ``links`` at poses ``at`` [link, 7] (the origin unless given)."""
+    model = empty() if model is None else model
+    poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (len(links), 1)) if at is None else np.asarray(at, float)
+    view = still_view(model, links, poses)
+    primitives = Primitives(model, grass=grass)
+    primitives.update(view)
+    return primitives, view
+
+
+def raster(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (inf for nothing) and primitive numbers [height, width] by the rasteriser."""
+    seen = Visibility(info.width, info.height)
+    seen.draw(primitives, pinhole(info, pose))
+    shape = (info.height, info.width)
+    return seen.depth.numpy().reshape(shape), seen.primitive.numpy().reshape(shape)
+
+
+def oracle(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -> tuple[np.ndarray, np.ndarray]:
+    """The same by the ray caster."""
+    count = info.width * info.height
+    depth, primitive = wp.empty(count, dtype=float, device="cpu"), wp.empty(count, dtype=wp.int32, device="cpu")
+    caster = RayCaster(primitives)
+    wp.launch(
+        rays.cast_camera, count, inputs=[primitives.shapes, caster.hierarchies(), pinhole(info, pose)], outputs=[depth, primitive], device="cpu"
+    )
+    shape = (info.height, info.width)
+    return depth.numpy().reshape(shape), primitive.numpy().reshape(shape)
+
+
+def pixel_rays(info: CameraInfo = SMALL) -> np.ndarray:
+    """Rays [height, width, 3] of all pixels in the optical frame, 1 along its axis, float64."""
+    u, v = np.meshgrid(np.arange(info.width), np.arange(info.height))
+    return np.stack([(u - info.cx) / info.fx, (v - info.cy) / info.fy, np.ones(u.shape)], -1)

@@ -1,0 +1,176 @@
+"""The rasteriser against closed forms in double precision and against the ray caster."""
+
+import numpy as np
+import pytest
+import seeing
+import trimesh
+
+from vinesim import frames
+from vinesim.sensors.picture import looking
+from vinesim.world.ids import Organ
+
+SKEW = frames.normalize(np.array([0.3, 0.2, -0.4, 0.8]))
+
+
+def _march(distance, rays: np.ndarray, eye: np.ndarray, turn: np.ndarray, far: float = 10.0) -> np.ndarray:
+    """Depth by sphere tracing a distance field [m] in world coordinates; inf where nothing is met."""
+    d = frames.rotate(turn, rays)
+    length = np.linalg.norm(d, axis=-1)
+    t = np.zeros(rays.shape[:-1])
+    for _ in range(400):
+        t += distance(eye + d * t[..., None]) / length
+    return np.where((t < far) & (distance(eye + d * np.minimum(t, far)[..., None]) < 1e-7), t, np.inf)
+
+
+def _capsule(a, b, r):
+    def distance(p):
+        h = np.clip(((p - a) @ (b - a)) / ((b - a) @ (b - a)), 0.0, 1.0)
+        return np.linalg.norm(p - a - h[..., None] * (b - a), axis=-1) - r
+
+    return distance
+
+
+def _box(half):
+    def distance(p):
+        q = np.abs(p) - half
+        return np.linalg.norm(np.maximum(q, 0.0), axis=-1) + np.minimum(q.max(-1), 0.0)
+
+    return distance
+
+
+@pytest.mark.parametrize("away", [0.3, 1.5, 6.0])
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "box", "cylinder"])
+def test_depth_is_exact(kind: str, away: float) -> None:
+    eye = np.array([-away, 0.02, 1.03])
+    pose = looking(eye, np.array([0.0, 0.0, 1.0]))
+    axis = frames.rotate(SKEW, np.array([0.0, 0.0, 0.09]))
+    centre = np.array([0.0, 0.0, 1.0])
+    local = lambda p: frames.rotate(frames.conjugate(SKEW), p - centre)  # noqa: E731
+    made, field = {
+        "sphere": (seeing.shape("sphere", 0.08, at=centre), lambda p: np.linalg.norm(p - centre, axis=-1) - 0.08),
+        "capsule": (seeing.shape("capsule", 0.05, 0.09, at=centre, turn=SKEW), _capsule(centre - axis, centre + axis, 0.05)),
+        "box": (seeing.shape("box", 0.1, 0.06, 0.04, at=centre, turn=SKEW), lambda p: _box(np.array([0.1, 0.06, 0.04]))(local(p))),
+        "cylinder": (
+            seeing.shape("cylinder", 0.05, 0.09, at=centre, turn=SKEW),
+            lambda p: _box(np.array([0.05, 0.09]))(np.stack([np.hypot(*local(p)[..., :2].T).T, local(p)[..., 2]], -1)),
+        ),
+    }[kind]
+    primitives, _ = seeing.world(seeing.thing(made))
+    depth, primitive = seeing.raster(primitives, pose)
+    truth = _march(field, seeing.pixel_rays(), eye, pose[3:])
+    here, there = primitive >= 0, np.isfinite(truth)
+    assert there.sum() > 80
+    assert (here != there).sum() <= 0.02 * there.sum() + 2  # grazing rays only
+    both = here & there
+    assert np.abs(depth - truth)[both].max() < 2e-4
+    assert np.median(np.abs(depth - truth)[both]) < 1e-5
+
+
+def test_a_plane_at_a_known_depth() -> None:
+    primitives, _ = seeing.world(seeing.thing(seeing.shape("box", 0.5, 5.0, 5.0, at=(2.5, 0.0, 1.0))))
+    depth, primitive = seeing.raster(primitives, seeing.AHEAD)
+    assert (primitive >= 0).all()
+    assert np.abs(depth - 2.0).max() < 2e-6
+
+
+def _solids():
+    ball = trimesh.creation.icosphere(2, radius=0.15)
+    return ball, seeing.thing(
+        seeing.shape("box", 0.2, 0.1, 0.3),
+        seeing.shape("cylinder", 0.08, 0.2, at=(0, 0, 0.5), turn=SKEW),
+        seeing.shape("capsule", 0.07, 0.2, at=(0.3, 0, 0.5), turn=SKEW),
+        seeing.shape("ellipsoid", 0.1, 0.05, 0.2, at=(-0.3, 0, 0.5), turn=SKEW),
+        seeing.shape("sphere", 0.1, at=(0, 0.3, 0.6)),
+    )
+
+
+VIEWPOINTS = {
+    "along the rows": ([-1.9, 1.0, 1.45], [6.0, 1.2, 1.4]),
+    "up into the canopy": ([1.2, 1.2, 1.3], [1.3, 1.2, 2.0]),
+    "down": ([2.0, 1.2, 1.9], [2.2, 1.4, 0.0]),
+    "grazing the canopy": ([-2.0, 1.2, 1.95], [3.0, 1.2, 1.97]),
+    "inside the canopy": ([1.1, 0.2, 1.97], [2.0, 0.4, 1.95]),
+    "along a wire": ([1.0, 0.0, 2.02], [3.0, 0.0, 2.0]),
+    "solids": ([0.2, 0.1, 1.2], [1.2, 1.0, 0.9]),
+    "solids at arm's length": ([1.0, 0.85, 1.1], [1.2, 1.0, 1.1]),
+}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory):
+    ball, link = _solids()
+    file = tmp_path_factory.mktemp("mesh") / "ball.stl"
+    ball.export(file)
+    mesh = seeing.thing(seeing.shape("mesh", 1.0, 1.0, 1.0, at=(0, -0.3, 0.6), file=str(file)), name="mesh", index=1)
+    at = np.tile([1.2, 1.0, 0.6, *frames.yaw(0.5)], (2, 1))
+    primitives, _ = seeing.world(link, mesh, model=seeing.demo(), at=at, grass=3.0)
+    return primitives
+
+
+@pytest.mark.parametrize("where", VIEWPOINTS)
+def test_the_ray_caster_sees_the_same(scene, where: str) -> None:
+    pose = looking(*map(np.array, VIEWPOINTS[where]))
+    depth, primitive = seeing.raster(scene, pose)
+    truth, ids = seeing.oracle(scene, pose)
+    same = primitive == ids
+    assert len(np.unique(ids)) > 30
+    assert same.mean() >= 0.999
+    close = same & (truth < 20.0)
+    assert np.abs(depth - truth)[close].max() < 2e-4
+
+
+def test_the_ray_caster_sees_the_same_from_anywhere(scene) -> None:
+    rng = np.random.default_rng(4)
+    agree, total = 0, 0
+    for _ in range(6):
+        eye = rng.uniform([0.0, 0.0, 1.5], [5.0, 2.5, 2.2])
+        pose = looking(eye, eye + rng.normal(size=3))
+        agree += (seeing.raster(scene, pose)[1] == seeing.oracle(scene, pose)[1]).sum()
+        total += seeing.SMALL.width * seeing.SMALL.height
+    assert agree / total >= 0.999
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box", "ellipsoid"])
+@pytest.mark.parametrize("side", [(0.0, 0.06), (0.06, 0.0), (-0.05, 0.05)])
+def test_what_crosses_the_pinhole_plane_is_seen(kind: str, side: tuple[float, float]) -> None:
+    """A solid beside the pinhole, half of it behind: seen as the ray caster sees it."""
+    size = {"sphere": (0.05,), "capsule": (0.03, 0.2), "cylinder": (0.03, 0.2), "box": (0.2, 0.03, 0.04), "ellipsoid": (0.2, 0.03, 0.04)}[kind]
+    turn = frames.exp(np.array([0.0, 1.3, 0.0])) if kind in ("capsule", "cylinder") else frames.IDENTITY
+    primitives, _ = seeing.world(seeing.thing(seeing.shape(kind, *size, at=(0.01, side[0], 1.0 + side[1]), turn=turn)))
+    _, primitive = seeing.raster(primitives, seeing.AHEAD)
+    _, ids = seeing.oracle(primitives, seeing.AHEAD)
+    assert (ids >= 0).sum() > 50
+    assert (primitive == ids).mean() >= 0.999
+
+
+def test_leaves_that_cross_the_pinhole_plane_are_seen() -> None:
+    model = seeing.demo()
+    primitives, view = seeing.world(model=model)
+    leaf = view.body_q[model.leaf_body]
+    blade = frames.compose(leaf, model.leaf_pose)[::300]
+    crossing = 0
+    for pose in blade:
+        eye = pose[:3] + frames.rotate(pose[3:], np.array([0.03, 0.0, 0.004]))
+        camera = looking(eye, eye + frames.rotate(pose[3:], np.array([1.0, 0.2, -0.15])))
+        primitive, ids = seeing.raster(primitives, camera)[1], seeing.oracle(primitives, camera)[1]
+        crossing += (primitives.organ[ids[ids >= 0]] == int(Organ.LEAF)).mean() > 0.3
+        assert (primitive == ids).mean() >= 0.999
+    assert crossing >= len(blade) // 2
+
+
+def test_a_camera_inside_a_housing_looks_out(tmp_path) -> None:
+    file = tmp_path / "housing.stl"
+    trimesh.creation.box((0.2, 0.2, 0.2)).export(file)
+    shell = (seeing.shape("mesh", 1.0, 1.0, 1.0, at=(0, 0, 1), file=str(file)), seeing.shape("box", 0.1, 0.1, 0.1, at=(0, 0, 1)))
+    wall = seeing.thing(seeing.shape("box", 0.5, 5.0, 5.0, at=(2.5, 0.0, 1.0)), name="wall", index=1)
+    primitives, _ = seeing.world(seeing.thing(*shell), wall)
+    depth, _ = seeing.raster(primitives, seeing.AHEAD)
+    assert np.abs(depth - 2.0).max() < 2e-6
+
+
+def test_nothing_in_the_world_is_ground_and_sky() -> None:
+    primitives, _ = seeing.world()
+    depth, primitive = seeing.raster(primitives, seeing.AHEAD)
+    assert set(np.unique(primitive)) == {-2, -1}
+    row = int(seeing.SMALL.cy) + 60
+    assert depth[row, 10] == pytest.approx(seeing.SMALL.fy / (row - seeing.SMALL.cy), rel=1e-5)

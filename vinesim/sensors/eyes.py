@@ -1,0 +1,163 @@
+"""The thread that sees: takes the newest view of the world, renders what somebody wants, drops what comes too late.
+
+Physics calls :meth:`Eyes.see` every tick and never waits. Warp's launches release the interpreter lock, so a frame
+costs the physics thread the other core, not its tick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from vinesim.sensors.camera import Camera
+from vinesim.sensors.lidar import Lidar
+from vinesim.sensors.primitives import Primitives
+from vinesim.world.model import Model
+from vinesim.world.values import CameraFrame, LidarScan, View
+
+log = logging.getLogger(__name__)
+
+
+class Wanted(Protocol):
+    """Whether anybody listens to a sensor now."""
+
+    def __call__(self) -> bool: ...
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Mount:
+    """One sensor and its listener."""
+
+    sensor: Camera | Lidar
+    deliver: Callable[[CameraFrame | LidarScan], None]
+    """Called in the sensing thread with every frame or scan."""
+    wanted: Wanted = lambda: True
+    rate: float | None = None
+    """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
+
+    @property
+    def name(self) -> str:
+        """The sensor's name, which its pose carries too."""
+        return self.sensor.name
+
+
+class Eyes:
+    """All sensors of one client in one thread. Use as a context manager, or :meth:`start` and :meth:`stop`."""
+
+    def __init__(self, model: Model, mounts: list[Mount] | tuple[Mount, ...], *, primitives: Primitives | None = None) -> None:
+        names = [m.name for m in mounts]
+        if len(set(names)) != len(names):
+            twice = next(n for n in names if names.count(n) > 1)
+            raise ValueError(f"two sensors are named {twice!r}; give each its own name")
+        self.mounts = tuple(mounts)
+        self.primitives = primitives or Primitives(model)
+        self.frames = dict.fromkeys(names, 0)
+        """Frames delivered by each sensor."""
+        self.dropped = dict.fromkeys(names, 0)
+        """Frames that were due and not rendered in time, by sensor."""
+        self.failure: BaseException | None = None
+        """What stopped the thread, if anything did; :meth:`see` and :meth:`stop` raise it."""
+        self._due = dict.fromkeys(names, -np.inf)
+        self._news = threading.Condition()
+        self._newest: tuple[View, Mapping[str, np.ndarray]] | None = None
+        self._moved: list[np.ndarray] = []
+        self._stopping = False
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> Eyes:
+        """Start the thread."""
+        if self._thread is not None:
+            raise RuntimeError("these eyes are open already; stop them first")
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="eyes", daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self, timeout: float = 10.0) -> None:
+        """End the thread after the frame it is at; raises what went wrong in it, once."""
+        with self._news:
+            self._stopping = True
+            self._news.notify()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join(timeout)
+            if thread.is_alive():
+                raise TimeoutError(f"the sensing thread did not end within {timeout} s")
+        self._raise()
+
+    def __enter__(self) -> Eyes:
+        return self.start()
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            self.stop()
+        except Exception:
+            if kind is None:  # a failure of the body comes first
+                raise
+
+    def see(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
+        """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
+        self._raise()
+        with self._news:
+            self._newest = (view, poses)
+            if len(view.moved):
+                self._moved.append(view.moved)
+                if len(self._moved) > 256:
+                    self._moved = [np.unique(np.concatenate(self._moved))]
+            self._news.notify()
+
+    def _raise(self) -> None:
+        if self.failure is not None:
+            failure, self.failure = self.failure, None
+            raise RuntimeError(f"the sensing thread failed: {failure!r}") from failure
+
+    def _run(self) -> None:
+        moved: list[np.ndarray] = []
+        try:
+            while True:
+                with self._news:
+                    self._news.wait_for(lambda: self._stopping or self._newest is not None)
+                    if self._stopping:
+                        return
+                    (view, poses), self._newest = self._newest, None
+                    moved += self._moved
+                    self._moved = []
+                due = [m for m in self.mounts if self._is_due(m, view.time, poses)]
+                if not due:
+                    continue
+                self.primitives.update(view, np.concatenate(moved) if moved else np.zeros(0, np.int64))
+                moved = []
+                for mount in due:
+                    if self._stopping:
+                        return
+                    sensor, pose = mount.sensor, poses[mount.name]
+                    take = sensor.render if isinstance(sensor, Camera) else sensor.scan
+                    mount.deliver(take(self.primitives, pose, view.time))
+                    self.frames[mount.name] += 1
+        except BaseException as failure:  # surfaced by the next see() or stop()
+            log.exception("the sensing thread stops")
+            self.failure = failure
+
+    def _is_due(self, mount: Mount, now: float, poses: Mapping[str, np.ndarray]) -> bool:
+        """Whether a sensor takes a frame of simulation time ``now``; counts the frames it has missed."""
+        name = mount.name
+        if name not in poses or not mount.wanted():
+            self._due[name] = -np.inf  # whoever comes back is served at once, and missed nothing
+            return False
+        due, period = self._due[name], 1.0 / (mount.rate or mount.sensor.rate)
+        if now < due - 2.0 * period:  # time was set back
+            due = -np.inf
+        if now < due - 1e-6:
+            return False
+        if not np.isfinite(due):
+            self._due[name] = now + period
+            return True
+        late = int((now - due + 1e-6) / period)
+        self.dropped[name] += late
+        self._due[name] = due + (late + 1) * period
+        return True
