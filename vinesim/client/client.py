@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from vinesim.client.trace import Trace
+from vinesim.net import interest
 from vinesim.net.bus import Bus
 from vinesim.net.exchange import Exchange, Inbox
 from vinesim.net.messages import Hello
@@ -53,7 +54,7 @@ class Client:
         *,
         name: str,
         pose: np.ndarray,
-        near: float = 6.0,
+        near: float = interest.NEAR,
         device: str = "cpu",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
