@@ -37,7 +37,7 @@ class Plants:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
     ``free()`` chooses each tree's phi: 1 while a joint turns faster than ``brisk`` or for ``ONSET`` ticks after a touch
-    began, ``tree_phi`` otherwise. ``response()`` and ``commit()`` belong to the ``free()`` before them.
+    began, ``phi`` otherwise. ``response()`` and ``commit()`` belong to the ``free()`` before them.
 
     Args:
         model: constants; :class:`ValueError` in words if a tree cannot be simulated.
@@ -73,7 +73,7 @@ class Plants:
         self.model, self.state = model, state
         self.dt, self.brisk, self.limit, self.bound = dt, brisk, limit, bound
         trees, bodies = len(model.tree_first), len(model.body_mass)
-        self.tree_phi = np.full(trees, phi, np.float32)
+        self.phi = np.full(trees, phi, np.float32)
         """phi asked for each tree [tree]; set it as you like."""
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint that the last commit found [tree] rad/s; NaN or above ``bound`` for a tree that it stopped."""
@@ -85,9 +85,12 @@ class Plants:
         """Acceleration over the last tick [body, 6] m/s^2, rad/s^2, world axes."""
         self.body_mass = model.body_mass.copy()
         self.body_inertia = model.body_inertia.copy()
+        self.phi_used = np.zeros(trees, np.float32)
+        """phi of each tree's last ``free()`` [tree]."""
         self._onset = np.zeros(trees, np.int32)
         self._touched = np.full(trees, -2, np.int64)  # tick of the last touch
-        self._tick = 0
+        self.tick = 0
+        """Commits so far."""
         self._wrench = np.zeros((bodies, 6), np.float32)
         self._pushed = np.zeros(0, np.int32)
         self._stepping = np.zeros(trees, np.int32)
@@ -173,10 +176,10 @@ class Plants:
             touched = np.unique(self.model.body_tree[bodies])
             self._subset[: len(touched)] = touched
             self._launch(self._push, len(touched))
-            self.brace(touched[self._touched[touched] < self._tick - 1])
-            self._touched[touched] = self._tick
+            self.brace(touched[self._touched[touched] < self.tick - 1])
+            self._touched[touched] = self.tick
         self._launch(self._integrate, len(self._stepped))
-        self._tick += 1
+        self.tick += 1
 
     def brace(self, trees: np.ndarray) -> None:
         """Use phi = 1 in the next ``ONSET`` ticks of trees about to be touched (``commit()`` sees to new touches)."""
@@ -231,7 +234,7 @@ class Plants:
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
         """Least damping ratio that a spring mode of this frequency [Hz] can show: pi f (2 phi - 1) dt."""
-        phi = float(self.tree_phi.max(initial=0.5)) if phi is None else phi
+        phi = float(self.phi.max(initial=0.5)) if phi is None else phi
         return math.pi * frequency * (2.0 * phi - 1.0) * self.dt
 
     def reweigh(self, body: int, mass: float) -> None:
@@ -265,7 +268,8 @@ class Plants:
             wp.int32: {"tree_first": model.tree_first, "tree_size": model.tree_size, "body_tree": model.body_tree,
                        "body_parent": model.body_parent, "stepping": self._stepping, "subset": self._subset,
                        "onset": self._onset},
-            float: {"body_mass": self.body_mass, "tree_phi": self.tree_phi, "tree_rate": self.tree_rate},
+            float: {"body_mass": self.body_mass, "tree_phi": self.phi, "phi_used": self.phi_used,
+                    "tree_rate": self.tree_rate},
             wp.bool: {"tree_awake": state.tree_awake},
             wp.vec3: {"body_offset": model.body_offset, "body_com": model.body_com, "body_inertia": self.body_inertia,
                       "joint_stiffness": model.joint_stiffness,
@@ -280,7 +284,6 @@ class Plants:
             for dtype, arrays in kinds.items()
             for name, data in arrays.items()
         }
-        bodies, trees = len(model.body_mass), len(model.tree_first)
         scratch = {
             wp.vec3: ("lever", "drawn", "Du", "joint_qd_free"),
             wp.quat: ("axes",),
@@ -288,8 +291,7 @@ class Plants:
             wp.spatial_vector: ("bias", "spread"),
         }
         for dtype, names in scratch.items():
-            a |= {name: wp.empty(bodies, dtype=dtype, device="cpu") for name in names}
-        a["phi_used"] = wp.zeros(trees, dtype=float, device="cpu")
+            a |= {name: wp.empty(len(model.body_mass), dtype=dtype, device="cpu") for name in names}
 
         def record(kernel: wp.Kernel, *inputs: object) -> wp.Launch:
             values = [a[value] if isinstance(value, str) else value for value in inputs]

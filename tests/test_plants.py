@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.physics.plants import ONSET, Plants
+from vinesim.world.grow import Tree, Wood, assemble
+from vinesim.world.model import Model
+from vinesim.world.state import State
+
+
+def canes(count: int) -> Model:
+    trees = []
+    for i in range(count):
+        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
+        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 5)
+        tree.settle()
+        trees.append(tree)
+    return assemble(trees)
+
+
+@pytest.fixture
+def plants() -> Plants:
+    model = canes(4)
+    return Plants(model, State.at_rest(model))
+
+
+def step(plants: Plants, ticks: int = 1) -> None:
+    for _ in range(ticks):
+        plants.free()
+        plants.commit()
+
+
+def test_drawn_shape_stays(plants: Plants) -> None:
+    drawn = plants.state.body_q.copy()
+    plants.wake(np.arange(4))
+    step(plants, 200)
+    plants.kinematics()
+    np.testing.assert_allclose(plants.state.body_q, drawn, atol=2e-5)
+
+
+def test_state_is_shared_memory_and_kinematics_follow_it(plants: Plants) -> None:
+    state, rng = plants.state, np.random.default_rng(1)
+    state.joint_q[:] = frames.exp(rng.normal(size=(20, 3)))
+    state.joint_qd[:] = rng.normal(size=(20, 3))
+    plants.kinematics(np.arange(4))
+    np.testing.assert_allclose(state.body_q, plants.model.forward(state.joint_q), atol=2e-6)
+    ahead = state.joint_q.astype(float)
+    h = 1e-5
+    there = plants.model.forward(frames.multiply(frames.exp(h * state.joint_qd.astype(float)), ahead))
+    here = plants.model.forward(ahead)
+    np.testing.assert_allclose(state.body_qd[:, :3], (there - here)[:, :3] / h, atol=1e-3)
+    turn = frames.log(frames.multiply(there[:, 3:], frames.conjugate(here[:, 3:]))) / h
+    np.testing.assert_allclose(state.body_qd[:, 3:], turn, atol=1e-3)
+
+
+def test_awake_is_sorted_and_sleepers_are_untouched(plants: Plants) -> None:
+    state = plants.state
+    plants.wake(np.array([3, 1]))
+    assert plants.awake.tolist() == [1, 3]
+    plants.wake(0)
+    plants.rest(np.array([1]))
+    assert plants.awake.tolist() == [0, 3]
+    assert state.tree_awake.tolist() == [True, False, False, True]
+    asleep = plants.bodies_of(np.array([1, 2]))
+    assert asleep.tolist() == list(range(5, 15))
+    arrays = [state.joint_q, state.joint_qd, state.body_q, state.body_qd, plants.velocity_free, plants.acceleration]
+    before = [array[asleep].tobytes() for array in arrays]
+    state.joint_qd[0, 1] = 1.0
+    step(plants, 3)
+    assert [array[asleep].tobytes() for array in arrays] == before
+    assert np.abs(state.joint_qd[:5]).max() > 1e-3
+
+
+def test_touching_a_sleeper_is_refused(plants: Plants) -> None:
+    plants.wake(np.array([0, 2]))
+    plants.free()
+    plants.wake(1)  # too late for this tick
+    with pytest.raises(ValueError, match=r"body 7 is touched, but tree 1 slept: wake it before free\(\)"):
+        plants.commit(np.array([2, 7]), np.zeros((2, 6)))
+    with pytest.raises(ValueError, match=r"body 15 .* tree 3"):
+        plants.response(np.array([15]))
+
+
+def test_resting_between_free_and_commit_holds(plants: Plants) -> None:
+    plants.wake(np.array([0, 1]))
+    plants.state.joint_qd[:, 1] = 1.0
+    plants.free()
+    plants.rest(0)
+    before = plants.state.joint_q[:5].copy()
+    plants.commit()
+    np.testing.assert_array_equal(plants.state.joint_q[:5], before)
+    assert not plants.state.joint_qd[:5].any()
+
+
+def test_wrenches_on_one_body_add_up_and_do_not_linger() -> None:
+    model = canes(1)
+    runs = []
+    for bodies, wrenches in (
+        ([4], [[1.0, 2.0, 3.0, 0.1, 0.0, 0.0]]),
+        ([4, 4], [[1.0, 0.0, 3.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.1, 0.0, 0.0]]),
+    ):
+        plants = Plants(model, State.at_rest(model))
+        plants.wake(0)
+        plants.free()
+        plants.commit(np.array(bodies), np.array(wrenches))
+        kicked = plants.state.joint_qd.copy()
+        step(plants, 400)
+        runs.append((kicked, plants.tree_rate[0]))
+    np.testing.assert_allclose(runs[0][0], runs[1][0], rtol=1e-6)
+    assert np.abs(runs[0][0]).max() > 0.1
+    assert runs[0][1] < 0.01  # the push was one tick long
+
+
+def test_steady_load_bends_by_the_beam_formula() -> None:
+    """A small sideways force on the tip: deflection F L^3 / 3 EI."""
+    tree = Tree(frames.pose(np.zeros(3)))
+    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.2), 16)
+    tree.settle()
+    model = assemble([tree])
+    plants = Plants(model, State.at_rest(model))
+    plants.wake(0)
+    plants.body_load[15] = [0.0, 0.01, 0.0, 0.0, 0.0, 0.01 / 16]  # at the tip
+    step(plants, 1500)
+    plants.kinematics()
+    tip = frames.compose(plants.state.body_q[15], frames.pose([1 / 16, 0, 0]))
+    assert tip[1] == pytest.approx(0.01 / (3 * 5e9 * np.pi * 0.004**4 / 4), rel=0.01)
+
+
+def test_response_of_nothing_and_of_many(plants: Plants) -> None:
+    plants.wake(np.arange(4))
+    plants.free()
+    assert plants.response(np.zeros(0, np.int32)).shape == (0, 6, 0, 6)
+    one = plants.response(np.array([7]))
+    many = plants.response(np.arange(20))
+    assert many.shape == (20, 6, 20, 6)
+    np.testing.assert_array_equal(many[7, :, 7], one[0, :, 0])
+    flat = many.reshape(120, 120)
+    np.testing.assert_array_equal(flat, flat.T)
+    assert np.linalg.eigvalsh(flat.astype(float)).min() > -1e-4 * np.abs(flat).max()
+    assert not many[0, :, 5:].any()
+
+
+def test_phi_is_one_after_a_touch_begins_and_when_brisk(plants: Plants) -> None:
+    plants.wake(np.arange(2))
+    used = plants.phi_used
+    step(plants)
+    assert used[:2].tolist() == pytest.approx([0.55, 0.55])
+    seen = []
+    for _ in range(ONSET + 3):  # a lasting touch begins
+        plants.free()
+        seen.append(float(used[0]))
+        plants.commit(np.array([2]), np.array([[0.0, 0.0, 0.01, 0.0, 0.0, 0.0]]))
+        assert used[1] == pytest.approx(0.55)
+    assert seen == pytest.approx([0.55] + [1.0] * ONSET + [0.55] * 2)
+    plants.state.joint_qd[6, 0] = 6.0
+    plants.free()
+    assert used[1] == 1.0
+
+
+def test_pull_moves_by_blend(plants: Plants) -> None:
+    rng = np.random.default_rng(2)
+    state, bodies = plants.state, plants.model.bodies_of(2)
+    start = state.joint_q[bodies].copy()
+    goal = frames.exp(rng.normal(size=(5, 3)) * 0.5)
+    rates = rng.normal(size=(5, 3))
+    plants.pull(2, -3.0 * goal, rates, 0.25)  # neither sign nor length of a quaternion matters
+    np.testing.assert_allclose(state.joint_qd[bodies], rates, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(state.joint_q[bodies], axis=-1), 1.0, atol=1e-6)
+    whole = frames.log(frames.multiply(frames.conjugate(start), goal))
+    done = frames.log(frames.multiply(frames.conjugate(start), state.joint_q[bodies]))
+    np.testing.assert_allclose(done, 0.25 * whole, atol=1e-5)
+    plants.pull(2, goal, rates, 1.0)
+    there = frames.multiply(frames.conjugate(goal), state.joint_q[bodies])
+    np.testing.assert_allclose(frames.log(there), 0.0, atol=1e-5)
+    with pytest.raises(ValueError, match="tree 2: pulled to a pose that is not finite"):
+        plants.pull(2, np.full((5, 4), np.nan), rates, 0.5)
+    with pytest.raises(ValueError, match=r"tree 2: .* it has 5 bodies"):
+        plants.pull(2, goal[:4], rates, 0.5)
+
+
+def test_a_lighter_body_hangs_less(plants: Plants) -> None:
+    plants.wake(0)
+    plants.reweigh(4, plants.body_mass[4] / 10)
+    before = plants.state.body_q[4, 2]
+    step(plants, 300)
+    plants.kinematics()
+    assert plants.state.body_q[4, 2] > before + 1e-5
+    assert plants.model.body_mass[4] > 5 * plants.body_mass[4]  # the model is everyone's, and constant
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("body_length", 0.0, r"body 6 of tree 1: length \[m\] 0.0; give a positive length"),
+        ("body_mass", -1.0, r"body 6 of tree 1: mass \[kg\] -1.0; give a positive mass"),
+        ("body_inertia", 0.0, r"body 6 of tree 1: inertia \[kg m\^2\] .*; give positive principal moments"),
+        ("joint_stiffness", -2.0, r"body 6 of tree 1: stiffness .*; a spring pulls back"),
+        ("joint_damping", -2.0, r"body 6 of tree 1: damping .*; a damper takes energy"),
+        ("body_parent", 6, r"body 6 of tree 1: parent 6; a parent stands before its children"),
+        ("body_parent", 3, r"body 6 of tree 1: parent 3; name a body of the same tree"),
+        ("body_rest", 2.0, r"body 6 of tree 1: rest rotation .*; give a unit quaternion"),
+        ("body_offset", np.nan, r"Model.body_offset\[6, 0\] is not finite"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused_in_words(name: str, value: float, says: str) -> None:
+    model = canes(2)
+    state = State.at_rest(model)
+    getattr(model, name)[6] = value
+    with pytest.raises(ValueError, match=says):
+        Plants(model, state)
+
+
+def test_bad_state_and_options_are_refused() -> None:
+    model = canes(1)
+    state = State.at_rest(model)
+    state.joint_q[2] = np.nan
+    with pytest.raises(ValueError, match=r"State.joint_q\[2, 0\] is not finite"):
+        Plants(model, state)
+    with pytest.raises(ValueError, match=r"phi 0\.4"):
+        Plants(model, State.at_rest(model), phi=0.4)
+    with pytest.raises(ValueError, match=r"use State\.at_rest"):
+        Plants(model, State.at_rest(canes(2)))
