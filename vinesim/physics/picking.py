@@ -15,6 +15,8 @@ from vinesim.physics.touching import Touching
 
 STUB = 1e-3
 """What stays on the tree [kg]."""
+BRISK = 20.0
+"""[m/s^2] Gravity, and what turning adds to the acceleration of a bunch's middle over that of its stalk."""
 PATIENCE = 3
 """[tick] A peduncle parts when it has been pulled too hard for so long: one tick's peak is not a pull."""
 
@@ -24,22 +26,26 @@ class Picking:
 
     def __init__(self, plants: Plants, rigid: Rigid, touching: Touching) -> None:
         self.plants, self.rigid, self.touching = plants, rigid, touching
-        self.pull = np.zeros(len(plants.model.bunch_body), np.float32)
-        """[bunch] N, of the last tick in which the bunch was touched."""
-        self._strained = np.zeros(len(self.pull), np.int32)
+        self._strained = np.zeros(len(plants.model.bunch_body), np.int32)
         self._bunch_of = np.full(len(plants.model.body_mass), -1)
-        self._bunch_of[plants.model.bunch_body] = np.arange(len(self.pull))
+        self._bunch_of[plants.model.bunch_body] = np.arange(len(self._strained))
 
     def update(self) -> tuple[int, ...]:
         """After a commit: pick the bunches that were pulled off; their numbers, sorted."""
-        bunches = self._bunch_of[self.touching.bodies]
-        bunches = bunches[bunches >= 0]
-        bunches = bunches[self.plants.state.bunch_attached[bunches]]
+        touching, model = self.touching, self.plants.model
+        bunches = self._bunch_of[touching.bodies]
+        on_bunches = bunches >= 0
+        bunches = bunches[on_bunches]
         if len(bunches) == 0:
             return ()
-        force = self.plants.joint_wrench(self.plants.model.bunch_body[bunches])[:, :3]
-        self.pull[bunches] = np.linalg.norm(force, axis=1)
-        strained = self.pull[bunches] > self.plants.model.bunch_pull[bunches]
+        # most are held loosely: the peduncle carries no more than the hands' force, the weight and the inertia
+        bodies = touching.bodies[on_bunches]
+        hands = np.abs(touching.wrenches[on_bunches, :3]).sum(1)
+        moving = np.abs(self.plants.acceleration[bodies]).sum(1) + BRISK
+        strained = hands + self.plants.body_mass[bodies] * moving > model.bunch_pull[bunches]
+        if strained.any():
+            force = self.plants.joint_wrench(bodies)[:, :3]
+            strained = (force * force).sum(1) > model.bunch_pull[bunches] ** 2
         self._strained[bunches] = np.where(strained, self._strained[bunches] + 1, 0)
         parted = tuple(int(b) for b in bunches if self._strained[b] >= PATIENCE)
         for bunch in parted:

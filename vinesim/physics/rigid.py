@@ -435,6 +435,7 @@ class Rigid:
             _attach(spec, robot)
         for bunch, body in self._bunches.items():
             _drop(spec, bunch, body)
+        spec.option.noslip_iterations = 3 if self._bunches else 0  # without it a bunch creeps through the fingers
         world = spec.compile()
         data = mujoco.MjData(world)
         contact = np.zeros(world.nv)
@@ -568,7 +569,6 @@ def _scene(model: Model, dt: float) -> mujoco.MjSpec:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     spec.option.impratio = 10.0
-    spec.option.noslip_iterations = 3  # without it a loose bunch creeps through the fingers
     friction = [FRICTION, 0.005, 0.0001]
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=_GROUND, conaffinity=_BOX,
