@@ -315,3 +315,27 @@ def test_rigid_groups_join_what_a_constraint_couples():
     a, b = (int(rigid.group[g]) for g in rigid.geoms.id)
     assert rigid.data.ncon > 0
     assert a == b
+
+
+def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
+    physics = Physics(rows_of_canes(3))
+    assert [name.split(":")[0] for name, _ in physics.stages] == [
+        "rigid", "touching", "plants", "touching", "plants", "rigid", "guard", "picking", "sleep",
+    ]  # fmt: skip
+    physics.plants.wake(1)
+    physics.state.joint_qd[physics.model.bodies_of(1).start, 1] = 0.5
+    for _ in range(3000):
+        physics.step()
+        if len(physics.plants.awake) == 0:
+            break
+    assert len(physics.plants.awake) == 0
+    assert physics.time == pytest.approx(0.01 * physics.tick)
+
+
+def test_a_tree_that_a_robot_reaches_into_stays_awake():
+    physics = Physics(rows_of_canes(3))
+    physics.add_robot(bar((0.7, -0.034, 0.95), stiffness=1000.0, damping=100.0))
+    for _ in range(400):
+        physics.step()
+    assert physics.touching.near.tolist() == [0]
+    assert physics.plants.awake.tolist() == [0]

@@ -48,8 +48,14 @@ def test_depth_is_exact(kind: str, away: float) -> None:
     local = lambda p: frames.rotate(frames.conjugate(SKEW), p - centre)  # noqa: E731
     made, field = {
         "sphere": (seeing.shape("sphere", 0.08, at=centre), lambda p: np.linalg.norm(p - centre, axis=-1) - 0.08),
-        "capsule": (seeing.shape("capsule", 0.05, 0.09, at=centre, turn=SKEW), _capsule(centre - axis, centre + axis, 0.05)),
-        "box": (seeing.shape("box", 0.1, 0.06, 0.04, at=centre, turn=SKEW), lambda p: _box(np.array([0.1, 0.06, 0.04]))(local(p))),
+        "capsule": (
+            seeing.shape("capsule", 0.05, 0.09, at=centre, turn=SKEW),
+            _capsule(centre - axis, centre + axis, 0.05),
+        ),
+        "box": (
+            seeing.shape("box", 0.1, 0.06, 0.04, at=centre, turn=SKEW),
+            lambda p: _box(np.array([0.1, 0.06, 0.04]))(local(p)),
+        ),
         "cylinder": (
             seeing.shape("cylinder", 0.05, 0.09, at=centre, turn=SKEW),
             lambda p: _box(np.array([0.05, 0.09]))(np.stack([np.hypot(*local(p)[..., :2].T).T, local(p)[..., 2]], -1)),
@@ -134,7 +140,13 @@ def test_the_ray_caster_sees_the_same_from_anywhere(scene) -> None:
 @pytest.mark.parametrize("side", [(0.0, 0.06), (0.06, 0.0), (-0.05, 0.05)])
 def test_what_crosses_the_pinhole_plane_is_seen(kind: str, side: tuple[float, float]) -> None:
     """A solid beside the pinhole, half of it behind: seen as the ray caster sees it."""
-    size = {"sphere": (0.05,), "capsule": (0.03, 0.2), "cylinder": (0.03, 0.2), "box": (0.2, 0.03, 0.04), "ellipsoid": (0.2, 0.03, 0.04)}[kind]
+    size = {
+        "sphere": (0.05,),
+        "capsule": (0.03, 0.2),
+        "cylinder": (0.03, 0.2),
+        "box": (0.2, 0.03, 0.04),
+        "ellipsoid": (0.2, 0.03, 0.04),
+    }[kind]
     turn = frames.exp(np.array([0.0, 1.3, 0.0])) if kind in ("capsule", "cylinder") else frames.IDENTITY
     primitives, _ = seeing.world(seeing.thing(seeing.shape(kind, *size, at=(0.01, side[0], 1.0 + side[1]), turn=turn)))
     _, primitive = seeing.raster(primitives, seeing.AHEAD)
@@ -161,7 +173,10 @@ def test_leaves_that_cross_the_pinhole_plane_are_seen() -> None:
 def test_a_camera_inside_a_housing_looks_out(tmp_path) -> None:
     file = tmp_path / "housing.stl"
     trimesh.creation.box((0.2, 0.2, 0.2)).export(file)
-    shell = (seeing.shape("mesh", 1.0, 1.0, 1.0, at=(0, 0, 1), file=str(file)), seeing.shape("box", 0.1, 0.1, 0.1, at=(0, 0, 1)))
+    shell = (
+        seeing.shape("mesh", 1.0, 1.0, 1.0, at=(0, 0, 1), file=str(file)),
+        seeing.shape("box", 0.1, 0.1, 0.1, at=(0, 0, 1)),
+    )
     wall = seeing.thing(seeing.shape("box", 0.5, 5.0, 5.0, at=(2.5, 0.0, 1.0)), name="wall", index=1)
     primitives, _ = seeing.world(seeing.thing(*shell), wall)
     depth, _ = seeing.raster(primitives, seeing.AHEAD)

@@ -6,7 +6,9 @@ import subprocess
 
 ROOT = pathlib.Path(__file__).parents[2]
 FORBIDDEN = {
-    "a registry's download address": re.compile(r"https?://(files\.)?(pypi|pythonhosted|registry\.npmjs|deb\.debian)\.", re.I),
+    "a registry's download address": re.compile(
+        r"https?://(files\.)?(pypi|pythonhosted|registry\.npmjs|deb\.debian)\.", re.I
+    ),
     "a path of one machine": re.compile(r"(?<![\w.])/(work|root|home/\w+)/"),
 }
 

@@ -73,6 +73,20 @@ class _Robot:
     bodies: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Loose:
+    """A bunch that hangs on no vine: its weight and its spheres, in the frame that it had as a plant's body."""
+
+    mass: float
+    com: np.ndarray
+    inertia: np.ndarray
+    """[3] kg m^2 about the centre of mass."""
+    center: np.ndarray
+    """[sphere, 3] m"""
+    radius: np.ndarray
+    """[sphere] m"""
+
+
 @dataclasses.dataclass(frozen=True)
 class Geoms:
     """The shapes of robots and boxes that plants can touch, sorted by MuJoCo geom."""
@@ -107,6 +121,7 @@ class Rigid:
         self.model = model
         self.dt = dt
         self._robots: dict[str, _Robot] = {}
+        self._bunches: dict[int, Loose] = {}
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
         self.generation = 0
@@ -174,6 +189,33 @@ class Rigid:
             polynomial = np.polynomial.Polynomial(coefficients)
             self.data.joint(joint).qpos[0] = polynomial(self.data.joint(source).qpos[0])
         self._fresh = False
+
+    @property
+    def loose(self) -> tuple[int, ...]:
+        """Bunches that lie, fall or are held, in the order in which they left their vines."""
+        return tuple(self._bunches)
+
+    def add_bunch(self, bunch: int, body: Loose, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Take a bunch over from its vine: ``pose`` [7] and ``velocity`` [6] (of its origin, angular; world axes)."""
+        if bunch in self._bunches:
+            raise ValueError(f"bunch {bunch} is loose already")
+        self._bunches[bunch] = body
+        self._compile()
+        self.place_bunch(bunch, pose, velocity)
+
+    def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Put a loose bunch somewhere: ``pose`` [7], ``velocity`` [6] in world axes."""
+        joint, pose = self.data.joint(f"bunch/{bunch}"), np.asarray(pose, float)
+        turn = frames.normalize(pose[3:])
+        joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(turn)])
+        joint.qvel[:3] = velocity[:3]
+        joint.qvel[3:] = frames.rotate(frames.conjugate(turn), np.asarray(velocity[3:], float))
+        self._fresh = False
+
+    def remove_bunch(self, bunch: int) -> None:
+        """Take a loose bunch out of the world."""
+        del self._bunches[bunch]
+        self._compile()
 
     # ------------------------------------------------------------------ what they are asked to do
 
@@ -391,6 +433,9 @@ class Rigid:
         spec = _scene(self.model, self.dt)
         for robot in self._robots.values():
             _attach(spec, robot)
+        for bunch, body in self._bunches.items():
+            _drop(spec, bunch, body)
+        spec.option.noslip_iterations = 3 if self._bunches else 0  # without it a bunch creeps through the fingers
         world = spec.compile()
         data = mujoco.MjData(world)
         contact = np.zeros(world.nv)
@@ -429,6 +474,11 @@ class Rigid:
                 if shapes:
                     links.append(Link(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                     bodies.append(robot.bodies[link])
+        for bunch, loose in self._bunches.items():
+            spheres = zip(loose.radius, loose.center, strict=True)
+            shapes = tuple(Shape("sphere", (float(r),), frames.pose(at), (0.25, 0.05, 0.3, 1.0)) for r, at in spheres)
+            links.append(Link(f"bunch/{bunch}", Organ.BUNCH, bunch, shapes))
+            bodies.append(self.world.body(f"bunch/{bunch}").id)
         return tuple(links), np.array(bodies, int)
 
     def _list_geoms(self) -> Geoms:
@@ -436,6 +486,7 @@ class Rigid:
         owner = {m.body(f"box/{i}").id: ("box/" + str(i), "box") for i in range(len(self.model.box_size))}
         for name, robot in self._robots.items():
             owner.update({body: (name, link) for link, body in robot.bodies.items()})
+        owner.update({m.body(f"bunch/{i}").id: (f"bunch/{i}", "bunch") for i in self._bunches})
         ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] in owner and m.geom_contype[g]], int)
         last = np.full(m.nbody, -1)
         for body in range(1, m.nbody):
@@ -585,6 +636,19 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
     stiffness, damping = robot.tracks
     for i, axis in enumerate(_PLANAR):
         _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
+
+
+def _drop(spec: mujoco.MjSpec, bunch: int, loose: Loose) -> None:
+    """A bunch as a free body of spheres, hard enough not to creep out of a gripper."""
+    body = spec.worldbody.add_body(
+        name=f"bunch/{bunch}", mass=loose.mass, ipos=loose.com, inertia=loose.inertia, explicitinertial=True
+    )
+    body.add_freejoint(name=f"bunch/{bunch}")
+    for center, radius in zip(loose.center, loose.radius, strict=True):
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[float(radius), 0, 0], pos=center, mass=0.0, contype=_BOX,
+            conaffinity=_ALL, friction=[FRICTION, 0.005, 0.0001], priority=1, solimp=[0.99, 0.999, 0.001, 0.5, 2],
+        )  # fmt: skip
 
 
 def _tracks(spec: RobotSpec) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vinesim.physics.guard import Guard
+from vinesim.physics.picking import Picking
 from vinesim.physics.plants import Plants
 from vinesim.physics.rigid import Rigid
+from vinesim.physics.sleep import Sleep
 from vinesim.physics.touching import Touching
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -26,6 +29,11 @@ class Physics:
         self.plants = Plants(model, self.state, dt=dt, device=device)
         self.rigid = Rigid(model, dt=dt)
         self.touching = Touching(model, self.plants, self.rigid)
+        self.picking = Picking(self.plants, self.rigid, self.touching)
+        self.sleep = Sleep(self.plants)
+        self.guard = Guard(self.plants)
+        self.picked: tuple[int, ...] = ()
+        """Bunches that were pulled off their vines in the last tick."""
         self.tick = 0
         self._body_q: np.ndarray | None = None
         self._fresh = True
@@ -36,6 +44,9 @@ class Physics:
             ("touching: solve the contacts of both", self.touching.solve),
             ("plants: move, pushed by them", self._commit),
             ("rigid: move, pushed by them", self._finish),
+            ("guard: stop what went wrong", self._guard),
+            ("picking: part what was pulled too hard", self._pick),
+            ("sleep: rest what nobody touches or reaches", self._sleep),
         )
 
     def step(self) -> None:
@@ -92,6 +103,11 @@ class Physics:
         """See :meth:`Rigid.remove_robot`."""
         self.rigid.remove_robot(name)
 
+    def pick(self, bunch: int) -> None:
+        """Cut a bunch off its vine; see :meth:`Picking.pick`."""
+        self.picking.pick(bunch)
+        self._body_q = None
+
     # ------------------------------------------------------------------ stages that only hand over
 
     def _commit(self) -> None:
@@ -101,3 +117,12 @@ class Physics:
 
     def _finish(self) -> None:
         self.rigid.finish(self.touching.force)
+
+    def _guard(self) -> None:
+        self.guard.check()
+
+    def _pick(self) -> None:
+        self.picked = self.picking.update()
+
+    def _sleep(self) -> None:
+        self.sleep.update(self.touching.near)

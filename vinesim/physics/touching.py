@@ -30,7 +30,7 @@ SLOTS = 64
 ISLANDS = 24
 """Up to so many contacts are solved as one block; more are parted into islands that do not feel each other."""
 STIR = 1e-3
-"""[m/s] A box slower than this wakes nobody."""
+"""[m/s] A box or a loose bunch slower than this wakes nobody."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -321,7 +321,7 @@ class Touching:
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
         first = [i for i in range(count) if i == 0 or g.actor[i] != g.actor[i - 1]]
         self._actor_first = np.array([*first, count], np.int32)
-        self._actor_lies = np.array([g.actor[i].startswith("box/") for i in first], np.bool_)
+        self._actor_lies = np.array([g.actor[i] not in self.rigid.robots for i in first], np.bool_)
         self._actor_low, self._actor_high = np.zeros((len(first), 3), np.float32), np.zeros((len(first), 3), np.float32)
         self._make_room(max(self._room, 64))
 
