@@ -237,7 +237,7 @@ def free(
         H = H_out[k]
         M = M_out[k]
         # the metric acts on the rate as the joint frame sees it, not on its derivative in world axes
-        u = metric * wp.cross(turning, frame * rate) - frame * spring - wp.spatial_bottom(bias)
+        u = metric * wp.cross(turning, wp.spatial_bottom(body_qd_out[k])) - frame * spring - wp.spatial_bottom(bias)
         D = wp.inverse(J + metric)
         DJ = D * J
         DH = D * H
@@ -287,14 +287,11 @@ def free(
         a = wp.spatial_top(pushed) + wp.cross(alpha, lever) + wp.cross(turning, wp.cross(turning, lever))
         relative = Du_out[k] - DJ_out[k] * alpha - DH_out[k] * a
         body_acceleration_out[k] = wp.spatial_vector(a, alpha + relative)
-        rate = joint_qd[k]
-        seen = relative - wp.cross(turning, wp.quat_rotate(axes_out[k], rate))
-        rate = rate + dt * wp.quat_rotate_inv(axes_out[k], seen)
-        joint_qd_free_out[k] = rate
+        swing = wp.spatial_bottom(body_qd_out[k]) - turning
+        gain = dt * (relative - wp.cross(turning, swing))
+        joint_qd_free_out[k] = joint_qd[k] + wp.quat_rotate_inv(axes_out[k], gain)
         omega = wp.spatial_bottom(motion)
-        body_qd_free_out[k] = wp.spatial_vector(
-            wp.spatial_top(motion) + wp.cross(omega, lever), omega + wp.quat_rotate(axes_out[k], rate)
-        )
+        body_qd_free_out[k] = wp.spatial_vector(wp.spatial_top(motion) + wp.cross(omega, lever), omega + swing + gain)
 
 
 @wp.kernel
@@ -477,7 +474,9 @@ def integrate(
     for k in range(first, last):
         if sound:
             rate = joint_qd_free[k]
-            rate = rate / wp.max(1.0, wp.length(rate) / limit)
+            square = wp.length_sq(rate)
+            if square > limit * limit:
+                rate = rate * (limit / wp.sqrt(square))
             mean = (1.0 - phi) * joint_qd_out[k] + phi * rate
             joint_qd_out[k] = rate
             joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q_out[k])

@@ -176,14 +176,15 @@ class Plants:
             touched = np.unique(self.model.body_tree[bodies])
             self._subset[: len(touched)] = touched
             self._launch(self._push, len(touched))
-            self.brace(touched[self._touched[touched] < self.tick - 1])
+            begun = touched[self._touched[touched] < self.tick - 1]
+            self._onset[begun] = ONSET + 1  # integrating counts this tick
             self._touched[touched] = self.tick
         self._launch(self._integrate, len(self._stepped))
         self.tick += 1
 
     def brace(self, trees: np.ndarray) -> None:
         """Use phi = 1 in the next ``ONSET`` ticks of trees about to be touched (``commit()`` sees to new touches)."""
-        self._onset[trees] = ONSET + 1  # commit counts down before the next free pass reads it
+        self._onset[trees] = ONSET
 
     def kinematics(self, trees: np.ndarray | None = None) -> None:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""
