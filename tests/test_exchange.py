@@ -232,6 +232,18 @@ def test_in_the_same_window_of_cells_but_not_near_not_one_byte_leaves():
     assert ada.environment_bytes() == 0
 
 
+def test_of_the_trees_one_moves_only_those_near_somebody_leave():
+    hub = MemoryHub()
+    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 7.0)
+    run(hub, [ada, bob], 0.5)
+    ada.touched = {0, 3}
+    run(hub, [ada, bob], 1.5)
+    assert {update.tree for update in bob.heard} == {3}
+    assert ada.exchange.counters.environment.bytes_out == bob.exchange.counters.environment.bytes_in
+    assert bob.exchange.claim(0) == Claim()
+    assert ada.exchange.counters.environment.bytes_out == 2 * (14 + 13 + 6 * 9)
+
+
 def test_near_the_state_arrives_within_quantisation():
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 3.0)

@@ -44,6 +44,11 @@ def test_angle_between_is_the_angle_of_the_difference(turn, angle):
     assert smooth.angle_between(-turned, q) == pytest.approx(angle, abs=1e-6)
 
 
+def test_single_precision_states_are_not_apart_by_rounding():
+    q = frames.exp(np.random.default_rng(0).uniform(-1, 1, (1000, 3)))
+    assert smooth.angle_between(q.astype(np.float32).astype(float), q).max() < 1e-6
+
+
 def test_extrapolation_stops_at_150_ms_and_never_runs_back():
     np.testing.assert_allclose(smooth.horizon(np.array([-1.0, 0.0, 0.1, 0.15, 9.0])), [0, 0, 0.1, 0.15, 0.15])
 

@@ -159,12 +159,12 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
         console.print(f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (the first run compiles kernels)")
         pusher = start(
             PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
-            "--seconds", str(seconds), "--out", str(out / PUSHER),
+            "--seconds", str(seconds), "--out", str(out / PUSHER), "--camera-hz", "5",
         )  # fmt: skip
         newest = {PUSHER: json.loads(pusher.line(300.0))}
         visitor = start(
             VISITOR, *common, "--name", VISITOR, "--connect", endpoint, "--spawn", "1", "--back", "8",
-            "--namespace", VISITOR, "--out", str(out / VISITOR),
+            "--namespace", VISITOR, "--out", str(out / VISITOR), "--camera-hz", "2",
         )  # fmt: skip
         watch(pusher, visitor, server, newest, console, headless)
         visitor.stop()

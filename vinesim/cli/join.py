@@ -24,7 +24,7 @@ class WrongUse(ValueError):  # noqa: N818
 def run(
     *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int, back: float,
     namespace: str, ros: bool, push: int | None, watch: int | None, near: float, seconds: float | None,
-    out: pathlib.Path | None, status: str, device: str,
+    out: pathlib.Path | None, status: str, device: str, camera_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
@@ -38,7 +38,7 @@ def run(
         signal.signal(number, lambda *_: stop.set())
 
     from vinesim.client.client import Client
-    from vinesim.client.jobs import DriveTo
+    from vinesim.client.jobs import DriveTo, LookAt
     from vinesim.client.pace import Pace
     from vinesim.client.places import checked_bunch, spawn_pose
     from vinesim.client.senses import Senses
@@ -69,7 +69,7 @@ def run(
 
             bus = stack.enter_context(ZenohBus(name, connect=connect))
         client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device)
-        senses = stack.enter_context(Senses(client, namespace=namespace, ros=ros, keep_pictures=out is not None))
+        senses = stack.enter_context(Senses(client, namespace=namespace, ros=ros, keep_pictures=out is not None, camera_hz=camera_hz))
         pace = Pace(client.physics.dt)
         watched = watch if watch is not None else push
         if watched is not None:
@@ -80,6 +80,8 @@ def run(
         if push is not None and client.trace is not None:
             reach = ReachAndPush(client.robot, senses.side_of(client.trace.centre()), client.trace.centre)
             client.jobs.append(reach.control)
+        if client.trace is not None:
+            client.jobs.append(LookAt(client.robot, client.trace.centre))
         reporter = Status(client, pace, senses.sent)
         speaker = threading.Thread(target=_speak, args=(reporter, senses, status, stop), name="status")
         speaker.start()

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vinesim.sensors.picture import portrait
+from vinesim.sensors.primitives import still_view
 from vinesim.world.generate import generate
 from vinesim.world.scene import load, reseeded
 from vinesim.world.show import table as rows_of
@@ -23,6 +24,6 @@ def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
         table.add_row(quantity, value, unit)
     console.print(table)
     target = out or pathlib.Path(f"{scene.name}.png")
-    portrait(scene, model, target)
+    portrait(model, still_view(model), target, sun=scene.sun.direction())
     console.print(f"picture: {target}")
     return 0

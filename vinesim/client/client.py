@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from vinesim.client.trace import Trace
+from vinesim.net import interest
 from vinesim.net.bus import Bus
 from vinesim.net.exchange import Exchange, Inbox
 from vinesim.net.messages import Hello
@@ -53,12 +54,12 @@ class Client:
         *,
         name: str,
         pose: np.ndarray,
-        near: float = 6.0,
+        near: float = interest.NEAR,
         device: str = "cpu",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, device=device)
+        self.physics = Physics(model, device=device, picking=False)  # the network does not carry it yet
         self.robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         hello = Hello(
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=scene.name,
@@ -126,7 +127,7 @@ class Client:
         physics = self.physics
         touched = [tree for tree, actor in physics.touched if actor == self.name]
         settled = self.exchange.send(
-            now, self.robot.update(now), touched=touched, moving=physics.plants.awake, read=self._read,
+            now, self.robot.update(now), touched=touched, moving=physics.sleep.moving, read=self._read,
         )  # fmt: skip
         for update in settled:
             # the last word is what all copies hold: hold it too

@@ -41,6 +41,32 @@ class DriveTo:
         self.robot.command_base(min(self.speed, 0.8 * distance + 0.05), np.clip(2.0 * turn, -0.6, 0.6), time)
 
 
+class LookAt:
+    """Keep the head's camera on a point, whatever the head is made of."""
+
+    GAIN = 3.0
+    """Share of the angle that is taken out per second [1/s]."""
+
+    def __init__(self, robot: Robot, point: Callable[[], np.ndarray]) -> None:
+        """``point`` gives the place to look at [3] m in the world. Does nothing without a head and a camera on it."""
+        description = robot.description
+        self.robot, self.point = robot, point
+        self._joints = description.indices("head") if "head" in description.groups and description.cameras else None
+        self._camera = description.cameras[0].frame if description.cameras else ""
+
+    def __call__(self, time: float) -> None:
+        if self._joints is None:
+            return
+        robot = self.robot
+        pose = robot.frame_pose(self._camera)
+        axis = frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0]))
+        wanted = frames.normalize(self.point() - pose[:3])
+        turn = np.cross(axis, wanted) * self.GAIN
+        J = robot.rigid.jacobian(robot.name, self._camera, pose[:3])[3:, self._joints]
+        rate = J.T @ np.linalg.solve(J @ J.T + 0.01 * np.eye(3), turn)
+        robot.command_position(robot.setpoint[self._joints] + robot.rigid.dt * rate, self._joints)
+
+
 @dataclasses.dataclass
 class _Running:
     trajectory: JointTrajectory

@@ -155,7 +155,7 @@ class Exchange:
     """
 
     def __init__(self, bus: Bus, me: Hello, model: Model, *, near: float = interest.NEAR) -> None:
-        """``near`` [m]: others nearer than this to a tree see what I do to it (at most 7 m, what cells cover)."""
+        """``near`` [m]: others nearer than this to a tree see what I do to it (at most 5 m, what cells cover)."""
         if me.name != bus.name:
             raise ValueError(f"greeting of {me.name!r} on the bus of {bus.name!r}: one actor has one name")
         self.bus, self.me, self.model = bus, me, model

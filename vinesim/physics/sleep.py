@@ -19,7 +19,13 @@ class Sleep:
     def __init__(self, plants: Plants, *, quiet: float = QUIET, patience: int = PATIENCE) -> None:
         self.plants, self.quiet, self.patience = plants, quiet, patience
         self.ticks = np.zeros(len(plants.model.tree_first), np.int32)
-        """How long each tree has been quiet [tree] ticks."""
+        """How long each awake tree has been quiet [tree] ticks."""
+
+    @property
+    def moving(self) -> np.ndarray:
+        """Awake trees that have not been quiet for long: those whose state is news, sorted [k]."""
+        awake = self.plants.awake
+        return awake[self.ticks[awake] < self.patience]
 
     def wake(self, trees: np.ndarray) -> None:
         """Wake trees, or keep them awake, for at least ``patience`` ticks from now."""
@@ -28,13 +34,14 @@ class Sleep:
         self.plants.wake(trees)
 
     def update(self, busy: np.ndarray | None = None) -> np.ndarray:
-        """After a commit: the trees that have just been put to rest [k]. ``busy`` [n] are touched, near or watched."""
+        """After a commit: the trees that have just been put to rest [k]. ``busy`` [n] are touched or near somebody: they
+        stay awake, however quiet.
+        """
         awake = self.plants.awake
         self.ticks[awake] += 1
         self.ticks[awake[~(self.plants.tree_rate[awake] < self.quiet)]] = 0
-        if busy is not None:
-            self.ticks[busy] = 0
-        tired = awake[self.ticks[awake] >= self.patience]
+        quiet = awake[self.ticks[awake] >= self.patience]
+        tired = quiet if busy is None else np.setdiff1d(quiet, busy)
         self.plants.rest(tired)
         self.ticks[tired] = 0
         return tired

@@ -23,7 +23,8 @@ class Physics:
     One thread owns it. What others may read leaves it as :class:`View` and other frozen values.
     """
 
-    def __init__(self, model: Model, *, dt: float = 0.01, device: str = "cpu") -> None:
+    def __init__(self, model: Model, *, dt: float = 0.01, device: str = "cpu", picking: bool = True) -> None:
+        """``dt`` [s]; ``device`` for the plants; ``picking``: bunches part from their vines when pulled too hard."""
         self.model, self.dt = model, dt
         self.state = State.at_rest(model)
         self.plants = Plants(model, self.state, dt=dt, device=device)
@@ -45,7 +46,7 @@ class Physics:
             ("plants: move, pushed by them", self._commit),
             ("rigid: move, pushed by them", self._finish),
             ("guard: stop what went wrong", self._guard),
-            ("picking: part what was pulled too hard", self._pick),
+            *([("picking: part what was pulled too hard", self._pick)] if picking else []),
             ("sleep: rest what nobody touches or reaches", self._sleep),
         )
 

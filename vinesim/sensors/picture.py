@@ -79,14 +79,18 @@ def write_png(path: str | pathlib.Path, image: np.ndarray) -> pathlib.Path:
 
 
 def save(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "frame") -> list[pathlib.Path]:
-    """Write ``<stem>_rgb``, ``_depth`` (colours), ``_depth_mm`` (16UC1) and ``_labels`` PNGs; returns their paths."""
+    """Write ``<stem>_rgb``, ``_depth`` (colours), ``_depth_mm`` (16UC1) and ``_labels`` PNGs; returns their paths.
+
+    An empty ``stem`` leaves plain names: ``rgb.png`` and so on.
+    """
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     images = {
         "rgb": frame.rgb, "depth": depth_colours(frame.depth), "depth_mm": depth_millimetres(frame.depth),
         "labels": label_colours(frame.labels),
     }  # fmt: skip
-    return [write_png(folder / f"{stem}_{name}.png", image) for name, image in images.items()]
+    prefix = f"{stem}_" if stem else ""
+    return [write_png(folder / f"{prefix}{name}.png", image) for name, image in images.items()]
 
 
 def standpoint(model: Model) -> np.ndarray:
