@@ -105,7 +105,7 @@ def test_a_peduncle_parts_when_it_is_pulled_harder_than_it_holds():
             break
     assert picked_at is not None
     assert picked_at > 155
-    assert min(pulls[-3:]) > 12.0
+    assert min(pulls[-3:-1]) > 12.0  # the third tick too strong, after which it hangs no more
     assert max(pulls[:150]) < 12.0
     assert physics.rigid.loose == (0,)
 

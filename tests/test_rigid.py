@@ -385,3 +385,24 @@ def test_gains_can_be_tuned_and_survive_a_newcomer():
     gravity = rigid.data.qfrc_gravcomp[rigid._robots["anna"].v[1]]
     assert effort[1] - gravity == pytest.approx(2.0 - 5.0 * velocity[1], abs=1e-9)
     assert velocity[1] > 0.1
+
+
+def test_boxes_at_rest_sleep_until_something_pushes_them():
+    rigid = Rigid(yard(boxes=3))
+    rigid.add_robot(arm())
+    nothing = np.full(rigid.world.nv, -0.0)
+    for _ in range(100):
+        rigid.prep()
+        rigid.finish(nothing)
+    assert rigid.data.ncon == 0
+    assert (rigid.velocity_free[:18] == 0.0).all()
+    push = nothing.copy()
+    push[rigid.world.joint("box/1").dofadr[0]] = 30.0  # mu m g is 15.7 N
+    for _ in range(20):
+        rigid.prep()
+        rigid.finish(push)
+    rigid.prep()
+    moved = rigid.data.joint("box/1").qpos[0]
+    assert moved == pytest.approx(0.5 * (30.0 - 0.8 * 2.0 * 9.81) / 2.0 * 0.2**2, rel=0.25)
+    assert rigid.data.joint("box/0").qpos[0] == 0.0
+    assert rigid.data.joint("box/0").qvel[0] == 0.0

@@ -448,9 +448,10 @@ def couple(
             axis = t2
         row = 3 * c + r
         turn = wp.cross(lever, axis)
+        column = contact_column[c]
         for k in range(3):
-            plant_rows_out[row, contact_column[c] + k] = axis[k]
-            plant_rows_out[row, contact_column[c] + 3 + k] = turn[k]
+            plant_rows_out[row, column + k] = axis[k]
+            plant_rows_out[row, column + 3 + k] = turn[k]
         about = x - subtree_com[geom_root[g]]
         dof = geom_dof[g]
         carried = zero

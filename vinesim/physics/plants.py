@@ -10,12 +10,14 @@ The scheme (:mod:`vinesim.kernels.plant`) damps as if every joint's beta (dampin
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import plant
+from vinesim.kernels.launch import bind
 from vinesim.world.grow import GRAVITY
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -141,7 +143,7 @@ class Plants:
         """Bring ``body_q`` and ``body_qd`` to the start of the tick and solve the motion without contacts."""
         self._stepped = self._list
         self._stepping[: len(self._list)] = self._list
-        self._launch(self._free, len(self._list))
+        self._free(len(self._list))
 
     def response(self, bodies: np.ndarray) -> np.ndarray:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
@@ -157,7 +159,7 @@ class Plants:
             self._record_response(max(2 * self._capacity, n, 16))
         self._asked[:n] = bodies
         self._asked[n] = -1
-        self._launch(self._respond, n)
+        self._respond(n)
         y = self._response[:n, :, :n].reshape(6 * n, 6 * n)
         return (0.5 * (y + y.T)).reshape(n, 6, n, 6)
 
@@ -175,11 +177,11 @@ class Plants:
             self._pushed = bodies.astype(np.int32)
             touched = np.unique(self.model.body_tree[bodies])
             self._subset[: len(touched)] = touched
-            self._launch(self._push, len(touched))
+            self._push(len(touched))
             begun = touched[self._touched[touched] < self.tick - 1]
             self._onset[begun] = ONSET + 1  # integrating counts this tick
             self._touched[touched] = self.tick
-        self._launch(self._integrate, len(self._stepped))
+        self._integrate(len(self._stepped))
         self.tick += 1
 
     def brace(self, trees: np.ndarray) -> None:
@@ -190,7 +192,7 @@ class Plants:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""
         trees = self._list if trees is None else np.atleast_1d(trees)
         self._subset[: len(trees)] = trees
-        self._launch(self._place, len(trees))
+        self._place(len(trees))
 
     def pull(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
@@ -257,13 +259,8 @@ class Plants:
             late = next(i for i, tree in enumerate(trees) if tree not in self._stepped)
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before free()")
 
-    def _launch(self, command: wp.Launch, threads: int) -> None:
-        if threads:
-            command.set_dim(threads)
-            command.launch()
-
     def _record(self, tension: bool) -> None:
-        """Bind every kernel to the arrays once: a recorded launch costs a fifth of a plain one."""
+        """Bind every kernel to the arrays once."""
         model, state = self.model, self.state
         kinds = {
             wp.int32: {"tree_first": model.tree_first, "tree_size": model.tree_size, "body_tree": model.body_tree,
@@ -298,9 +295,8 @@ class Plants:
         for dtype, names in scratch.items():
             a |= {name: wp.empty(len(model.body_mass), dtype=dtype, device="cpu") for name in names}
 
-        def record(kernel: wp.Kernel, *inputs: object) -> wp.Launch:
-            values = [a[value] if isinstance(value, str) else value for value in inputs]
-            return wp.launch(kernel, 1, inputs=values, device="cpu", record_cmd=True)
+        def record(kernel: wp.Kernel, *inputs: object) -> Callable[[int], None]:
+            return bind(kernel, [a[value] if isinstance(value, str) else value for value in inputs], [])
 
         gravity, dt = wp.vec3(GRAVITY), self.dt
         tree, joint = ("tree_first", "tree_size"), ("body_parent", "body_offset", "body_rest")

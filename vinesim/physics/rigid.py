@@ -321,15 +321,20 @@ class Rigid:
         """First half: positions, native contacts, and the velocity that the tick would end with without plants."""
         m, d = self.world, self.data
         self._servo()
-        d.qfrc_applied[:] = 0.0
+        # still applied from the last tick: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
+        d.qfrc_applied[:] = 0.0
         # the whole forward pass behind the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
 
     @property
     def velocity_free(self) -> np.ndarray:
-        """[dof] the prediction of :meth:`prep`."""
-        return self.data.qvel + self.dt * self.data.qacc
+        """[dof] the prediction of :meth:`prep`; zero for what sleeps, whose ``qacc`` MuJoCo leaves as it was."""
+        m, d = self.world, self.data
+        velocity = d.qvel + self.dt * d.qacc
+        if d.nv_awake < m.nv:
+            velocity[d.tree_asleep[m.dof_treeid] >= 0] = 0.0
+        return velocity
 
     @property
     def group(self) -> np.ndarray:
@@ -358,7 +363,7 @@ class Rigid:
         """Second half: integrate with generalised contact forces of plants, ``force`` [dof]."""
         m, d = self.world, self.data
         if force is not None:
-            d.qfrc_applied[:] = force
+            np.add(force, 0.0, out=d.qfrc_applied)  # +0 for -0, which would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
         self._contact[:] = 0.0 if force is None else force
         if d.ncon:
@@ -569,6 +574,8 @@ def _scene(model: Model, dt: float) -> mujoco.MjSpec:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     spec.option.impratio = 10.0
+    # boxes and bunches that lie still cost nothing; robots, being driven, never sleep
+    spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     friction = [FRICTION, 0.005, 0.0001]
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=_GROUND, conaffinity=_BOX,

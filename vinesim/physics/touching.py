@@ -330,7 +330,10 @@ class Touching:
         s, g, state, mj = self.shapes, self._geoms, self.plants.state, self._mujoco
 
         def shared(data: np.ndarray, dtype: type) -> wp.array:
-            return wp.array(data, dtype=dtype, device="cpu", copy=False)
+            array = wp.array(data, dtype=dtype, device="cpu", copy=False)
+            if data.size and array.ptr != data.ctypes.data:
+                raise ValueError(f"an array of {data.shape} {data.dtype} is not contiguous: Warp would work on a copy")
+            return array
 
         def ints(*names: str) -> list[wp.array]:
             return [shared(getattr(self, "_" + name), wp.int32) for name in names]
