@@ -67,7 +67,11 @@ def oracle(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -
     depth, primitive = wp.empty(count, dtype=float, device="cpu"), wp.empty(count, dtype=wp.int32, device="cpu")
     caster = RayCaster(primitives)
     wp.launch(
-        rays.cast_camera, count, inputs=[primitives.shapes, caster.hierarchies(), pinhole(info, pose)], outputs=[depth, primitive], device="cpu"
+        rays.cast_camera,
+        count,
+        inputs=[primitives.shapes, caster.hierarchies(), pinhole(info, pose)],
+        outputs=[depth, primitive],
+        device="cpu",
     )
     shape = (info.height, info.width)
     return depth.numpy().reshape(shape), primitive.numpy().reshape(shape)

@@ -317,7 +317,10 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.ar
         lit = wp.where(gap > 0.0, 0.0, 1.0)
         for k in range(taps):
             v = spiral[k] * spread
-            if m.depth[int(y + v[0] * turn[1] + v[1] * turn[0]) * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])] > z:
+            if (
+                m.depth[int(y + v[0] * turn[1] + v[1] * turn[0]) * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])]
+                > z
+            ):
                 lit += 1.0
         lit = lit / (float(taps) + 1.0)
     return lit

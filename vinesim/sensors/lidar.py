@@ -54,7 +54,9 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         organs = {o.name.lower() for o in Organ if o != Organ.NOTHING}
         if set(spec.reflectance) != organs:
             wrong = sorted(set(spec.reflectance) ^ organs)[0]
-            raise specs.SensorError(f"{name}: reflectance.{wrong} is missing or unknown; give one for each of {', '.join(sorted(organs))}")
+            raise specs.SensorError(
+                f"{name}: reflectance.{wrong} is missing or unknown; give one for each of {', '.join(sorted(organs))}"
+            )
         return spec
 
 

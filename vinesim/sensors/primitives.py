@@ -256,7 +256,11 @@ def _fixed(model: Model, still: int) -> _Batch | None:
     rng = np.random.default_rng(3)
     seed = rng.uniform(size=int(index.max()) + 1)[index] * 7.0
     # bark runs through from piece to piece: distances count from the foot of a post, along a wire
-    along = np.where(np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1), start[:, 2], length[whole] * ends[0][:, 0])
+    along = np.where(
+        np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1),
+        start[:, 2],
+        length[whole] * ends[0][:, 0],
+    )
     return _batch(
         CONE, _columns(start, thick), b=_columns(end, thin), c=_columns(along, seed, 0.0, 0.0), material=material, tint=tint, organ=organ,
         label=organ * label(Organ(1), 0) + index, carrier=still, group=_cell_of((start + end) * 0.5, 0),
