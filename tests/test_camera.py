@@ -45,7 +45,7 @@ def test_a_known_bunch_lies_on_its_pixel(model, primitives) -> None:
     for bunch in range(0, len(model.bunch_body), 4):
         centre = _bunch_centre(model, view, bunch)
         # a level gaze that is off the bunch by some degrees, with the camera rolled
-        pose = looking(centre + [-0.28, 0.10, -0.12], centre + [0.0, 0.03, 0.02])
+        pose = looking(centre + np.array([-0.28, 0.10, -0.12]), centre + np.array([0.0, 0.03, 0.02]))
         pose[3:] = frames.multiply(pose[3:], frames.exp(np.array([0.0, 0.0, 0.3])))
         frame = camera.render(primitives, pose)
         local = frames.rotate(frames.conjugate(pose[3:]), centre - pose[:3])
@@ -100,7 +100,7 @@ def test_a_moved_bunch_moves_in_the_picture(model) -> None:
     primitives, view = Primitives(model, grass=0.0), still_view(model)
     camera, bunch = _camera(), 10
     centre = _bunch_centre(model, view, bunch)
-    pose = looking(centre + [-0.5, 0.0, -0.1], centre)
+    pose = looking(centre + np.array([-0.5, 0.0, -0.1]), centre)
     right = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]))
 
     def column() -> float:
@@ -163,7 +163,7 @@ def test_things_cast_shadows_that_follow_them() -> None:
 
     lit, dark = ground(1.3, 0.55, 0.0), ground(1.3, 0.15, 0.0)
     assert dark < 0.7 * lit
-    at = at + [0, 0.6, 0, 0, 0, 0, 0]
+    at[0, 1] += 0.6
     primitives.update(dataclasses.replace(view, link_q=at, links=view.links))
     assert ground(1.3, 0.15, 0.05) < 0.7 * lit  # not yet: shadows are redrawn at a bounded rate
     assert ground(1.3, 0.15, 0.2) > 0.8 * lit

@@ -47,8 +47,14 @@ def test_points_lie_on_the_ground(lidar: Lidar) -> None:
 
 
 def test_rings_offsets_and_angles_follow_the_table(lidar: Lidar) -> None:
-    room = seeing.thing(*(seeing.shape("box", 0.1, 9.0, 9.0, at=frames.rotate(frames.yaw(a), np.array([5.0, 0, 0])), turn=frames.yaw(a))
-                          for a in np.arange(4) * np.pi / 2))  # fmt: skip
+    room = seeing.thing(
+        *(
+            seeing.shape(
+                "box", 0.1, 9.0, 9.0, at=frames.rotate(frames.yaw(a), np.array([5.0, 0, 0])), turn=frames.yaw(a)
+            )
+            for a in np.arange(4) * np.pi / 2
+        )
+    )
     scan = lidar.scan(seeing.world(room)[0], AT, 7.0)
     shots = len(lidar.offset)
     assert shots == 16 * 1808
@@ -95,7 +101,7 @@ def test_a_scan_of_the_vineyard_follows_motion(lidar: Lidar) -> None:
     }
     import dataclasses
 
-    primitives.update(dataclasses.replace(view, link_q=view.link_q + [0.0, 0.5, 0, 0, 0, 0, 0]))
+    primitives.update(dataclasses.replace(view, link_q=view.link_q + 0.5 * np.eye(7)[1]))
     moved = lidar.scan(primitives, AT)
     mine = moved.xyz[moved.labels == label(Organ.ROBOT, 0)].astype(float)
     assert np.abs(np.hypot(mine[:, 0] - 2.0, mine[:, 1] - 0.5) - 0.05).max() < 2e-5

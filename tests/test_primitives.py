@@ -34,9 +34,12 @@ def test_every_bunch_has_its_berries_where_its_body_is(model, primitives) -> Non
         round_ones = mine[primitives.shapes.kind.numpy()[mine] == 1]
         assert len(round_ones) == model.bunch_berries[bunch]
         expected = berries(
-            float(model.bunch_length[bunch]), float(model.bunch_radius[bunch]), int(model.bunch_berries[bunch]),
-            int(model.bunch_variety[bunch]), int(model.bunch_seed[bunch]),
-        )  # fmt: skip
+            float(model.bunch_length[bunch]),
+            float(model.bunch_radius[bunch]),
+            int(model.bunch_berries[bunch]),
+            int(model.bunch_variety[bunch]),
+            int(model.bunch_seed[bunch]),
+        )
         pose = view.body_q[model.bunch_body[bunch]].astype(float)
         at = pose[:3] + frames.rotate(pose[3:], expected.position)
         got = primitives.shapes.a.numpy()[round_ones]
@@ -124,7 +127,7 @@ def test_links_come_move_and_go(model, primitives) -> None:
     primitives.update(dataclasses.replace(view, links=links, link_q=pose))
     assert primitives.count == plants + 1
     assert primitives.label[-1] == label(Organ.ROBOT, 2)
-    pose = pose + [0.5, 0, 0, 0, 0, 0, 0]
+    pose = pose + 0.5 * np.eye(7)[0]
     dirty = primitives.update(dataclasses.replace(view, links=links, link_q=pose))
     assert len(dirty) == 1
     assert primitives.shapes.a.numpy()[-1] == pytest.approx([1.5, 0.0, 0.5, 0.1])

@@ -5,7 +5,7 @@ Every primitive is four vectors ``a b c d`` whose meaning follows from its kind:
 ========== ======================= ======================= ============================ =====================
 kind       a                       b                       c                            d
 ========== ======================= ======================= ============================ =====================
-CONE       start, radius           end, radius             distance along, seed, -, -   -
+CONE       start, radius           end, radius             along, seed, sky at end, 1   -
 SPHEROID   centre, radius          axis, length / width    seed, depth in bunch, -, -   occlusion vector, mean
 LEAF       petiole end, size       midrib, outline number  upper normal, seed           curvatures a b c, age
 BOX        centre, half x          quaternion              half y, half z, seed, -      -
@@ -126,7 +126,7 @@ def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
     k0 = d2 * m5 - m1 * m1 + m1 * slope * ra * 2.0 - m0 * ra * ra
     h = k1 * k1 - k0 * k2
     best = FAR
-    side = int(0)
+    side = wp.int32(0)
     if d2 > 0.0 and h >= 0.0:
         root = wp.sqrt(h)
         if k2 > 0.0:

@@ -43,6 +43,6 @@ def bunches(frame: CameraFrame) -> tuple[Sighting, ...]:
                 int(last - first),
                 (int(c.min()), int(r.min()), int(c.max()), int(r.max())),
                 float(np.median(depth)) if len(depth) else float("nan"),
-            )  # fmt: skip
+            )
         )
     return tuple(sightings)
