@@ -70,7 +70,7 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> visibility.Pinhole:
     """Intrinsics and pose [7] of the optical frame as kernels need them."""
     if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
         raise ValueError(
-            f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, size {info.width} x {info.height}; give positive ones"
+            f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; give positive ones"
         )
     pose = np.asarray(pose, float)
     if not np.isfinite(pose).all():
