@@ -39,7 +39,9 @@ def demo(
     scene: Scene = "demo",
     robot: Robot = "vinebot",
     headless: Annotated[bool, typer.Option(help="No live table; one line a second.")] = False,
-    out: Annotated[pathlib.Path, typer.Option(help="Folder for pictures, plot and summary.json.")] = pathlib.Path("out"),
+    out: Annotated[pathlib.Path, typer.Option(help="Folder for pictures, plot and summary.json.")] = pathlib.Path(
+        "out"
+    ),
 ) -> None:
     """A robot pushes a bunch, another client sees it move, ROS topics carry it.
 
@@ -86,11 +88,15 @@ def client(
     ros: Annotated[bool, typer.Option(help="Talk ROS 2, if it is installed.")] = True,
     push: Annotated[int | None, typer.Option(help="Reach for this bunch and push it, again and again.")] = None,
     watch: Annotated[int | None, typer.Option(help="Record force and displacement of this bunch.")] = None,
-    near: Annotated[float, typer.Option(min=0.1, max=5.0, help="Others nearer than this to a thing hear of it [m].")] = 5.0,
+    near: Annotated[
+        float, typer.Option(min=0.1, max=5.0, help="Others nearer than this to a thing hear of it [m].")
+    ] = 5.0,
     seconds: Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")] = None,
     out: Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")] = None,
     status: Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")] = "text",
-    camera_hz: Annotated[float | None, typer.Option(min=0.1, help="Pictures a second; the camera's own rate unless given.")] = None,
+    camera_hz: Annotated[
+        float | None, typer.Option(min=0.1, help="Pictures a second; the camera's own rate unless given.")
+    ] = None,
     device: Annotated[str, typer.Option(help="Where plants are simulated: cpu or cuda:0.")] = "cpu",
 ) -> None:
     """Join the vineyard as one actor, with a simulation of its own.

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -23,6 +23,7 @@ from rich.table import Table
 
 from vinesim.client import plot
 from vinesim.client.trace import Rows, remote_error
+from vinesim.robot.description import Mount
 from vinesim.ros import environment
 
 PUSHER, VISITOR = "picker", "visitor"
@@ -134,7 +135,7 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
 
     console = Console(stderr=True)
     plan = reseeded(load_scene(scene), seed)
-    load_robot(robot)  # say now, and once, what is wrong with it
+    robot_named = load_robot(robot)  # say now, and once, what is wrong with it
     model = generate(plan)
     bunch = bunch_in_reach(model, spawn_pose(plan, 0))
     for folder in (out, out / PUSHER, out / VISITOR):
@@ -155,8 +156,12 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
 
         server = start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0")
         endpoint = server.line(20.0).removeprefix("listening on ")
-        stranger = None if no_ros else start("stranger", "-m", "vinesim.ros.witness")
-        console.print(f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (the first run compiles kernels)")
+        stranger = (
+            None if no_ros else start("stranger", "-m", "vinesim.ros.witness", *heard_topics(robot_named.cameras))
+        )
+        console.print(
+            f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (the first run compiles kernels)"
+        )
         pusher = start(
             PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
             "--seconds", str(seconds), "--out", str(out / PUSHER), "--camera-hz", "5",
@@ -178,6 +183,18 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
     console.print(_result(summary))
     console.print(f"pictures, plot and summary.json are in {out}/")
     return 0
+
+
+def heard_topics(cameras: Sequence[Mount]) -> list[str]:
+    """What the stranger subscribes to: all of the pusher's topics, and of the visitor's its joints and first picture."""
+    topics = [
+        "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment", "/tf_environment_static",
+        "/lidar/points", "/vine/contacts", "/mobile_base_controller/odom", "/diagnostics", f"/{VISITOR}/joint_states",
+    ]  # fmt: skip
+    pictures = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info", "depth/points", "labels")
+    topics += [f"/{camera.name}/{picture}" for camera in cameras for picture in pictures]
+    topics += [f"/{VISITOR}/{camera.name}/rgb/image_raw" for camera in cameras[:1]]
+    return [word for topic in topics for word in ("--topic", topic)]
 
 
 def watch(
@@ -272,7 +289,10 @@ def _result(summary: dict[str, Any]) -> Table:
         ("real-time factor", f"{summary['real_time_factor']:.4f}"),
         ("touch to motion", f"{summary['touch_to_motion_ticks']} ticks"),
         ("largest force", f"{summary['force_peak_n']:.1f} N"),
-        ("remote copy off by", "never in company" if error is None else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95"),
+        (
+            "remote copy off by",
+            "never in company" if error is None else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95",
+        ),
         ("bytes of touched plants, nobody near", f"{summary['environment_bytes_when_far']}"),
         ("ROS messages heard by a stranger", f"{sum(summary['ros_received'].values())}"),
     ):

@@ -20,7 +20,7 @@ STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
 
 
-class WrongUse(ValueError):  # noqa: N818
+class WrongUse(ValueError):
     """Options that cannot be meant; the text says which."""
 
 
@@ -74,7 +74,9 @@ def run(
 
             bus = stack.enter_context(ZenohBus(name, connect=connect))
         client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device)
-        senses = stack.enter_context(Senses(client, namespace=namespace, ros=ros, keep_pictures=out is not None, camera_hz=camera_hz))
+        senses = stack.enter_context(
+            Senses(client, namespace=namespace, ros=ros, keep_pictures=out is not None, camera_hz=camera_hz)
+        )
         pace = Pace(client.physics.dt)
         watched = watch if watch is not None else push
         if watched is not None:

@@ -187,7 +187,8 @@ class Faraway:
         sent = client.exchange.counters.environment.bytes_out
         here = client.robot.rigid.base(client.name)[0][:2]
         distance = min(
-            (float(np.hypot(*(client.physics.rigid.base(name)[0][:2] - here))) for name in client.others), default=np.inf
+            (float(np.hypot(*(client.physics.rigid.base(name)[0][:2] - here))) for name in client.others),
+            default=np.inf,
         )
         if distance > client.exchange.near + self.MARGIN:
             self.bytes += sent - self._seen

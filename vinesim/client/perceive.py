@@ -8,6 +8,7 @@ import os
 import pathlib
 import pickle
 import signal
+import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
@@ -24,6 +25,8 @@ from vinesim.world.values import CameraFrame, LidarScan, Link, RobotSample, View
 
 FIGURES_PERIOD = 0.1
 """Simulated time between two reports to the tick: what is wanted, what was sent [s]."""
+SWITCH = 5e-4
+"""How long one thread here may hold the interpreter lock when another wants it [s]."""
 NICE = 5
 """Where cores are scarce, the tick goes first."""
 
@@ -65,6 +68,7 @@ def perceive(setup: Setup, mailbox: Mailbox, pipe: Connection) -> None:
     """Entry of the process: perceive until told to stop, or until whoever started it is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then says stop
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.setswitchinterval(SWITCH)
     if hasattr(os, "nice"):
         os.nice(NICE)
     try:

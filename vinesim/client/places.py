@@ -14,7 +14,7 @@ HEIGHT = (1.2, 1.75)
 """Height of a bunch's centre that an arm reaches [m]."""
 
 
-class NoPlace(ValueError):  # noqa: N818
+class NoPlace(ValueError):
     """A start place or a bunch that the scene does not have; the text says what it has."""
 
 

@@ -72,7 +72,14 @@ class Senses:
         self._mailbox = Mailbox(40 * len(client.model.body_mass) + (4 << 20), context)
         self._pipe, theirs = context.Pipe()
         setup = Setup(
-            client.name, client.model, description, client.scene.sun.direction(), namespace, ros, keep_pictures, camera_hz
+            client.name,
+            client.model,
+            description,
+            client.scene.sun.direction(),
+            namespace,
+            ros,
+            keep_pictures,
+            camera_hz,
         )
         self._process = context.Process(
             target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {client.name}", daemon=True

@@ -17,7 +17,7 @@ class Status:
     def __init__(self, client: Client, pace: Pace, sent: Any = None) -> None:
         """``sent`` gives the number of messages sent so far by ROS topic, if there is a node."""
         self.client, self.pace = client, pace
-        self._sent = sent or (lambda: {})
+        self._sent = sent or (dict)
         self._before: dict[str, int] = {}
         self._before_time = 0.0
 

@@ -28,7 +28,7 @@ class BusError(RuntimeError):
     """The network cannot be used as asked; the text says what, where and the remedy."""
 
 
-class NameTaken(BusError):  # noqa: N818
+class NameTaken(BusError):
     """Another live actor has this name."""
 
     def __init__(self, name: str, world: str) -> None:

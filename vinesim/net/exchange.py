@@ -49,7 +49,7 @@ FORGOTTEN = 3.0
 _LONG_AGO = -1e9
 
 
-class Mismatch(RuntimeError):  # noqa: N818
+class Mismatch(RuntimeError):
     """Actors that cannot share a world: their vineyards or their protocols differ."""
 
 

@@ -64,7 +64,7 @@ class MessageError(ValueError):
     """A message that must not be believed; the text says why."""
 
 
-class WrongVersion(MessageError):  # noqa: N818
+class WrongVersion(MessageError):
     """A message of another protocol version; ``theirs`` is its number."""
 
     def __init__(self, theirs: int) -> None:

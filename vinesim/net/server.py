@@ -23,7 +23,7 @@ LISTEN = "tcp/0.0.0.0:7447"
 """All interfaces, Zenoh's port."""
 
 
-class PortTaken(BusError):  # noqa: N818
+class PortTaken(BusError):
     """The endpoint cannot be listened on."""
 
     def __init__(self, endpoint: str, reason: str) -> None:

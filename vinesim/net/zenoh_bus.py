@@ -40,7 +40,7 @@ PATIENCE = 2.0
 """How long connecting may take [s]."""
 
 
-class ServerUnreachable(BusError):  # noqa: N818
+class ServerUnreachable(BusError):
     """No server answers at the endpoint."""
 
     def __init__(self, endpoint: str, reason: str) -> None:
