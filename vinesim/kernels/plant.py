@@ -236,7 +236,7 @@ def free(
         J = J_out[k]
         H = H_out[k]
         M = M_out[k]
-        # the metric acts on the rate as the joint frame sees it, not on its derivative in world axes
+        # the metric acts on the rate as the joint frame sees it, hence turning x omega = turning x (joint rate)
         u = metric * wp.cross(turning, wp.spatial_bottom(body_qd_out[k])) - frame * spring - wp.spatial_bottom(bias)
         D = wp.inverse(J + metric)
         DJ = D * J

@@ -282,6 +282,10 @@ class Plants:
             for dtype, arrays in kinds.items()
             for name, data in arrays.items()
         }
+        for arrays in kinds.values():
+            for name, data in arrays.items():
+                if data.size and a[name].ptr != data.ctypes.data:
+                    raise ValueError(f"{name} cannot be shared with Warp; give a C-contiguous array of its own")
         scratch = {
             wp.vec3: ("lever", "drawn", "Du", "joint_qd_free"),
             wp.quat: ("axes",),
