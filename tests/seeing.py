@@ -21,7 +21,7 @@ from vinesim.world.values import CameraInfo, Link, Shape, View
 
 IDEAL = CameraSpec.load("pinhole")
 SMALL = IDEAL.info("optical", 0.5)
-AHEAD = looking(np.zeros(3) + [0, 0, 1.0], np.array([1.0, 0.0, 1.0]))
+AHEAD = looking(np.array([0, 0, 1.0]), np.array([1.0, 0.0, 1.0]))
 """An optical frame 1 m above the origin that looks along +x."""
 
 

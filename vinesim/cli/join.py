@@ -8,11 +8,14 @@ import logging
 import os
 import pathlib
 import signal
+import sys
 import threading
 from typing import Any
 
 log = logging.getLogger(__name__)
 
+SWITCH = 2e-4
+"""How long another thread may hold the interpreter lock when the tick wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
 
@@ -33,6 +36,8 @@ def run(
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
 
+    # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
+    sys.setswitchinterval(SWITCH)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

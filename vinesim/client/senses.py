@@ -1,12 +1,18 @@
-"""What a robot perceives and tells ROS: joins the sensing thread, the ROS node and the tick."""
+"""What a robot perceives and tells ROS, seen from the tick: a process of its own does the work.
+
+Rendering and publishing hold Python's interpreter lock for milliseconds at a time. In threads beside the tick they cost
+it its beat (docs/decisions/senses-process.md has the figures), so they live in a process, to which the tick hands one
+letter a tick through shared memory and of which it never waits for an answer.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import pathlib
+import pickle
 import types
-from collections.abc import Callable
 from typing import Any, Self
 
 import numpy as np
@@ -14,24 +20,29 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.jobs import Obey
+from vinesim.client.mailbox import Mailbox
+from vinesim.client.perceive import Letter, Setup, perceive
 from vinesim.ros import environment
-from vinesim.sensors import picture
-from vinesim.sensors.camera import Camera, CameraSpec
-from vinesim.sensors.eyes import Eyes, Mount
-from vinesim.sensors.lidar import Lidar, LidarSpec
-from vinesim.world.ids import Organ
-from vinesim.world.values import CameraFrame, LidarScan
+from vinesim.ros.types import Command
 
 log = logging.getLogger(__name__)
 
-TRUTH_TICKS = 10
-"""Ticks between two messages of true poses (/tf_environment): 10 Hz."""
 VIEW_TICKS = 2
 """Ticks between two views for the eyes: 50 Hz, faster than any camera here."""
+ANSWER = 10.0
+"""How long the process may take to write its pictures [s]."""
+PATIENCE = 1.2
+"""How long it may take to end [s]."""
+
+
+class SensesError(RuntimeError):
+    """The process of the senses failed; the text says how."""
+
+    exit_code = 3
 
 
 class Senses:
-    """Cameras, lidars and the ROS node of the client's robot. A context: its threads end with it."""
+    """Cameras, lidars and the ROS node of the client's robot. A context: the process ends with it."""
 
     def __init__(
         self,
@@ -46,93 +57,94 @@ class Senses:
         displacement of the watched bunch for :meth:`save`. ``camera_hz`` replaces the cameras' own rate.
         """
         self.client = client
-        self._keep = keep_pictures
-        self._kept: CameraFrame | None = None
-        self._greatest = -1.0
-        self._stack = contextlib.ExitStack()
-        self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(len(client.model.bunch_body)))
-        self._attached: np.ndarray | None = None
-        self._names: tuple[str, ...] = ()
-        self._truth_q = np.zeros((0, 7))
-        self.node = self._open_node(namespace) if ros else None
-        self._frames = {}
-        self.eyes = self._open_eyes(camera_hz)
-        client.senses.append(self._every_tick)
-        if self.node is not None:
-            client.jobs.insert(0, Obey(client.robot, self.node.commands))
-
-    def _open_node(self, namespace: str) -> Any:
-        reason = environment.available()
-        if reason is not None:
+        if ros and (reason := environment.available()) is not None:
             log.warning("running without ROS 2: %s", reason)
-            return None
-        from vinesim.ros.node import Node
-
-        description = self.client.robot.description
-        fixed = [(p, c, q) for (p, c), q in zip(description.fixed, description.fixed_q, strict=True)]
-        node = self._stack.enter_context(
-            Node(
-                self.client.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=namespace,
-                static_transforms=fixed, cameras=[m.name for m in description.cameras],
-                lidars=[m.name for m in description.lidars], base=description.base,
-                clock=not namespace,  # one clock in a ROS domain: that of the client without a namespace
-            )
-        )  # fmt: skip
-        poles = np.flatnonzero(self.client.model.fixed_organ == Organ.POLE)
-        at = frames.pose(self.client.model.fixed_start[poles])
-        node.publish_environment_static(tuple(f"pole_{i:04d}" for i in range(len(poles))), at)
-        return node
-
-    def _open_eyes(self, camera_hz: float | None) -> Eyes:
-        description, sun = self.client.robot.description, self.client.scene.sun.direction()
-        mounts = []
-        for i, place in enumerate(description.cameras):
-            spec = CameraSpec.load(place.type)
-            camera = Camera(spec, spec.info(place.frame), place.name, sun)
-            wanted = self._wanted(place.name, always=self._keep and i == 0)
-            mounts.append(Mount(camera, self._deliver_camera, wanted, camera_hz))
-            self._frames[place.name] = place.frame
-        for place in description.lidars:
-            lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame)
-            mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name)))
-            self._frames[place.name] = place.frame
-        return self._stack.enter_context(Eyes(self.client.model, mounts))
-
-    def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:
-        return lambda: always or (self.node is not None and self.node.wanted(name))
-
-    def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
-        assert isinstance(frame, CameraFrame)
-        if self.node is not None:
-            self.node.publish_camera(frame)
-        if self._keep and frame.name == self.eyes.mounts[0].name:
-            trace = self.client.trace
-            shift = 0.0 if trace is None else trace.displacement
-            if shift >= self._greatest:
-                self._greatest, self._kept = shift, frame
-
-    def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
-        assert isinstance(scan, LidarScan)
-        if self.node is not None:
-            self.node.publish_lidar(scan)
+            ros = False
+        description = client.robot.description
+        self._sensors = {place.name: place.frame for place in (*description.cameras, *description.lidars)}
+        self._commands: list[Command] = []
+        self._figures: dict[str, Any] = {"sent": {}, "eyes": keep_pictures}
+        self._moved = np.zeros(len(client.model.tree_first), bool)
+        self._links: Any = None
+        self._acknowledged, self._letters = 0, 0
+        self._asked: list[tuple[int, np.ndarray]] = []
+        context = multiprocessing.get_context("spawn")
+        self._mailbox = Mailbox(40 * len(client.model.body_mass) + (4 << 20), context)
+        self._pipe, theirs = context.Pipe()
+        setup = Setup(
+            client.name, client.model, description, client.scene.sun.direction(), namespace, ros, keep_pictures, camera_hz
+        )
+        self._process = context.Process(
+            target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {client.name}", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        self._wait_for("ready", 120.0)
+        client.senses.append(self._every_tick)
+        if ros:
+            client.jobs.insert(0, Obey(client.robot, self._take_commands))
 
     # ------------------------------------------------------------------ the tick
 
     def _every_tick(self, client: Client) -> None:
-        physics, node = client.physics, self.node
-        if physics.tick % VIEW_TICKS == 0 and any(mount.wanted() for mount in self.eyes.mounts):
-            poses = {name: client.robot.frame_pose(frame) for name, frame in self._frames.items()}
-            self.eyes.see(physics.view(), poses)
-        if node is None:
-            return
-        node.publish_tick(physics.time, client.robot.sample(physics.time, physics.contacts))
-        if physics.tick % TRUTH_TICKS == 0 and node.wanted("tf_environment"):
-            attached = physics.state.bunch_attached
-            if self._attached is None or not np.array_equal(attached, self._attached):
-                self._attached = attached.copy()
-                self._names = tuple(self._bunch_names[i] for i in np.flatnonzero(attached))
-            bodies = client.model.bunch_body[self._attached]
-            node.publish_environment(physics.time, self._names, physics.state.body_q[bodies].astype(float))
+        self._listen()
+        physics, trace = client.physics, client.trace
+        self._moved[physics.plants.awake] = True
+        looks = self._figures["eyes"] and physics.tick % VIEW_TICKS == 0
+        truth = self._figures.get("truth", False) and physics.tick % 10 == 0
+        trees = bodies = body_q = link_q = poses = links = None
+        if looks or truth:
+            physics.refresh()
+            trees = np.flatnonzero(self._moved)
+            bodies = physics.plants.bodies_of(trees)
+            body_q = physics.state.body_q[bodies]
+        if looks:
+            link_q = physics.rigid.link_q()
+            poses = {name: client.robot.frame_pose(frame) for name, frame in self._sensors.items()}
+            if physics.rigid.links() is not self._links:
+                links = physics.rigid.links()
+        letter = Letter(
+            number=self._letters + 1, tick=physics.tick, time=physics.time,
+            sample=client.robot.sample(physics.time, physics.contacts),
+            bodies=bodies, body_q=body_q, trees=trees, attached=np.packbits(physics.state.bunch_attached),
+            links=links, link_q=link_q, poses=poses, displacement=0.0 if trace is None else trace.displacement,
+        )  # fmt: skip
+        if self._mailbox.put(pickle.dumps(letter, pickle.HIGHEST_PROTOCOL)):
+            self._letters += 1
+            if trees is not None:
+                self._asked.append((self._letters, trees))
+
+    def _listen(self) -> None:
+        """Take what the process says: commands, figures, and which letters it has read."""
+        if not self._process.is_alive() and not self._pipe.poll():
+            raise SensesError(f"the senses of {self.client.name} ended with exit code {self._process.exitcode}")
+        while self._pipe.poll():
+            kind, value = self._pipe.recv()
+            if kind == "commands":
+                self._commands += value
+            elif kind == "figures":
+                self._figures = value
+            elif kind == "read":
+                self._read(*value)
+            elif kind == "failed":
+                raise SensesError(f"the senses of {self.client.name} failed: {value}")
+
+    def _read(self, number: int, links_seen: bool) -> None:
+        """A letter with a view was read: what moved until then, and rests since, needs no telling again."""
+        if links_seen:
+            self._links = self.client.physics.rigid.links()
+        told = [trees for n, trees in self._asked if n == number]
+        self._asked = [(n, trees) for n, trees in self._asked if n > number]
+        if told:
+            later = [trees for _, trees in self._asked]
+            self._moved[told[0]] = False
+            for trees in later:
+                self._moved[trees] = True
+            self._moved[self.client.physics.plants.awake] = True
+
+    def _take_commands(self) -> list[Command]:
+        commands, self._commands = self._commands, []
+        return commands
 
     # ------------------------------------------------------------------ questions
 
@@ -144,30 +156,48 @@ class Senses:
 
     def sent(self) -> dict[str, int]:
         """Messages sent so far, by topic."""
-        return {} if self.node is None else self.node.sent
+        return self._figures["sent"]
 
     def diagnose(self, figures: dict[str, Any]) -> None:
-        """Pass the client's figures to /diagnostics."""
-        if self.node is not None:
-            keys = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "bytes_in", "bytes_out")
-            healthy = figures["real_time_factor"] > 0.99
-            self.node.publish_diagnostics(figures["time"], {key: figures[key] for key in keys}, healthy=healthy)
+        """Pass the client's figures on to /diagnostics."""
+        keys = ("time", "tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "bytes_in", "bytes_out")
+        with contextlib.suppress(OSError):
+            self._pipe.send(("diagnose", {key: figures[key] for key in keys}))
 
     def report(self) -> dict[str, Any]:
-        """What was dropped and refused."""
-        figures: dict[str, Any] = {"frames": dict(self.eyes.frames), "frames_dropped": dict(self.eyes.dropped)}
-        if self.node is not None:
-            figures |= {"ros_sent": self.node.sent, "ros_dropped": self.node.dropped}
-        return figures
+        """What was rendered, sent and dropped."""
+        return {key: self._figures[key] for key in ("frames", "frames_dropped", "ros_dropped") if key in self._figures}
 
     def save(self, folder: pathlib.Path) -> None:
         """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs."""
-        if self._kept is not None:
-            picture.save(self._kept, folder, "")
+        self._pipe.send(("save", folder))
+        self._wait_for("saved", ANSWER)
+
+    def _wait_for(self, answer: str, timeout: float) -> None:
+        while self._pipe.poll(timeout):
+            try:
+                kind, value = self._pipe.recv()
+            except EOFError:
+                break
+            if kind == "failed":
+                raise SensesError(f"the senses of {self.client.name} failed: {value}")
+            if kind == "figures":
+                self._figures = value
+            if kind == answer:
+                return
+        raise SensesError(f"the senses of {self.client.name} did not get {answer} within {timeout:.0f} s")
 
     def close(self) -> None:
-        """End all threads."""
-        self._stack.close()
+        """End the process."""
+        with contextlib.suppress(OSError):
+            self._pipe.send(("stop", None))
+        self._process.join(PATIENCE)
+        if self._process.is_alive():
+            log.warning("the senses of %s did not end by themselves", self.client.name)
+            self._process.kill()
+            self._process.join()
+        self._pipe.close()
+        self._mailbox.close()
 
     def __enter__(self) -> Self:
         return self

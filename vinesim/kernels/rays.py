@@ -46,7 +46,7 @@ class Hit:
 def smooth_from(s: Shapes, i: int, depth_scale: float, forward: wp.vec3, eye: wp.vec3) -> int:
     """Whether a leaf's outline is interpolated, by the rasteriser's rule; never without a focal length."""
     a4 = s.a[i]
-    smooth = int(0)
+    smooth = wp.int32(0)
     if s.kind[i] == LEAF and depth_scale > 0.0:
         if a4[3] * depth_scale > wp.dot(xyz(a4) - eye, forward) * SMOOTH_SIZE:
             smooth = 1
@@ -64,7 +64,7 @@ def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, f
         if t < best.t:
             best.t = t
             best.primitive = -2
-    i = int(0)
+    i = wp.int32(0)
     query = wp.bvh_query_ray(h.plants, o, d)
     while wp.bvh_query_next(query, i, best.t):
         t = hit(s, i, o, d, smooth_from(s, i, focal, forward, o))
@@ -72,7 +72,7 @@ def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, f
             best.t = t
             best.primitive = i
     if h.first_rigid >= 0:
-        j = int(0)
+        j = wp.int32(0)
         other = wp.bvh_query_ray(h.rigid, o, d)
         while wp.bvh_query_next(other, j, best.t):
             t = hit(s, h.first_rigid + j, o, d, 0)
@@ -196,7 +196,7 @@ def sweep(
     o = wp.transform_get_translation(pose)
     ray = wp.quat_rotate(wp.transform_get_rotation(pose), d)
     best = first_hit(hierarchies, shapes, o, ray, farthest, 0.0, ray)
-    name = int(-1)
+    name = wp.int32(-1)
     bright = float(0.0)
     if best.primitive != -1 and best.t >= nearest:
         n = wp.vec3(0.0, 0.0, 1.0)

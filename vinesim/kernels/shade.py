@@ -317,7 +317,10 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.ar
         lit = wp.where(gap > 0.0, 0.0, 1.0)
         for k in range(taps):
             v = spiral[k] * spread
-            if m.depth[int(y + v[0] * turn[1] + v[1] * turn[0]) * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])] > z:
+            if (
+                m.depth[int(y + v[0] * turn[1] + v[1] * turn[0]) * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])]
+                > z
+            ):
                 lit += 1.0
         lit = lit / (float(taps) + 1.0)
     return lit
@@ -347,9 +350,9 @@ def smooth(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
     ax = fx - float(i)
     ay = fy - float(j)
     k = (i + 1) & 255
-    l = (j + 1) & 255
+    below = (j + 1) & 255
     return (table[j, i] * (1.0 - ax) + table[j, k] * ax) * (1.0 - ay) + (
-        table[l, i] * (1.0 - ax) + table[l, k] * ax
+        table[below, i] * (1.0 - ax) + table[below, k] * ax
     ) * ay
 
 
@@ -399,39 +402,39 @@ def matte(n: wp.vec3, albedo: wp.vec3, sky: float) -> Surface:
 
 
 @wp.func
-def ground_surface(l: Looks, p: wp.vec3, pixel: float) -> Surface:
-    coarse = smooth(l.noise, p[0] * 0.21, p[1] * 0.21)
+def ground_surface(looks: Looks, p: wp.vec3, pixel: float) -> Surface:
+    coarse = smooth(looks.noise, p[0] * 0.21, p[1] * 0.21)
     detail = 1.0 / (1.0 + pixel * pixel * 20000.0)
     tone = float(0.5)
     sod = float(0.5)
     n = wp.vec3(0.0, 0.0, 1.0)
     if detail > 0.08:
-        t = smooth(l.soil, p[0] * 0.8, p[1] * 0.8)
+        t = smooth(looks.soil, p[0] * 0.8, p[1] * 0.8)
         tone = 0.5 + (t[0] - 0.5) * detail
         sod = 0.5 + (t[1] - 0.5) * detail
         n = wp.normalize(wp.vec3(t[2] * detail, t[3] * detail, 1.0))
-    green = smoothstep(0.40, 0.60, coarse[0] * 0.8 + 0.2 * sod)
+    green = smoothstep(0.38, 0.60, coarse[0] * 0.55 + 0.2 * coarse[2] + 0.25 * sod) * 0.85
     earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
-    turf = mix(wp.vec3(0.04, 0.068, 0.014), wp.vec3(0.15, 0.19, 0.045), sod)
+    turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
     s = matte(n, mix(earth, turf, green) * (0.8 + 0.4 * coarse[1]), 0.75)
     s.plain = wp.vec3(0.0, 0.0, 1.0)
     s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
     s.gloss = 0.0
-    x = (p[0] - l.ground_x) / l.ground_cell
-    y = (p[1] - l.ground_y) / l.ground_cell
-    if x > 0.0 and y > 0.0 and x < float(l.ground_sky.shape[1] - 1) and y < float(l.ground_sky.shape[0] - 1):
+    x = (p[0] - looks.ground_x) / looks.ground_cell
+    y = (p[1] - looks.ground_y) / looks.ground_cell
+    if x > 0.0 and y > 0.0 and x < float(looks.ground_sky.shape[1] - 1) and y < float(looks.ground_sky.shape[0] - 1):
         i = int(x)
         j = int(y)
         fx = x - float(i)
         fy = y - float(j)
-        low = l.ground_sky[j, i] * (1.0 - fx) + l.ground_sky[j, i + 1] * fx
-        high = l.ground_sky[j + 1, i] * (1.0 - fx) + l.ground_sky[j + 1, i + 1] * fx
+        low = looks.ground_sky[j, i] * (1.0 - fx) + looks.ground_sky[j, i + 1] * fx
+        high = looks.ground_sky[j + 1, i] * (1.0 - fx) + looks.ground_sky[j + 1, i + 1] * fx
         s.sky = low * (1.0 - fy) + high * fy
     return s
 
 
 @wp.func
-def berry_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
+def berry_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
     a4 = g.a[i]
     b4 = g.b[i]
     c4 = g.c[i]
@@ -440,8 +443,8 @@ def berry_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
     stretch = 1.0 / b4[3] - 1.0
     e = squeeze(p - xyz(a4), axis, stretch)
     n = wp.normalize(squeeze(e, axis, stretch))
-    tint = l.tint[i]
-    s = matte(n, tint, l.sky[i])
+    tint = looks.tint[i]
+    s = matte(n, tint, looks.sky[i])
     # neighbours: a baked cosine lobe of what stands around
     s.occlusion = wp.clamp(1.0 - block[3] - wp.dot(xyz(block), n), 0.12, 1.0) * (0.4 + 0.6 * c4[1])
     light = tint[1] * 2.2  # pale berries let light through, dark ones carry the bloom
@@ -455,8 +458,8 @@ def berry_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
     if pixel < a4[3] * 0.35:
         w = wp.normalize(e)
         seed = c4[0]
-        wide = smooth(l.noise, w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3)
-        fine = smooth(l.noise, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
+        wide = smooth(looks.noise, w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3)
+        fine = smooth(looks.noise, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
         s.albedo = tint * (0.86 + 0.28 * wide[1])
         s.albedo = mix(s.albedo, wp.vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide[0] + 0.15 * n[2]))
         s.albedo = s.albedo * (1.0 + pale * (0.14 * fine[2] - 0.07) + red * wp.where(fine[3] > 0.82, 0.22, 0.0))
@@ -472,7 +475,7 @@ def berry_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
 
 
 @wp.func
-def leaf_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: float) -> Surface:
+def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: float) -> Surface:
     a4 = g.a[i]
     b4 = g.b[i]
     c4 = g.c[i]
@@ -487,8 +490,8 @@ def leaf_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: flo
     slope_u = -2.0 * bend[0] * u - wp.where(u > 0.0, bend[2], -bend[2])
     slope_v = -2.0 * bend[1] * v
     plain = wp.normalize(side * slope_u + rib * slope_v + up)
-    s = matte(plain, l.tint[i], l.sky[i])
-    grass = l.material[i] == GRASS
+    s = matte(plain, looks.tint[i], looks.sky[i])
+    grass = looks.material[i] == GRASS
     if grass:
         s.albedo = s.albedo * (0.35 + 0.75 * (0.5 + 0.5 * v))
         s.through = s.albedo * 0.7
@@ -497,7 +500,7 @@ def leaf_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: flo
         s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, v)
     else:
         vein = float(0.0)
-        age = bend[3]
+        age = wp.max(bend[3] - 0.42, 0.0) * 1.7  # a leaf turns late
         near = size > pixel * 10.0
         number = int(b4[3])
         if near:
@@ -507,16 +510,16 @@ def leaf_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: flo
             n = int(y)
             fx = x - float(m)
             fy = y - float(n)
-            low = l.blade[number, n, m] * (1.0 - fx) + l.blade[number, n, m + 1] * fx
-            high = l.blade[number, n + 1, m] * (1.0 - fx) + l.blade[number, n + 1, m + 1] * fx
+            low = looks.blade[number, n, m] * (1.0 - fx) + looks.blade[number, n, m + 1] * fx
+            high = looks.blade[number, n + 1, m] * (1.0 - fx) + looks.blade[number, n + 1, m + 1] * fx
             t = low * (1.0 - fy) + high * fy
             clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
             vein = t[0] * clear
             relief = 0.8 * clear
             s.normal = wp.normalize(side * (slope_u - t[1] * relief) + rib * (slope_v - t[2] * relief) + up)
             s.albedo = s.albedo * (0.72 + 0.5 * t[3])
-        if age > 0.12:
-            spot = texel_of(l.noise, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
+        if age > 0.02:
+            spot = texel_of(looks.noise, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
             edge = (
                 float(
                     g.outline[
@@ -547,7 +550,7 @@ def leaf_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: flo
 
 
 @wp.func
-def solid_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
+def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
     kind = g.kind[i]
     a4 = g.a[i]
     b4 = g.b[i]
@@ -555,12 +558,15 @@ def solid_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
     a = xyz(a4)
     n = wp.vec3(0.0, 0.0, 1.0)
     grain = p  # position along and across the grain
+    sky = looks.sky[i]
     if kind == CONE or kind == CYLINDER:
         ba = xyz(b4) - a
         h = wp.clamp(wp.dot(p - a, ba) / wp.dot(ba, ba), 0.0, 1.0)
         out = p - a - ba * h
         length = wp.length(ba)
         along = ba / length
+        if c4[3] > 0.0:
+            sky = sky * (1.0 - h) + c4[2] * h
         if kind == CYLINDER:
             n = wp.normalize(out)
             if h <= 1.0e-4:
@@ -591,30 +597,30 @@ def solid_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
             n = wp.quat_rotate(q, wp.normalize(n))
         else:
             n = wp.normalize(wp.quat_rotate(q, wp.cw_div(grain, wp.cw_mul(half, half))))
-    material = l.material[i]
-    tint = l.tint[i]
-    s = matte(n, tint, l.sky[i])
+    material = looks.material[i]
+    tint = looks.tint[i]
+    s = matte(n, tint, sky)
     seed = c4[1]
     near = pixel < 0.004
     if material == CANE:
         if near:
-            t = smooth(l.noise, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 1.6 + seed * 3.1)
+            t = smooth(looks.noise, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 1.6 + seed * 3.1)
             s.albedo = mix(tint * (0.55 + 0.9 * t[2]), wp.vec3(0.20, 0.10, 0.045), 0.5 * smoothstep(0.45, 0.7, t[0]))
             s.normal = wp.normalize(n + wp.vec3(t[1] - 0.5, t[2] - 0.5, t[3] - 0.5) * (0.7 / (1.0 + pixel * 500.0)))
         s.polish = 14.0
     elif material == BARK:
         wide = smooth(
-            l.noise, grain[0] * 2.6 + grain[2] * 0.24 + seed, grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4
+            looks.noise, grain[0] * 2.6 + grain[2] * 0.24 + seed, grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4
         )
-        fine = texel_of(l.noise, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed)
+        fine = texel_of(looks.noise, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed)
         height = wide[2] * 0.6 + fine[1] * 0.4
         s.albedo = mix(wp.vec3(0.075, 0.054, 0.038), wp.vec3(0.27, 0.20, 0.14), smoothstep(0.28, 0.75, height))
         s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, height)
         s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.6)
         s.gloss = 0.01
     elif material == POST:
-        wide = smooth(l.noise, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
-        fine = texel_of(l.noise, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)
+        wide = smooth(looks.noise, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
+        fine = texel_of(looks.noise, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)
         s.albedo = (
             tint * (0.55 + 0.55 * wide[1] + 0.35 * fine[2]) * (1.0 - 0.45 * smoothstep(0.35, 0.0, p[2]) * wide[0])
         )
@@ -625,13 +631,13 @@ def solid_surface(g: Shapes, l: Looks, i: int, p: wp.vec3, pixel: float) -> Surf
         s.polish = 30.0
         s.mirror = 0.5
     elif material == PLASTIC:
-        t = texel_of(l.noise, grain[0] * 2.0 + grain[2], grain[1] * 2.0 + grain[2])
+        t = texel_of(looks.noise, grain[0] * 2.0 + grain[2], grain[1] * 2.0 + grain[2])
         s.albedo = tint * (0.85 + 0.3 * t[1])
         s.gloss = 0.045
         s.polish = 45.0
         s.mirror = 0.6
     elif material == CLOTH:
-        wide = smooth(l.noise, grain[0] * 1.4 + seed, grain[2] * 1.1 + grain[1] * 0.9)
+        wide = smooth(looks.noise, grain[0] * 1.4 + seed, grain[2] * 1.1 + grain[1] * 0.9)
         s.albedo = tint * (0.78 + 0.45 * wide[0])
         s.normal = wp.normalize(n + wp.vec3(wide[0] - 0.5, wide[1] - 0.5, (wide[2] - 0.5) * 0.7) * 0.9)
         s.gloss = 0.008
@@ -694,9 +700,9 @@ def ambient(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
 
 
 @wp.func
-def mirrored(l: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
+def mirrored(looks: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
     """What a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
-    t = texel_of(l.noise, r[0] * 0.35 + r[2] * 0.2, r[1] * 0.35 - r[2] * 0.15)
+    t = texel_of(looks.noise, r[0] * 0.35 + r[2] * 0.2, r[1] * 0.35 - r[2] * 0.15)
     hole = smoothstep(0.62 - 0.35 * sky, 0.72 - 0.35 * sky, t[1])
     above = mix(wp.vec3(0.05, 0.08, 0.02), wp.vec3(0.75, 0.95, 1.25), hole)
     return mix(light.bounce * 0.8, above, smoothstep(-0.25, 0.25, r[2]))
@@ -704,7 +710,7 @@ def mirrored(l: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
 
 @wp.func
 def shine(
-    l: Looks,
+    looks: Looks,
     light: Light,
     near: ShadowMap,
     far: ShadowMap,
@@ -769,9 +775,9 @@ def shine(
                 above = mix(wp.vec3(0.06, 0.09, 0.03), light.sky_colour, s.sky * s.sky)
                 colour += mix(light.bounce, above, 0.5 + 0.5 * r[2]) * (wp.min(fresnel, 0.16) * s.mirror * s.occlusion)
             else:
-                colour += mirrored(l, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)
+                colour += mirrored(looks, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)
     colour += s.albedo * s.glow
-    return mix(colour, light.haze, 1.0 - wp.exp(-t * 0.005))
+    return mix(colour, light.haze, 1.0 - wp.exp(-t * 0.003))
 
 
 @wp.kernel
@@ -812,7 +818,7 @@ def shade(
             f = 0.06711056 * float(x) + 0.00583715 * float(y)
             f = 52.9829189 * (f - wp.floor(f))
             turn = light.turns[int((f - wp.floor(f)) * 64.0) & 63]
-            kind = int(-1)
+            kind = wp.int32(-1)
             s = Surface()
             if i >= 0:
                 kind = shapes.kind[i]

@@ -5,7 +5,7 @@ Every primitive is four vectors ``a b c d`` whose meaning follows from its kind:
 ========== ======================= ======================= ============================ =====================
 kind       a                       b                       c                            d
 ========== ======================= ======================= ============================ =====================
-CONE       start, radius           end, radius             distance along, seed, -, -   -
+CONE       start, radius           end, radius             along, seed, sky at end, 1   -
 SPHEROID   centre, radius          axis, length / width    seed, depth in bunch, -, -   occlusion vector, mean
 LEAF       petiole end, size       midrib, outline number  upper normal, seed           curvatures a b c, age
 BOX        centre, half x          quaternion              half y, half z, seed, -      -
@@ -126,7 +126,7 @@ def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
     k0 = d2 * m5 - m1 * m1 + m1 * slope * ra * 2.0 - m0 * ra * ra
     h = k1 * k1 - k0 * k2
     best = FAR
-    side = int(0)
+    side = wp.int32(0)
     if d2 > 0.0 and h >= 0.0:
         root = wp.sqrt(h)
         if k2 > 0.0:
@@ -158,23 +158,25 @@ def hit_cylinder(a: wp.vec3, b: wp.vec3, r: float, d: wp.vec3) -> float:
     ba = b - a
     length2 = wp.dot(ba, ba)
     m = wp.dot(ba, d)
-    n = -wp.dot(ba, a)
+    shift = wp.dot((a + b) * 0.5, d) / wp.dot(d, d)  # see hit_cone
+    oa = d * shift - a
+    n = wp.dot(ba, oa)
     k2 = length2 * wp.dot(d, d) - m * m
-    k1 = -length2 * wp.dot(a, d) - n * m
-    k0 = length2 * wp.dot(a, a) - n * n - r * r * length2
+    k1 = length2 * wp.dot(oa, d) - n * m
+    k0 = length2 * wp.dot(oa, oa) - n * n - r * r * length2
     h = k1 * k1 - k2 * k0
     best = FAR
     if k2 > 1.0e-12 * length2 and h >= 0.0:
         t = (-k1 - wp.sqrt(h)) / k2
         y = n + t * m
-        if t > 0.0 and y > 0.0 and y < length2:
-            best = t
+        if t + shift > 0.0 and y > 0.0 and y < length2:
+            best = t + shift
     if m != 0.0:
         end = wp.where(m > 0.0, 0.0, length2)  # the end that faces the ray
         t = (end - n) / m
-        p = d * t - a - ba * (end / length2)
-        if t > 0.0 and t < best and wp.dot(p, p) <= r * r:
-            best = t
+        p = oa + d * t - ba * (end / length2)
+        if t + shift > 0.0 and t + shift < best and wp.dot(p, p) <= r * r:
+            best = t + shift
     return best
 
 

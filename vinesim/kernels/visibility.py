@@ -308,7 +308,7 @@ def raster_leaves(
                 dx = wp.vec3(side[0], rib[0], up[0]) * (inv / lens.fx)
                 dy = wp.vec3(side[1], rib[1], up[1]) * (inv / lens.fy)
                 dz = wp.vec3(side[2], rib[2], up[2]) * inv - dx * lens.cx - dy * lens.cy
-                smooth = int(0)
+                smooth = wp.int32(0)
                 if size * lens.fx > p[2] * SMOOTH_SIZE:
                     smooth = 1
                 nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)

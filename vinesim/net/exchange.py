@@ -179,6 +179,7 @@ class Exchange:
         self._announced: set[int] = set()
         self._mine: set[int] = set()
         self._theirs: set[int] = set()
+        self._silent: set[int] = set()
         self._answered: dict[int, float] = {}
         tree_count, body_count = len(model.tree_first), len(model.body_mass)
         self._said_at = np.full(tree_count, _LONG_AGO)
@@ -208,10 +209,10 @@ class Exchange:
 
     def owner(self, tree: int) -> str | None:
         """Who owns a tree now: a live actor's name (perhaps one's own), or None."""
-        claim = self._claims.get(tree, UNTOUCHED)
-        if claim.owner == NOBODY or (claim.owner != self.me.name and claim.owner not in self._actors):
-            return None
-        return claim.owner
+        owner = self._claims.get(tree, UNTOUCHED).owner
+        if owner == self.me.name:
+            return owner
+        return owner if owner in self._actors and tree not in self._silent else None
 
     def claim(self, tree: int) -> Claim:
         """The greatest claim on a tree that was made or heard."""
@@ -341,12 +342,12 @@ class Exchange:
         where = {n: a.update.base_q for n, a in self._actors.items() if a.update is not None}
         if self._window is not None:
             where[self.me.name] = self._position
+        # its claims still hold, should it come back; only its silence counts, or two would never agree again
         for tree in [tree for tree, claim in sorted(self._claims.items()) if claim.owner == name]:
-            held = self._claims[tree] = authority.rested(self._claims[tree])
-            self._touching[tree] = False
-            recent = time - self._heard_at[tree] < FORGOTTEN
+            recent = tree not in self._silent and time - self._heard_at[tree] < FORGOTTEN
+            self._silent.add(tree)
             if recent and authority.successor(self._middle[tree], where) == self.me.name:
-                self._take(tree, authority.touched(held, self.me.name, False))
+                self._take(tree, authority.touched(self._claims[tree], self.me.name, False))
 
     def _blame(self, sender: str, error: MessageError) -> None:
         """Count a message that cannot be believed, and say so once for each sender."""
@@ -385,7 +386,8 @@ class Exchange:
         held = self._claims.get(tree, UNTOUCHED)
         if claim == held:
             if claim.owner == sender:
-                self._touching[tree] = touching
+                self._adopt(tree, claim, touching)
+                self._heard_at[tree] = time
         elif authority.wins(claim, held):
             self._adopt(tree, claim, touching)
             self._heard_at[tree] = time
@@ -397,6 +399,7 @@ class Exchange:
         self._claims[tree] = claim
         self._touching[tree] = touching
         self._announced.add(tree)
+        self._silent.discard(tree)
         if claim.owner == self.me.name:
             self._mine.add(tree)
             return
@@ -405,11 +408,10 @@ class Exchange:
             self._theirs.add(tree)
 
     def _forget(self, time: float) -> None:
-        """Owners who fell silent own no more."""
-        for tree in sorted(self._theirs):
-            claim = self._claims[tree]
-            if claim.owner not in (NOBODY, self.me.name) and time - self._heard_at[tree] > FORGOTTEN:
-                self._claims[tree] = authority.rested(claim)
+        """Owners who fell silent own no more, until they are heard again: their claim still holds."""
+        for tree in self._theirs:
+            if time - self._heard_at[tree] > FORGOTTEN:
+                self._silent.add(tree)
 
     def _extrapolated(self, news: dict[int, tuple[Trees, str]], now: float, time: float) -> list[TreeUpdate]:
         """The last record of each tree, now; what was said is remembered for the next prediction."""
@@ -436,7 +438,7 @@ class Exchange:
             held = self.claim(tree)
             if claim == held or authority.wins(claim, held):
                 continue
-            mine_to_say = held.owner in (self.me.name, NOBODY) or authority.outdated(claim, held)
+            mine_to_say = self.owner(tree) in (self.me.name, None) or authority.outdated(claim, held)
             if mine_to_say and time - self._answered.get(tree, _LONG_AGO) >= ANSWER_PERIOD:
                 self._answered[tree] = time
                 self._say(tree, held)
@@ -491,6 +493,7 @@ class Exchange:
         self._claims[tree] = claim
         self._touching[tree] = True
         self._announced.discard(tree)
+        self._silent.discard(tree)
         self._mine.add(tree)
         self._said_to[tree] = 0
 
@@ -631,8 +634,10 @@ class Exchange:
                     self._said_at[tree] = time
                     left += heard.updates(self.me.name)
             elif tree not in self._announced:
-                # nobody ever heard of this claim: give its number back, so that sequences only count what was said
-                self._claims[tree] = authority.rested(self._before[tree])
+                # nobody ever heard of this claim: as if it had not been, so that sequences only count what was said
+                before = self._before[tree]
+                self._claims[tree] = authority.rested(before) if before.owner == self.me.name else before
+                self._silent.add(tree)
         return left
 
     def _say(self, tree: int, claim: Claim) -> None:

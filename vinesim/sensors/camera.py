@@ -56,15 +56,21 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         """Intrinsics with the principal point in the middle; ``scale`` enlarges the picture."""
         width, height = round(self.width.value * scale), round(self.height.value * scale)
         return CameraInfo(
-            width, height, self.fx.value * scale, self.fy.value * scale, 0.5 * (width - 1), 0.5 * (height - 1), frame_id,
-        )  # fmt: skip
+            width,
+            height,
+            self.fx.value * scale,
+            self.fy.value * scale,
+            0.5 * (width - 1),
+            0.5 * (height - 1),
+            frame_id,
+        )
 
 
 def pinhole(info: CameraInfo, pose: np.ndarray) -> visibility.Pinhole:
     """Intrinsics and pose [7] of the optical frame as kernels need them."""
     if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
         raise ValueError(
-            f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; all must be positive"
+            f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; give positive ones"
         )
     pose = np.asarray(pose, float)
     if not np.isfinite(pose).all():
@@ -116,17 +122,28 @@ class Visibility:
             mine = seen[np.isin(kind, kinds)]
             if len(mine):
                 wp.launch(
-                    kernel, (len(mine), lanes),
+                    kernel,
+                    (len(mine), lanes),
                     inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, lanes],
-                    outputs=[self.keys], device=self.device,
-                )  # fmt: skip
+                    outputs=[self.keys],
+                    device=self.device,
+                )
         wp.launch(
-            visibility.resolve, self.width * self.height,
+            visibility.resolve,
+            self.width * self.height,
             inputs=[
-                primitives.labels, self.keys, lens, label(Organ.GROUND, 0), float(nearest), float(farthest), -float("inf"), float("inf"),
+                primitives.labels,
+                self.keys,
+                lens,
+                label(Organ.GROUND, 0),
+                float(nearest),
+                float(farthest),
+                -float("inf"),
+                float("inf"),
             ],
-            outputs=[self.primitive, self.depth, self.labels], device=self.device,
-        )  # fmt: skip
+            outputs=[self.primitive, self.depth, self.labels],
+            device=self.device,
+        )
 
 
 @dataclasses.dataclass
@@ -163,13 +180,29 @@ class Camera:
         near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
         run = self.info.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
-            shade.shade, self.info.width * self.info.height // run,
-            inputs=[primitives.shapes, primitives.looks, self._sunlight.light, near, far, lens, seen.primitive, seen.keys, run],
-            outputs=[self._rgb], device=self.device,
-        )  # fmt: skip
+            shade.shade,
+            self.info.width * self.info.height // run,
+            inputs=[
+                primitives.shapes,
+                primitives.looks,
+                self._sunlight.light,
+                near,
+                far,
+                lens,
+                seen.primitive,
+                seen.keys,
+                run,
+            ],
+            outputs=[self._rgb],
+            device=self.device,
+        )
         shape = (self.info.height, self.info.width)
         return CameraFrame(
-            time=float(time), name=self.name, info=self.info, pose=pose,
-            rgb=self._rgb.numpy().reshape(*shape, 3).copy(), depth=seen.depth.numpy().reshape(shape).copy(),
+            time=float(time),
+            name=self.name,
+            info=self.info,
+            pose=pose,
+            rgb=self._rgb.numpy().reshape(*shape, 3).copy(),
+            depth=seen.depth.numpy().reshape(shape).copy(),
             labels=seen.labels.numpy().reshape(shape).copy(),
-        )  # fmt: skip
+        )

@@ -49,7 +49,9 @@ class Mount:
 class Eyes:
     """All sensors of one client in one thread. Use as a context manager, or :meth:`start` and :meth:`stop`."""
 
-    def __init__(self, model: Model, mounts: list[Mount] | tuple[Mount, ...], *, primitives: Primitives | None = None) -> None:
+    def __init__(
+        self, model: Model, mounts: list[Mount] | tuple[Mount, ...], *, primitives: Primitives | None = None
+    ) -> None:
         names = [m.name for m in mounts]
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)

@@ -54,7 +54,9 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         organs = {o.name.lower() for o in Organ if o != Organ.NOTHING}
         if set(spec.reflectance) != organs:
             wrong = sorted(set(spec.reflectance) ^ organs)[0]
-            raise specs.SensorError(f"{name}: reflectance.{wrong} is missing or unknown; give one for each of {', '.join(sorted(organs))}")
+            raise specs.SensorError(
+                f"{name}: reflectance.{wrong} is missing or unknown; give one for each of {', '.join(sorted(organs))}"
+            )
         return spec
 
 
@@ -101,17 +103,35 @@ class Lidar:
             raise ValueError(f"lidar {self.name!r} has the pose {pose.tolist()}; give finite numbers")
         turn = frames.normalize(pose[3:])
         wp.launch(
-            rays.sweep, len(self.offset),
+            rays.sweep,
+            len(self.offset),
             inputs=[
-                primitives.shapes, primitives.labels, primitives.organs, self._reflectance, self._elevation, self._caster.hierarchies(),
-                wp.transform(*map(float, pose[:3]), *map(float, turn)), self._azimuth, label(Organ.GROUND, 0), int(Organ.GROUND),
-                self.spec.nearest.value, self.spec.farthest.value,
+                primitives.shapes,
+                primitives.labels,
+                primitives.organs,
+                self._reflectance,
+                self._elevation,
+                self._caster.hierarchies(),
+                wp.transform(*map(float, pose[:3]), *map(float, turn)),
+                self._azimuth,
+                label(Organ.GROUND, 0),
+                int(Organ.GROUND),
+                self.spec.nearest.value,
+                self.spec.farthest.value,
             ],
-            outputs=[self._xyz, self._intensity, self._label], device=self.device,
-        )  # fmt: skip
+            outputs=[self._xyz, self._intensity, self._label],
+            device=self.device,
+        )
         labels = self._label.numpy()
         back = labels >= 0
         return LidarScan(
-            time=float(time), name=self.name, frame_id=self.frame_id, pose=pose, xyz=self._xyz.numpy()[back],
-            intensity=self._intensity.numpy()[back], ring=self.ring[back], offset=self.offset[back], labels=labels[back],
-        )  # fmt: skip
+            time=float(time),
+            name=self.name,
+            frame_id=self.frame_id,
+            pose=pose,
+            xyz=self._xyz.numpy()[back],
+            intensity=self._intensity.numpy()[back],
+            ring=self.ring[back],
+            offset=self.offset[back],
+            labels=labels[back],
+        )

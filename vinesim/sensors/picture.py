@@ -44,11 +44,20 @@ def depth_millimetres(depth: np.ndarray) -> np.ndarray:
 
 
 _ORGAN_COLOUR = {
-    Organ.NOTHING: (0, 0, 0), Organ.GROUND: (110, 85, 60), Organ.POLE: (160, 160, 160), Organ.WIRE: (220, 220, 220),
-    Organ.TRUNK: (105, 60, 25), Organ.ARM: (150, 90, 40), Organ.CANE: (205, 140, 70), Organ.LEAF: (60, 150, 50),
-    Organ.PEDUNCLE: (255, 255, 0), Organ.BUNCH: (190, 30, 140), Organ.BOX: (40, 90, 230), Organ.ROBOT: (235, 235, 235),
+    Organ.NOTHING: (0, 0, 0),
+    Organ.GROUND: (110, 85, 60),
+    Organ.POLE: (160, 160, 160),
+    Organ.WIRE: (220, 220, 220),
+    Organ.TRUNK: (105, 60, 25),
+    Organ.ARM: (150, 90, 40),
+    Organ.CANE: (205, 140, 70),
+    Organ.LEAF: (60, 150, 50),
+    Organ.PEDUNCLE: (255, 255, 0),
+    Organ.BUNCH: (190, 30, 140),
+    Organ.BOX: (40, 90, 230),
+    Organ.ROBOT: (235, 235, 235),
     Organ.HUMAN: (250, 120, 40),
-}  # fmt: skip
+}
 
 
 def label_colours(labels: np.ndarray) -> np.ndarray:
@@ -86,9 +95,11 @@ def save(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "frame") ->
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     images = {
-        "rgb": frame.rgb, "depth": depth_colours(frame.depth), "depth_mm": depth_millimetres(frame.depth),
+        "rgb": frame.rgb,
+        "depth": depth_colours(frame.depth),
+        "depth_mm": depth_millimetres(frame.depth),
         "labels": label_colours(frame.labels),
-    }  # fmt: skip
+    }
     prefix = f"{stem}_" if stem else ""
     return [write_png(folder / f"{prefix}{name}.png", image) for name, image in images.items()]
 

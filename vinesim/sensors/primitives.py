@@ -26,10 +26,17 @@ from vinesim.world.values import Link, Shape, View
 log = logging.getLogger(__name__)
 
 CONE, SPHEROID, LEAF, BOX, ELLIPSOID, CYLINDER, TRIANGLE = (
-    int(k) for k in (
-        shapes.CONE, shapes.SPHEROID, shapes.LEAF, shapes.BOX, shapes.ELLIPSOID, shapes.CYLINDER, shapes.TRIANGLE,
+    int(k)
+    for k in (
+        shapes.CONE,
+        shapes.SPHEROID,
+        shapes.LEAF,
+        shapes.BOX,
+        shapes.ELLIPSOID,
+        shapes.CYLINDER,
+        shapes.TRIANGLE,
     )
-)  # fmt: skip
+)
 KINDS = {
     "cone": CONE,
     "spheroid": SPHEROID,
@@ -119,10 +126,17 @@ def _canes(model: Model, still: int) -> _Batch:
     length = model.body_length[bodies]
     zero = np.zeros(len(bodies))
     return _batch(
-        CONE, _columns(zero, zero, zero, model.body_radius[bodies, 0]), b=_columns(length, zero, zero, model.body_radius[bodies, 1]),
-        c=_columns(zero, seed[tree] * 7.0, zero, zero), material=material, tint=tint, organ=organ,
-        label=organ * label(Organ(1), 0) + index, carrier=bodies, group=tree,
-    )  # fmt: skip
+        CONE,
+        _columns(zero, zero, zero, model.body_radius[bodies, 0]),
+        b=_columns(length, zero, zero, model.body_radius[bodies, 1]),
+        c=_columns(zero, seed[tree] * 7.0, zero, zero),
+        material=material,
+        tint=tint,
+        organ=organ,
+        label=organ * label(Organ(1), 0) + index,
+        carrier=bodies,
+        group=tree,
+    )
 
 
 def _bunch_of_peduncle(model: Model) -> np.ndarray:
@@ -155,22 +169,45 @@ def _foliage(model: Model) -> list[_Batch]:
     body, tree = model.leaf_body, model.body_tree[model.leaf_body]
     names = label(Organ.LEAF, 0) + tree
     blade = _batch(
-        LEAF, _columns(petiole_end, size), b=_columns(rib, shape), c=_columns(up, rng.uniform(size=count)), d=_columns(bend, model.leaf_age),
-        material=int(shade.FOLIAGE), tint=tint, organ=int(Organ.LEAF), label=names, carrier=body, group=tree,
-    )  # fmt: skip
+        LEAF,
+        _columns(petiole_end, size),
+        b=_columns(rib, shape),
+        c=_columns(up, rng.uniform(size=count)),
+        d=_columns(bend, model.leaf_age),
+        material=int(shade.FOLIAGE),
+        tint=tint,
+        organ=int(Organ.LEAF),
+        label=names,
+        carrier=body,
+        group=tree,
+    )
     petiole = _batch(
-        CONE, _columns(base, 0.0017), b=_columns(petiole_end, 0.0012), material=int(shade.STEM), tint=(0.21, 0.13, 0.06),
-        organ=int(Organ.LEAF), label=names, carrier=body, group=tree,
-    )  # fmt: skip
+        CONE,
+        _columns(base, 0.0017),
+        b=_columns(petiole_end, 0.0012),
+        material=int(shade.STEM),
+        tint=(0.21, 0.13, 0.06),
+        organ=int(Organ.LEAF),
+        label=names,
+        carrier=body,
+        group=tree,
+    )
     # a node is 1.45 times as thick as the cane between nodes
     along = np.clip(base[:, 0] / np.maximum(model.body_length[body], 1e-6), 0.0, 1.0)
     r = model.body_radius[body, 0] * (1.0 - along) + model.body_radius[body, 1] * along
     reach = np.array([1.0, 0.0, 0.0]) * r[:, None]
     axis = base * np.array([1.0, 0.0, 0.0])
     node = _batch(
-        CONE, _columns(axis - 0.7 * reach, 1.25 * r), b=_columns(axis + 0.4 * reach, 1.45 * r), material=int(shade.CANE),
-        tint=(0.24, 0.15, 0.07), organ=int(Organ.CANE), label=label(Organ.CANE, 0) + tree, carrier=body, group=tree,
-    )  # fmt: skip
+        CONE,
+        _columns(axis - 0.7 * reach, 1.25 * r),
+        b=_columns(axis + 0.4 * reach, 1.45 * r),
+        material=int(shade.CANE),
+        tint=(0.24, 0.15, 0.07),
+        organ=int(Organ.CANE),
+        label=label(Organ.CANE, 0) + tree,
+        carrier=body,
+        group=tree,
+    )
     return [blade, petiole, node]
 
 
@@ -179,9 +216,12 @@ def _bunch(model: Model, bunch: int, carrier: int, group: int) -> list[_Batch]:
     number = int(model.bunch_variety[bunch])
     variety = VARIETIES[number]
     one = berries(
-        float(model.bunch_length[bunch]), float(model.bunch_radius[bunch]), int(model.bunch_berries[bunch]), number,
+        float(model.bunch_length[bunch]),
+        float(model.bunch_radius[bunch]),
+        int(model.bunch_berries[bunch]),
+        number,
         int(model.bunch_seed[bunch]),
-    )  # fmt: skip
+    )
     rng = np.random.default_rng(int(model.bunch_seed[bunch]))
     n = len(one.radius)
     colour = np.array(variety.colour) * (1.0 + 0.10 * rng.normal(size=(n, 1)))
@@ -193,9 +233,15 @@ def _bunch(model: Model, bunch: int, carrier: int, group: int) -> list[_Batch]:
     name = label(Organ.BUNCH, bunch)
     common = {"organ": int(Organ.BUNCH), "label": name, "carrier": carrier, "group": group, "bunch": bunch}
     fruit = _batch(
-        SPHEROID, _columns(one.position, one.radius), b=_columns(one.axis, variety.elongation), c=_columns(rng.uniform(size=n), depth, 0.0, 0.0),
-        d=_crowding(one.position, one.radius, one.neighbours), material=int(shade.BERRY), tint=colour, **common,
-    )  # fmt: skip
+        SPHEROID,
+        _columns(one.position, one.radius),
+        b=_columns(one.axis, variety.elongation),
+        c=_columns(rng.uniform(size=n), depth, 0.0, 0.0),
+        d=_crowding(one.position, one.radius, one.neighbours),
+        material=int(shade.BERRY),
+        tint=colour,
+        **common,
+    )
     start, end = one.rachis[:, :-1].reshape(-1, 3), one.rachis[:, 1:].reshape(-1, 3)
     steps = one.rachis.shape[1] - 1
     taper = np.tile(np.linspace(0.0028, 0.0013, steps), len(one.rachis))
@@ -256,11 +302,23 @@ def _fixed(model: Model, still: int) -> _Batch | None:
     rng = np.random.default_rng(3)
     seed = rng.uniform(size=int(index.max()) + 1)[index] * 7.0
     # bark runs through from piece to piece: distances count from the foot of a post, along a wire
-    along = np.where(np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1), start[:, 2], length[whole] * ends[0][:, 0])
+    along = np.where(
+        np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1),
+        start[:, 2],
+        length[whole] * ends[0][:, 0],
+    )
     return _batch(
-        CONE, _columns(start, thick), b=_columns(end, thin), c=_columns(along, seed, 0.0, 0.0), material=material, tint=tint, organ=organ,
-        label=organ * label(Organ(1), 0) + index, carrier=still, group=_cell_of((start + end) * 0.5, 0),
-    )  # fmt: skip
+        CONE,
+        _columns(start, thick),
+        b=_columns(end, thin),
+        c=_columns(along, seed, 0.0, 0.0),
+        material=material,
+        tint=tint,
+        organ=organ,
+        label=organ * label(Organ(1), 0) + index,
+        carrier=still,
+        group=_cell_of((start + end) * 0.5, 0),
+    )
 
 
 def _meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> _Batch | None:
@@ -271,11 +329,12 @@ def _meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> _B
         return None
     rng = np.random.default_rng(23)
     spot = low + (high - low) * rng.uniform(size=(count, 2))
-    green = textures._sample(spot[:, 0] * 0.21, spot[:, 1] * 0.21)[:, 0]
-    spot = spot[green * 0.8 + 0.1 > 0.42 + 0.16 * rng.uniform(size=count)]
+    noise = textures.sample(spot[:, 0] * 0.21, spot[:, 1] * 0.21)
+    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125  # as the ground is coloured
+    spot = spot[green > 0.44 + 0.20 * rng.uniform(size=count)]
     n = len(spot)
     herb = rng.uniform(size=n) < 0.12
-    size = np.where(herb, rng.uniform(0.03, 0.06, n), rng.uniform(0.07, 0.19, n))
+    size = np.where(herb, rng.uniform(0.03, 0.06, n), 0.05 + 0.13 * rng.uniform(size=n) ** 1.5)
     yaw = rng.uniform(0.0, 2.0 * np.pi, n)
     lean = np.where(herb, rng.uniform(0.5, 1.1, n), rng.normal(0.0, 0.2, n))
     out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
@@ -286,17 +345,33 @@ def _meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> _B
     tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
     bend = _columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
     return _batch(
-        LEAF, _columns(root, size), b=_columns(rib, np.where(herb, textures.HERB, textures.GRASS)), c=_columns(up, rng.uniform(size=n)), d=bend,
-        material=int(shade.GRASS), tint=tint, organ=int(Organ.GROUND), label=label(Organ.GROUND, 0), carrier=still, group=_cell_of(spot, 0),
-    )  # fmt: skip
+        LEAF,
+        _columns(root, size),
+        b=_columns(rib, np.where(herb, textures.HERB, textures.GRASS)),
+        c=_columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(shade.GRASS),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=still,
+        group=_cell_of(spot, 0),
+    )
 
 
 def _nothing(still: int) -> _Batch:
     """A stand-in for a world without plants, far below the ground: no array is ever empty."""
     return _batch(
-        CONE, [[0.0, 0.0, float(shapes.HIDDEN), 1e-6]], b=[[1e-3, 0.0, float(shapes.HIDDEN), 1e-6]], material=0, tint=0.0,
-        organ=0, label=0, carrier=still, group=0,
-    )  # fmt: skip
+        CONE,
+        [[0.0, 0.0, float(shapes.HIDDEN), 1e-6]],
+        b=[[1e-3, 0.0, float(shapes.HIDDEN), 1e-6]],
+        material=0,
+        tint=0.0,
+        organ=0,
+        label=0,
+        carrier=still,
+        group=0,
+    )
 
 
 # ---- robots, boxes, people -------------------------------------------------------------------------------------------
@@ -313,9 +388,13 @@ def _rigid(model: Model, links: tuple[Link, ...], first: int, groups: int) -> li
         name = label(link.organ, link.index)
         for shape in link.shapes:
             common = {
-                "material": material, "tint": np.asarray(shape.rgba[:3]) ** 2.2, "organ": int(link.organ), "label": name,
-                "carrier": first + k, "group": groups + k,
-            }  # fmt: skip
+                "material": material,
+                "tint": np.asarray(shape.rgba[:3]) ** 2.2,
+                "organ": int(link.organ),
+                "label": name,
+                "carrier": first + k,
+                "group": groups + k,
+            }
             batches.append(_rigid_shape(shape, common))
     return batches
 
@@ -379,7 +458,7 @@ def _triangles(file: str, scale: tuple[float, ...]) -> np.ndarray:
 class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.shapes`)."""
 
-    def __init__(self, model: Model, *, grass: float = 5.0, device: str = "cpu") -> None:
+    def __init__(self, model: Model, *, grass: float = 14.0, device: str = "cpu") -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground."""
         self.model, self.device = model, device
         bodies = len(model.body_mass)
@@ -454,6 +533,8 @@ class Primitives:
                 pile.append(getattr(batch, name)[order])
             total += len(batch)
         whole = {name: np.concatenate(pile) for name, pile in pieces.items()}
+        if self.built:
+            whole["c"][: len(self._baked_c)] = self._baked_c
         self.label, self.organ = whole["label"].astype(np.int32), whole["organ"].astype(np.int32)
         self.cluster_first, self.cluster_size, self.cluster_kind, self._owner, self._cluster_bunch = (
             np.concatenate(x).astype(np.int32) for x in (firsts, sizes, kinds, owners, bunches)
@@ -541,6 +622,12 @@ class Primitives:
             )
             return out.numpy()
 
+        # light runs on from one piece of wood to the next: cones know the sky at their far end too
+        wood = np.flatnonzero(self.shapes.kind.numpy() == CONE)
+        wood_c = self._local.c.numpy()
+        wood_c[wood, 2:] = np.stack([seen(self.shapes.b.numpy()[wood, :3]), np.ones(len(wood))], 1)
+        self._local.c.assign(wood_c)
+        self._baked_c = wood_c.copy()
         self._sky = seen(posed[:, :3]) if len(posed) else np.zeros(0, np.float32)
         self.looks.sky = wp.array(self._sky, dtype=float, device=self.device)
         step = max(0.2, float((high - low).max()) / 500.0)
@@ -602,10 +689,18 @@ class Primitives:
     def _pose(self, dirty: np.ndarray) -> None:
         self._pose_array.assign(self._poses)
         wp.launch(
-            shapes.pose_clusters, len(dirty),
-            inputs=[self._local, self.clusters, self._carrier, wp.array(dirty.astype(np.int32), device=self.device), self._pose_array],
-            outputs=[self.shapes.a, self.shapes.b, self.shapes.c, self.shapes.d, self.lower, self.upper, self.ball], device=self.device,
-        )  # fmt: skip
+            shapes.pose_clusters,
+            len(dirty),
+            inputs=[
+                self._local,
+                self.clusters,
+                self._carrier,
+                wp.array(dirty.astype(np.int32), device=self.device),
+                self._pose_array,
+            ],
+            outputs=[self.shapes.a, self.shapes.b, self.shapes.c, self.shapes.d, self.lower, self.upper, self.ball],
+            device=self.device,
+        )
         self.version += 1
         self.cluster_version[dirty] = self.version
 
@@ -613,6 +708,11 @@ class Primitives:
 def still_view(model: Model, links: tuple[Link, ...] = (), link_q: np.ndarray | None = None) -> View:
     """A view of the vineyard at rest, for pictures and tests without physics."""
     return View(
-        time=0.0, tick=0, body_q=State.at_rest(model).body_q, bunch_attached=np.ones(len(model.bunch_body), bool), links=links,
-        link_q=np.zeros((0, 7)) if link_q is None else np.asarray(link_q, float), moved=np.zeros(0, np.int64),
-    )  # fmt: skip
+        time=0.0,
+        tick=0,
+        body_q=State.at_rest(model).body_q,
+        bunch_attached=np.ones(len(model.bunch_body), bool),
+        links=links,
+        link_q=np.zeros((0, 7)) if link_q is None else np.asarray(link_q, float),
+        moved=np.zeros(0, np.int64),
+    )

@@ -43,7 +43,7 @@ class RayCaster:
         self._built, self._version = p.built, p.version
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, reach: float = REACH) -> tuple[np.ndarray, np.ndarray]:
-        """Distances [ray] (in lengths of ``direction``; inf where nothing is met) and primitives (-2 ground, -1 none)."""
+        """Distances [ray], in lengths of ``direction`` (inf: nothing is met), and primitives (-2 ground, -1 none)."""
         p = self.primitives
         direction = np.ascontiguousarray(direction, np.float32).reshape(-1, 3)
         origin = np.ascontiguousarray(np.broadcast_to(np.asarray(origin, np.float32), direction.shape))
@@ -51,8 +51,11 @@ class RayCaster:
         distance = wp.empty(len(direction), dtype=float, device=p.device)
         primitive = wp.empty(len(direction), dtype=wp.int32, device=p.device)
         wp.launch(
-            rays.cast, len(direction), inputs=[p.shapes, self.hierarchies(), start, ray, float(reach)], outputs=[distance, primitive],
+            rays.cast,
+            len(direction),
+            inputs=[p.shapes, self.hierarchies(), start, ray, float(reach)],
+            outputs=[distance, primitive],
             device=p.device,
-        )  # fmt: skip
+        )
         found = primitive.numpy()
         return np.where(found == -1, np.inf, distance.numpy()), found

@@ -75,12 +75,20 @@ class _Map:
         if len(which):
             lanes = _LANES.get(self.device, 32)
             wp.launch(
-                shade.cast_shadows, (len(which), lanes),
+                shade.cast_shadows,
+                (len(which), lanes),
                 inputs=[
-                    primitives.shapes, primitives.clusters, primitives.ball, wp.array(which, device=self.device), self.struct, 0.25, lanes,
+                    primitives.shapes,
+                    primitives.clusters,
+                    primitives.ball,
+                    wp.array(which, device=self.device),
+                    self.struct,
+                    0.25,
+                    lanes,
                 ],
-                outputs=[self.struct.depth], device=self.device,
-            )  # fmt: skip
+                outputs=[self.struct.depth],
+                device=self.device,
+            )
 
 
 class Sunlight:
@@ -89,7 +97,7 @@ class Sunlight:
     def __init__(
         self, sun: tuple[float, float, float] = DEFAULT_SUN, *, taps: int = 4, period: float = 0.2, device: str = "cpu"
     ) -> None:
-        """``sun`` points towards the sun; ``taps`` shadow samples a pixel; moved shadows are redrawn once a ``period`` [s]."""
+        """``sun`` points towards the sun; ``taps`` are shadow samples a pixel; ``period`` [s] as in :class:`Camera`."""
         direction = np.asarray(sun, float) / np.linalg.norm(sun)
         self.period = period
         day = float(np.clip(direction[2] / 0.15, 0.0, 1.0))
@@ -99,7 +107,7 @@ class Sunlight:
         light.sun_colour = wp.vec3(3.3 * day, 2.95 * day, 2.35 * day)
         light.sky_colour = wp.vec3(0.52 * dim, 0.70 * dim, 1.0 * dim)
         light.bounce = wp.vec3(0.26 * dim, 0.21 * dim, 0.13 * dim)
-        light.haze = wp.vec3(0.56 * dim, 0.66 * dim, 0.78 * dim)
+        light.haze = wp.vec3(0.50 * dim, 0.60 * dim, 0.72 * dim)
         light.exposure, light.taps = 0.75, taps
         light.table = wp.array(textures.sky(tuple(direction)) * np.float32(dim), dtype=wp.vec3, device=device)
         k = np.arange(max(taps, 1))

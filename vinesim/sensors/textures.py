@@ -55,7 +55,7 @@ def _tuft() -> np.ndarray:
         x = root + lean * along**2
         y = -0.75 + height * along * (1.0 - 0.15 * abs(lean) * along)
         blade = np.concatenate([np.stack([x - half, y], 1), np.stack([x + half, y], 1)[::-1]])
-        cv2.fillPoly(mask, [np.round((blade + [1.0, 0.75]) * 0.5 * side).astype(np.int32)], 1)
+        cv2.fillPoly(mask, [np.round((blade + np.array([1.0, 0.75])) * 0.5 * side).astype(np.int32)], 1)
     return mask
 
 
@@ -159,7 +159,8 @@ def soil() -> np.ndarray:
         start = np.array([x, y]) * SIDE
         step = (6.0 + 14.0 * length) * np.array([np.cos(np.pi * turn), np.sin(np.pi * turn)])
         cv2.line(straw, *(tuple(map(int, p)) for p in (start, start + step)), 1.0, 1, cv2.LINE_AA)
-    slope_y, slope_x = np.gradient(0.5 * clods + 0.35 * sod)
+    height = 0.5 * clods + 0.35 * sod
+    slope_y, slope_x = (0.5 * (np.roll(height, -1, axis) - np.roll(height, 1, axis)) for axis in (0, 1))
     tone = np.clip(0.45 + 0.17 * clods + 0.5 * straw, 0.0, 1.0)
     green = np.clip(0.5 + 0.22 * sod + 0.3 * straw, 0.0, 1.0)
     return np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)
@@ -178,29 +179,29 @@ def sky(sun: tuple[float, float, float]) -> np.ndarray:
     azimuth = np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
     flat = np.sqrt(1.0 - height**2)
     x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
-    horizon = np.exp(-4.5 * height)[..., None]
-    colour = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.66, 0.79, 0.96])
+    horizon = np.exp(-5.5 * height)[..., None]
+    colour = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
-    halo = 0.10 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
+    halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
     colour = colour + halo[..., None] * np.array([3.3, 2.95, 2.35])
     far = 0.22 / (height + 0.12)
-    cover = _sample(x * far * 0.5, y * far * 0.5)
-    cloud = _step(0.52, 0.82, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * _step(0.02, 0.2, height) * 0.6
+    cover = sample(x * far * 0.5, y * far * 0.5)
+    cloud = _step(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * _step(0.02, 0.2, height) * 0.55
     colour = _mix(colour, np.array([1.35, 1.33, 1.30]), cloud)
     turns = azimuth / (2.0 * np.pi)
     for tone, base, rise, count in (
-        (np.array([0.47, 0.58, 0.70]), 0.045, 0.085, 2.0),
-        (np.array([0.34, 0.44, 0.46]), 0.020, 0.050, 3.0),
+        (np.array([0.36, 0.47, 0.62]), 0.045, 0.085, 2.0),
+        (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
     ):
-        ridge = base + rise * (_sample(turns * count, np.full_like(turns, 0.13 * count))[..., 0] - 0.35)
+        ridge = base + rise * (sample(turns * count, np.full_like(turns, 0.13 * count))[..., 0] - 0.35)
         colour = _mix(colour, tone, _step(0.004, -0.004, height - ridge))
-    crowns = 0.014 + 0.020 * _sample(turns * 16.0, np.full_like(turns, 0.71))[..., 1]
-    leafy = _sample(turns * 20.0, height * 8.0)[..., 2][..., None]
-    trees = np.array([0.16, 0.22, 0.13]) + (leafy - 0.5) * np.array([0.12, 0.16, 0.06])
+    crowns = 0.014 + 0.020 * sample(turns * 16.0, np.full_like(turns, 0.71))[..., 1]
+    leafy = sample(turns * 20.0, height * 8.0)[..., 2][..., None]
+    trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
     return _mix(colour, trees, _step(0.004, -0.004, height - crowns)).astype(np.float32)
 
 
-def _sample(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def sample(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Noise at positions of period 1, bilinear [..., 4]."""
     table, fx, fy = noise(), (x % 1.0) * SIDE, (y % 1.0) * SIDE
     i, j = fx.astype(int) % SIDE, fy.astype(int) % SIDE

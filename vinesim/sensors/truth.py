@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 
@@ -30,16 +31,18 @@ def bunches(frame: CameraFrame) -> tuple[Sighting, ...]:
     index = frame.labels[rows, columns] % LABEL_STRIDE
     order = np.argsort(index, kind="stable")
     index, rows, columns = index[order], rows[order], columns[order]
-    starts = np.flatnonzero(np.r_[True, index[1:] != index[:-1]]) if len(index) else np.zeros(0, int)
+    edges = np.flatnonzero(np.diff(index, prepend=-1, append=-1))
     sightings = []
-    for first, last in zip(starts, np.r_[starts[1:], len(index)], strict=True):
+    for first, last in itertools.pairwise(edges):
         r, c = rows[first:last], columns[first:last]
         depth = frame.depth[r, c]
         depth = depth[np.isfinite(depth)]
         sightings.append(
             Sighting(
-                int(index[first]), int(last - first), (int(c.min()), int(r.min()), int(c.max()), int(r.max())),
+                int(index[first]),
+                int(last - first),
+                (int(c.min()), int(r.min()), int(c.max()), int(r.max())),
                 float(np.median(depth)) if len(depth) else float("nan"),
-            )  # fmt: skip
+            )
         )
     return tuple(sightings)

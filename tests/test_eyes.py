@@ -1,0 +1,149 @@
+"""The sensing thread: newest view wins, nobody's sensor costs nothing, failures surface."""
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+import seeing
+
+from vinesim.sensors.camera import Camera
+from vinesim.sensors.eyes import Eyes, Mount
+from vinesim.sensors.lidar import Lidar, LidarSpec
+from vinesim.sensors.primitives import still_view
+from vinesim.world.ids import Organ, label
+
+TINY = seeing.IDEAL.info("optical", 0.1)
+
+
+class Inbox:
+    """Collects frames; ``wait`` until some number has come."""
+
+    def __init__(self) -> None:
+        self.frames = []
+        self._news = threading.Condition()
+
+    def __call__(self, frame) -> None:
+        with self._news:
+            self.frames.append(frame)
+            self._news.notify_all()
+
+    def wait(self, count: int) -> None:
+        with self._news:
+            assert self._news.wait_for(lambda: len(self.frames) >= count, 20.0), (
+                f"{len(self.frames)} of {count} frames came"
+            )
+
+
+@pytest.fixture
+def view():
+    return still_view(seeing.empty())
+
+
+def _camera(name: str = "head") -> Camera:
+    return Camera(seeing.IDEAL, TINY, name)
+
+
+def test_frames_come_at_the_sensors_rate_of_simulation_time(view) -> None:
+    inbox = Inbox()
+    with Eyes(seeing.empty(), [Mount(_camera(), inbox, rate=10.0)]) as eyes:
+        for i, time in enumerate((0.0, 0.1, 0.2, 0.3)):
+            for inside in (0.0, 0.03, 0.06):  # only the first of each tenth is due
+                eyes.see(dataclasses.replace(view, time=time + inside), {"head": seeing.AHEAD})
+                if inside == 0.0:
+                    inbox.wait(i + 1)
+        eyes.see(dataclasses.replace(view, time=0.4), {"head": seeing.AHEAD})
+        inbox.wait(5)
+    assert [round(f.time, 3) for f in inbox.frames] == [0.0, 0.1, 0.2, 0.3, 0.4]
+    assert eyes.frames == {"head": 5}
+    assert eyes.dropped == {"head": 0}
+
+
+def test_the_newest_view_wins_and_the_rest_is_counted(view) -> None:
+    gate, inbox = threading.Event(), Inbox()
+
+    def slow(frame) -> None:
+        inbox(frame)
+        assert gate.wait(20.0)
+
+    with Eyes(seeing.empty(), [Mount(_camera(), slow, rate=10.0)]) as eyes:
+        eyes.see(dataclasses.replace(view, time=0.0), {"head": seeing.AHEAD})
+        inbox.wait(1)
+        for k in range(1, 8):
+            eyes.see(dataclasses.replace(view, time=0.1 * k), {"head": seeing.AHEAD})
+        gate.set()
+        inbox.wait(2)
+    assert [round(f.time, 3) for f in inbox.frames] == [0.0, 0.7]
+    assert eyes.dropped == {"head": 6}
+
+
+def test_nothing_is_rendered_that_nobody_wants(view) -> None:
+    wanted, unwanted, listening = Inbox(), Inbox(), threading.Event()
+    lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
+    mounts = [Mount(_camera(), unwanted, wanted=listening.is_set, rate=10.0), Mount(lidar, wanted, rate=10.0)]
+    poses = {"head": seeing.AHEAD, "lidar": np.array([0, 0, 1.0, 0, 0, 0, 1])}
+    with Eyes(seeing.empty(), mounts) as eyes:
+        for k in range(3):
+            eyes.see(dataclasses.replace(view, time=0.1 * k), poses)
+            wanted.wait(k + 1)
+        assert unwanted.frames == []
+        listening.set()
+        eyes.see(dataclasses.replace(view, time=0.3), poses)
+        unwanted.wait(1)
+    assert eyes.frames == {"head": 1, "lidar": 4}
+    assert eyes.dropped == {"head": 0, "lidar": 0}
+
+
+def test_trees_that_moved_in_skipped_views_are_taken_over() -> None:
+    model = seeing.demo()
+    view, inbox, bunch = still_view(model), Inbox(), 10
+    tree = int(model.body_tree[model.bunch_body[bunch]])
+    with Eyes(model, [Mount(_camera(), inbox, rate=1.0)]) as eyes:
+        eyes.see(view, {"head": seeing.AHEAD})
+        inbox.wait(1)
+        body_q = view.body_q.copy()
+        body_q[model.bodies_of(tree), 2] += 0.3
+        # moves and sleeps again between two frames
+        eyes.see(dataclasses.replace(view, time=0.4, body_q=body_q, moved=np.array([tree])), {"head": seeing.AHEAD})
+        eyes.see(dataclasses.replace(view, time=1.0, body_q=body_q), {"head": seeing.AHEAD})
+        inbox.wait(2)
+        berries = eyes.primitives.label == label(Organ.BUNCH, bunch)
+        height = eyes.primitives.shapes.a.numpy()[berries, 2].mean()
+    rest = still_view(model).body_q[model.bunch_body[bunch], 2]
+    assert height > rest + 0.1
+
+
+def test_a_failure_surfaces(view, caplog) -> None:
+    def broken(frame) -> None:
+        raise OSError("the disk is full")
+
+    eyes = Eyes(seeing.empty(), [Mount(_camera(), broken)]).start()
+    thread = eyes._thread
+    eyes.see(view, {"head": seeing.AHEAD})
+    thread.join(20.0)
+    with pytest.raises(RuntimeError, match="the disk is full"):
+        eyes.see(view, {"head": seeing.AHEAD})
+    eyes.stop()  # raised once
+    assert "the sensing thread stops" in caplog.text
+
+
+def test_time_set_back_starts_anew(view) -> None:
+    inbox = Inbox()
+    with Eyes(seeing.empty(), [Mount(_camera(), inbox, rate=10.0)]) as eyes:
+        for k, time in enumerate((100.0, 0.0)):
+            eyes.see(dataclasses.replace(view, time=time), {"head": seeing.AHEAD})
+            inbox.wait(k + 1)
+    assert [f.time for f in inbox.frames] == [100.0, 0.0]
+
+
+def test_names_are_unique() -> None:
+    with pytest.raises(ValueError, match="two sensors are named 'head'"):
+        Eyes(seeing.empty(), [Mount(_camera(), print), Mount(_camera(), print)])
+
+
+def test_eyes_open_once_and_close_twice() -> None:
+    eyes = Eyes(seeing.empty(), []).start()
+    with pytest.raises(RuntimeError, match="open already"):
+        eyes.start()
+    eyes.stop()
+    eyes.stop()

@@ -1,0 +1,158 @@
+"""Primitives: complete, labelled, and moved only where the world moved."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import seeing
+import trimesh
+
+from vinesim import frames
+from vinesim.sensors.primitives import Primitives, still_view
+from vinesim.world.berries import berries
+from vinesim.world.ids import Organ, label
+
+
+@pytest.fixture(scope="module")
+def model():
+    return seeing.demo()
+
+
+@pytest.fixture
+def primitives(model):
+    return Primitives(model, grass=0.0)
+
+
+def _of(primitives: Primitives, organ: Organ, index: int) -> np.ndarray:
+    return np.flatnonzero(primitives.label == label(organ, index))
+
+
+def test_every_bunch_has_its_berries_where_its_body_is(model, primitives) -> None:
+    view = still_view(model)
+    for bunch in range(0, len(model.bunch_body), 7):
+        mine = _of(primitives, Organ.BUNCH, bunch)
+        round_ones = mine[primitives.shapes.kind.numpy()[mine] == 1]
+        assert len(round_ones) == model.bunch_berries[bunch]
+        expected = berries(
+            float(model.bunch_length[bunch]),
+            float(model.bunch_radius[bunch]),
+            int(model.bunch_berries[bunch]),
+            int(model.bunch_variety[bunch]),
+            int(model.bunch_seed[bunch]),
+        )
+        pose = view.body_q[model.bunch_body[bunch]].astype(float)
+        at = pose[:3] + frames.rotate(pose[3:], expected.position)
+        got = primitives.shapes.a.numpy()[round_ones]
+        assert np.abs(got[:, :3] - at).max() < 1e-5
+        assert np.abs(got[:, 3] - expected.radius).max() < 1e-6
+
+
+def test_every_leaf_cane_and_post_is_there(model, primitives) -> None:
+    organ, kind = primitives.organ, primitives.shapes.kind.numpy()
+    assert ((organ == int(Organ.LEAF)) & (kind == 2)).sum() == len(model.leaf_body)
+    assert (organ == int(Organ.CANE)).sum() >= (model.body_organ == int(Organ.CANE)).sum()
+    for o in (Organ.POLE, Organ.WIRE, Organ.TRUNK, Organ.ARM):
+        expected = {label(o, int(i)) for i in model.fixed_index[model.fixed_organ == int(o)]}
+        assert set(primitives.label[organ == int(o)]) == expected
+
+
+def test_peduncles_carry_the_number_of_their_bunch(model, primitives) -> None:
+    names = set(primitives.label[primitives.organ == int(Organ.PEDUNCLE)])
+    assert names == {label(Organ.PEDUNCLE, b) for b in range(len(model.bunch_body))}
+
+
+def test_posts_in_pieces_are_whole(model, primitives) -> None:
+    post = int(model.fixed_index[model.fixed_organ == int(Organ.POLE)][0])
+    mine = _of(primitives, Organ.POLE, post)
+    whole = (model.fixed_organ == int(Organ.POLE)) & (model.fixed_index == post)
+    a, b = primitives.shapes.a.numpy()[mine], primitives.shapes.b.numpy()[mine]
+    length = np.linalg.norm(b[:, :3] - a[:, :3], axis=1).sum()
+    assert length == pytest.approx(
+        np.linalg.norm(model.fixed_end[whole] - model.fixed_start[whole], axis=1).sum(), rel=1e-5
+    )
+
+
+def test_only_what_moved_is_moved(model, primitives) -> None:
+    view = still_view(model)
+    tree = int(model.body_tree[model.bunch_body[5]])
+    shifted = view.body_q.copy()
+    shifted[:, :3] += [0.0, 0.0, 0.25]  # every body, but only one tree says so
+    before = primitives.shapes.a.numpy().copy()
+    dirty = primitives.update(dataclasses.replace(view, body_q=shifted, moved=np.array([tree])))
+    moved = np.flatnonzero(np.abs(primitives.shapes.a.numpy() - before).max(1) > 1e-6)
+    carriers = primitives._carrier.numpy()[moved]
+    assert set(carriers) <= set(range(*model.bodies_of(tree).indices(len(model.body_mass))))
+    assert len(dirty) < 0.1 * len(primitives.cluster_first)
+    assert primitives.shapes.a.numpy()[moved, 2] == pytest.approx(before[moved, 2] + 0.25, abs=1e-5)
+    # the tree falls asleep a little further on: its last motion is still taken over
+    shifted[:, 2] += 0.01
+    primitives.update(dataclasses.replace(view, body_q=shifted, moved=np.zeros(0, np.int64)))
+    assert primitives.shapes.a.numpy()[moved, 2] == pytest.approx(before[moved, 2] + 0.26, abs=1e-5)
+    assert len(primitives.update(dataclasses.replace(view, body_q=shifted, moved=np.zeros(0, np.int64)))) == 0
+
+
+def test_bounds_hold_what_they_bound(model, primitives) -> None:
+    ball = primitives.ball.numpy()
+    lower, upper = primitives.lower.numpy(), primitives.upper.numpy()
+    owner = np.repeat(np.arange(len(ball)), primitives.cluster_size)
+    corner = np.maximum(np.abs(lower - ball[owner, :3]), np.abs(upper - ball[owner, :3]))
+    assert (corner.max(1) <= ball[owner, 3] + 1e-5).all()
+    assert (lower <= upper).all()
+
+
+def test_a_picked_bunch_leaves_the_vine_and_rides_on_its_link(model, primitives) -> None:
+    view = still_view(model)
+    bunch = 3
+    attached = view.bunch_attached.copy()
+    attached[bunch] = False
+    primitives.update(dataclasses.replace(view, bunch_attached=attached))
+    mine = _of(primitives, Organ.BUNCH, bunch)
+    assert (primitives.upper.numpy()[mine, 2] < -1e5).all()
+    link = seeing.thing(name="bunch/3", organ=Organ.BUNCH, index=bunch)
+    pose = np.array([[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]])
+    primitives.update(dataclasses.replace(view, bunch_attached=attached, links=(link,), link_q=pose))
+    there = _of(primitives, Organ.BUNCH, bunch)
+    shown = there[primitives.upper.numpy()[there, 2] > 0]
+    assert (primitives.shapes.kind.numpy()[shown] == 1).sum() == model.bunch_berries[bunch]
+    assert np.abs(primitives.shapes.a.numpy()[shown, :3] - pose[0, :3]).max() < 0.4
+    primitives.update(dataclasses.replace(view, links=()))
+    assert (primitives.upper.numpy()[_of(primitives, Organ.BUNCH, bunch), 2] > 0).all()
+
+
+def test_links_come_move_and_go(model, primitives) -> None:
+    view, plants = still_view(model), primitives.count
+    link = seeing.thing(seeing.shape("sphere", 0.1, at=(0.0, 0.0, 0.5)), index=2)
+    pose = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    links = (link,)
+    primitives.update(dataclasses.replace(view, links=links, link_q=pose))
+    assert primitives.count == plants + 1
+    assert primitives.label[-1] == label(Organ.ROBOT, 2)
+    pose = pose + 0.5 * np.eye(7)[0]
+    dirty = primitives.update(dataclasses.replace(view, links=links, link_q=pose))
+    assert len(dirty) == 1
+    assert primitives.shapes.a.numpy()[-1] == pytest.approx([1.5, 0.0, 0.5, 0.1])
+    primitives.update(view)
+    assert primitives.count == plants
+
+
+def test_meshes_are_simplified_and_keep_their_size(tmp_path) -> None:
+    file = tmp_path / "fine.stl"
+    trimesh.creation.icosphere(5, radius=0.3).export(file)
+    primitives, _ = seeing.world(seeing.thing(seeing.shape("mesh", 2.0, 2.0, 2.0, at=(0, 0, 1), file=str(file))))
+    assert 500 < primitives.counts()["triangle"] <= 4000
+    corners = primitives.shapes.a.numpy()[primitives.shapes.kind.numpy() == 6, :3]
+    assert np.linalg.norm(corners - [0, 0, 1], axis=1) == pytest.approx(0.6, abs=0.02)
+
+
+def test_wrong_shapes_are_named() -> None:
+    with pytest.raises(ValueError, match="shape kind 'blob'"):
+        seeing.world(seeing.thing(seeing.shape("blob", 1.0)))
+    with pytest.raises(ValueError, match=r"mesh file '/nowhere\.stl'"):
+        seeing.world(seeing.thing(seeing.shape("mesh", 1.0, file="/nowhere.stl")))
+
+
+def test_a_second_build_is_the_same_to_the_bit(model, primitives) -> None:
+    other = Primitives(model, grass=0.0)
+    for name in "abcd":
+        assert np.array_equal(getattr(primitives.shapes, name).numpy(), getattr(other.shapes, name).numpy())
+    assert np.array_equal(primitives.looks.sky.numpy(), other.looks.sky.numpy())
