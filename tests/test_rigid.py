@@ -406,3 +406,26 @@ def test_boxes_at_rest_sleep_until_something_pushes_them():
     assert moved == pytest.approx(0.5 * (30.0 - 0.8 * 2.0 * 9.81) / 2.0 * 0.2**2, rel=0.25)
     assert rigid.data.joint("box/0").qpos[0] == 0.0
     assert rigid.data.joint("box/0").qvel[0] == 0.0
+
+
+def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
+    rigid, alone = Rigid(yard()), Rigid(yard())
+    for world in (rigid, alone):
+        world.add_robot(arm())
+        world.add_robot(arm("bert", 1, y=3.0))
+        world.drive_base("bert", (0.3, 0.0, 0.0))
+    step(rigid, 20)
+    step(alone, 20)
+    where = rigid.base("anna")[0]
+    rigid.prep()
+    rigid.data.qvel[rigid._robots["anna"].v[1]] = np.nan
+    rigid.finish()
+    step(rigid, 30)
+    step(alone, 31)
+    assert rigid.faults == 1
+    assert "anna" in rigid.complaint
+    assert "bert" not in rigid.complaint
+    np.testing.assert_allclose(rigid.base("anna")[0], where, atol=1e-3)
+    np.testing.assert_allclose(rigid.read("anna")[0], HOME, atol=1e-2)
+    np.testing.assert_allclose(rigid.base("bert")[0], alone.base("bert")[0], atol=1e-6)
+    assert rigid.data.time == pytest.approx(alone.data.time)

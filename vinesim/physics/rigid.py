@@ -124,6 +124,9 @@ class Rigid:
         self._bunches: dict[int, Loose] = {}
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
+        self.faults = 0
+        """How many things were stopped because a number of theirs was not finite; ``complaint`` names the last."""
+        self.complaint = ""
         self.generation = 0
         """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
         self._compile()
@@ -321,6 +324,7 @@ class Rigid:
         """First half: positions, native contacts, and the velocity that the tick would end with without plants."""
         m, d = self.world, self.data
         self._servo()
+        self._sound[:] = d.qpos
         # still applied from the last tick: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
         d.qfrc_applied[:] = 0.0
@@ -365,6 +369,9 @@ class Rigid:
         if force is not None:
             np.add(force, 0.0, out=d.qfrc_applied)  # +0 for -0, which would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
+        if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
+            self._roll_back()
+            force = None
         self._contact[:] = 0.0 if force is None else force
         if d.ncon:
             native = np.where(d.efc_type >= _CONTACT, d.efc_force, 0.0)
@@ -394,6 +401,28 @@ class Rigid:
             mujoco.mj_kinematics(self.world, self.data)
             mujoco.mj_comPos(self.world, self.data)
             self._fresh = True
+
+    def _roll_back(self) -> None:
+        """Stop the kinematic trees with a number that is not finite where the tick began; the others go on."""
+        m, d = self.world, self.data
+        joint_tree = m.dof_treeid[m.jnt_dofadr]
+        width = np.where(m.jnt_type == mujoco.mjtJoint.mjJNT_FREE, 7, 1)
+        tree = np.repeat(joint_tree, width)  # of each entry of qpos
+        bad = np.zeros(m.ntree, bool)
+        bad[m.dof_treeid[~np.isfinite(d.qvel)]] = True
+        bad[tree[~np.isfinite(d.qpos)]] = True
+        sound = np.where(np.isfinite(self._sound), self._sound, m.qpos0)
+        d.qpos[bad[tree]] = sound[bad[tree]]
+        dofs = bad[m.dof_treeid]
+        for name in _OF_DOFS:
+            getattr(d, name)[dofs] = 0.0
+        for name, robot in self._robots.items():
+            if bad[m.dof_treeid[robot.base_v[0]]]:
+                self.place(name, self.base(name)[0], d.qpos[robot.q].copy())
+                robot.forward[:] = 0.0
+        stopped = [m.body(m.tree_bodyadr[tree]).name for tree in np.flatnonzero(bad)]
+        self.faults += len(stopped)
+        self.complaint = f"t = {d.time:.2f} s: {', '.join(stopped)} moved by a number that is not finite; stopped"
 
     def _servo(self) -> None:
         """Turn every robot's targets into MuJoCo's controls."""
@@ -449,6 +478,7 @@ class Rigid:
             _carry(self.world, self.data, self._contact, world, data, contact)
         self.world, self.data, self._contact = world, data, contact
         self._blocks: dict[bytes, _Block] = {}
+        self._sound = data.qpos.copy()
         self._fresh = False
         self.generation += 1
         for robot in self._robots.values():
@@ -574,6 +604,8 @@ def _scene(model: Model, dt: float) -> mujoco.MjSpec:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     spec.option.impratio = 10.0
+    # one bad number must not reset the whole world: finish() stops what it belongs to
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     # boxes and bunches that lie still cost nothing; robots, being driven, never sleep
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     friction = [FRICTION, 0.005, 0.0001]
