@@ -8,6 +8,7 @@ draws from its own stream, named by (seed, row, place): no vine knows how many o
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -32,10 +33,15 @@ SIDE_NODES = 6
 ARM_PIECES = 5
 TRUNK_PIECES = 7
 
+Draw = Callable[..., np.ndarray]
+"""Random numbers [shoot, ...] of the shape asked for, each shoot's from the stream of its vine."""
+
 _SIDE = slice(PIECES, PIECES + SIDE_PIECES)
 _SLOTS = PIECES + SIDE_PIECES + BUNCHES * (STALK_PIECES + 1)
 _CLEAR = 0.02
 """Least gap between a bunch and its neighbours, poles and trunks [m]."""
+_UPRIGHT = 0.6
+"""Most m g a^2 / EI of bunches at height a above the base of their shoot; a uniform column buckles at 2.47."""
 
 
 def _stalk(which: int) -> slice:
@@ -89,7 +95,8 @@ def _old_wood(scene: Scene, parts: vine.Vine) -> _Wood:
     head = layout.height - (0.06 if tendone else 0.03)
     up = np.linspace(0.0, 1.0, TRUNK_PIECES + 1)[:, None]
     beside = parts.trunk.beside_pole.value
-    trunk = foot[:, None] + up * [0.0, 0.0, head] + [0.0, beside, 0.0] * (1.0 - 0.45 * up)
+    side = np.array([0.0, beside, 0.0] if tendone else [beside, 0.0, 0.0])
+    trunk = foot[:, None] + up * [0.0, 0.0, head] + side * (1.0 - 0.45 * up)
     trunk += np.cumsum(wobble, 1) * [0.015, 0.015, 0.0] * np.sin(np.pi * np.minimum(up, 0.5))
 
     angle = 2.0 * np.pi * np.arange(arm_count) / arm_count
@@ -142,8 +149,8 @@ def _wires(scene: Scene, parts: vine.Vine) -> list[dict[str, np.ndarray]]:
     ys = np.unique([-over_y, *(np.arange(layout.rows) * layout.row_spacing), deep + over_y])
     radius = 0.5 * trellis.wire_diameter.value
     if scene.training == "tendone":
-        step_y = layout.row_spacing / round(layout.row_spacing / trellis.tendone_wire_spacing.value)
-        step_x = layout.vine_spacing / round(layout.vine_spacing / trellis.tendone_wire_spacing.value)
+        step_y = layout.row_spacing / max(round(layout.row_spacing / trellis.tendone_wire_spacing.value), 1)
+        step_x = layout.vine_spacing / max(round(layout.vine_spacing / trellis.tendone_wire_spacing.value), 1)
         at_y = np.arange(-over_y, deep + over_y + 1e-6, step_y)
         at_x = np.arange(-over_x, wide + over_x + 1e-6, step_x)
         along_x = np.stack(np.broadcast_arrays(xs[None], at_y[:, None], layout.height), -1)
@@ -197,8 +204,10 @@ class _Shoots:
     """[shoot, BUNCHES] mass, count, length, radius, seed, variety, pull, thick"""
     nodes: np.ndarray
     """[shoot] nodes of the main axis"""
-    luck: np.ndarray
-    """[shoot, NODES + SIDE_NODES, 12] standard normal numbers of the leaves"""
+    leaf_luck: np.ndarray
+    """[8, shoot, NODES + SIDE_NODES] standard normal numbers"""
+    leaf_chance: np.ndarray
+    """[4, shoot, NODES + SIDE_NODES] uniform numbers"""
 
 
 def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
@@ -229,37 +238,35 @@ def _draw_shoots(scene: Scene, parts: vine.Vine, wood: _Wood) -> _Shoots:
     side_sign = np.where(number % 2, 1.0, -1.0)
     if tendone:
         turn = np.arctan2(along[:, 1], along[:, 0]) + side_sign * (1.0 + 0.6 * uniform())
-        heading = np.stack([np.cos(turn), np.sin(turn), -0.35 + 0.15 * uniform()], -1)
+        heading = np.stack([np.cos(turn), np.sin(turn), -0.38 + 0.15 * uniform()], -1)
         ref = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
     else:
         lean = normal(2) * [0.12, 0.05]
         across = np.cross([0.0, 0.0, 1.0], along)
         heading = along * lean[:, :1] + across * lean[:, 1:] + [0.0, 0.0, 1.0]
         ref = along
-    points = _main_axis(
-        scene, start, heading, length, normal(PIECES, 3), wood.foot[np.repeat(np.arange(vines), per_vine)]
-    )
+    owner = np.repeat(np.arange(vines), per_vine)
+    points = _main_axis(scene, start, heading, length, normal(PIECES, 3), wood.foot[owner])
 
     side = uniform() < cane.lateral_share.value
     side_at = 6 + (5 * uniform()).astype(int)
-    side_points = _side_axis(
-        points,
-        side_at,
-        ref,
-        cane.lateral_length.at(uniform()),
-        np.where(uniform() < 0.5, 1, -1),
-        normal(SIDE_PIECES, 3),
-    )
+    side_long, hand = cane.lateral_length.at(uniform()), np.where(uniform() < 0.5, 1, -1)
+    side_points = _side_axis(points, side_at, ref, side_long, hand, normal(SIDE_PIECES, 3))
 
-    owner = np.repeat(np.arange(vines), per_vine)
     nodes = np.floor(cane.nodes.value[0] + (cane.nodes.value[1] - cane.nodes.value[0] + 1) * uniform()).astype(int)
     nodes = np.minimum(nodes, NODES)
-    fruit, at, stalk, hang, roll = _draw_fruit(scene, parts, points, length, nodes, wood.row[owner], uniform, normal)
-    chosen = _choose_bunches(scene, wood, owner, per_vine, stalk, fruit)
-    luck = normal(NODES + SIDE_NODES, 12)
+    fruit, at, stalk, hang, roll = _draw_fruit(scene, parts, points, nodes, wood.row[owner], uniform, normal)
+    rise = np.maximum(stalk[:, :, 0, 2] - points[:, :1, 2], 0.0)
+    stiffness = cane.woody_modulus.value * np.pi / 4.0 * base**4
+    burden = fruit["mass"] * -grow.GRAVITY[2] * rise**2 / stiffness[:, None]
+    chosen = _choose_bunches(scene, wood, per_vine, stalk, burden, fruit)
+    leaf_luck = np.moveaxis(normal(NODES + SIDE_NODES, 8), -1, 0)
+    leaf_chance = np.moveaxis(uniform(NODES + SIDE_NODES, 4), -1, 0)
     return _Shoots(
-        owner, ref, points, length, base, side, side_at, side_points, chosen, at, stalk, hang, roll, fruit, nodes, luck
-    )
+        vine=owner, ref=ref, points=points, length=length, base=base, side=side, side_at=side_at,
+        side_points=side_points, bunch=chosen, bunch_at=at, stalk=stalk, hang=hang, roll=roll, fruit=fruit,
+        nodes=nodes, leaf_luck=leaf_luck, leaf_chance=leaf_chance,
+    )  # fmt: skip
 
 
 def _main_axis(
@@ -276,11 +283,11 @@ def _main_axis(
         heading = heading + luck[:, i] * ([0.10, 0.10, 0.06] if tendone else [0.07, 0.05, 0.03])
         if tendone:
             # the bearing part droops below the net, the rest climbs over it
-            low = layout.height - 0.24 + 0.40 * min(2.0 * share, 1.0)
+            low = layout.height - 0.28 + 0.44 * min(2.0 * share, 1.0)
             heading[:, 2] += np.clip(2.2 * (low - at[:, 2]), -0.2, 0.28) * (0.5 + share)
             heading[:, 2] = np.clip(heading[:, 2], -0.42, 0.5)
         else:
-            heading[:, 1] += 0.9 * (foot[:, 1] - at[:, 1])
+            heading[:, 1] = 0.7 * heading[:, 1] + 0.9 * (foot[:, 1] - at[:, 1])
             heading[:, 2] += 0.12
         heading = frames.normalize(heading)
         points[:, i + 1] = at + heading * step
@@ -305,8 +312,10 @@ def _side_axis(
 # ---- fruit ---------------------------------------------------------------------------------------------------------
 
 
-def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # type: ignore[no-untyped-def]
-    """Two bunches for every shoot, of which :func:`_choose_bunches` keeps some."""
+def _draw_fruit(
+    scene: Scene, parts: vine.Vine, points: np.ndarray, nodes: np.ndarray, row: np.ndarray, uniform: Draw, normal: Draw
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Two bunches for every shoot, of which :func:`_choose_bunches` keeps some: fruit, at, stalk, hang, roll."""
     fruit, stalk = parts.bunch, parts.peduncle
     sigma = np.sqrt(np.log(1.0 + fruit.mass_variation.value**2))
     mass = fruit.mass.value * np.exp(sigma * normal(BUNCHES) - 0.5 * sigma**2)
@@ -322,7 +331,7 @@ def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # t
     hull = berries.hull(count, seed) * size[..., None]
     drawn = {
         "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,
-        "pull": stalk.pull.at(uniform(BUNCHES)), "thick": 0.5 * stalk.diameter.at(uniform(BUNCHES)),
+        "pull": stalk.pull.at(uniform(BUNCHES)), "thick": 0.5 * stalk.diameter.at(_share(mass, fruit.mass_range)),
     }  # fmt: skip
 
     # opposite the third to sixth leaf and one or two nodes further on, never both on one piece's tip
@@ -337,6 +346,9 @@ def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # t
     angle = 2.0 * np.pi * uniform(BUNCHES)
     level = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
     tilt = np.clip(0.10 + 0.04 * normal(BUNCHES), 0.02, 0.18)[..., None]
+    if scene.training == "vsp":  # beside its upright shoot, out of the hedge
+        level = frames.normalize(level * [0.4, 1.0, 0.0])
+        tilt = tilt + 0.10
     first = frames.normalize(level * tilt - [0.0, 0.0, 1.0])
     second = frames.normalize(level * 0.3 * tilt - [0.0, 0.0, 1.0])
     middle = top + first * long[..., None]
@@ -345,15 +357,25 @@ def _draw_fruit(scene, parts, points, length, nodes, row, uniform, normal):  # t
     return drawn, at, np.stack([top, middle, end], 2), hang, level
 
 
+def _share(value: np.ndarray, within: vine.Range) -> np.ndarray:
+    """How far ``value`` lies between the ends of a range, 0..1."""
+    low, high = within.value
+    return (value - low) / (high - low)
+
+
 def _choose_bunches(
-    scene: Scene, wood: _Wood, owner: np.ndarray, per_vine: int, stalk: np.ndarray, fruit: dict[str, np.ndarray]
+    scene: Scene, wood: _Wood, per_vine: int, stalk: np.ndarray, burden: np.ndarray, fruit: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Thin each vine to its number of bunches, keeping none that touches a pole, a trunk, or a bunch already kept."""
+    """Thin each vine to its number of bunches.
+
+    None is kept that touches a pole, a trunk or a bunch already kept, or under which an upright shoot would buckle.
+    """
     layout = scene.layout
     low, high = scene.fruit.bunches
     slots = per_vine * BUNCHES
     top = stalk[:, :, -1].reshape(-1, slots, 3)
     length, radius = (fruit[k].reshape(-1, slots) for k in ("length", "radius"))
+    burden = burden.reshape(-1, slots)
     level = top[..., :2] - wood.foot[:, None, :2]
     inside = (
         np.abs(level) + radius[..., None] + 0.5 * _CLEAR < 0.5 * np.array([layout.vine_spacing, layout.row_spacing])
@@ -370,13 +392,16 @@ def _choose_bunches(
         order = order[(inside & clear)[number, order]]
         t, r, h = top[number, order], radius[number, order], length[number, order]
         apart = np.sqrt(((t[:, None, :2] - t[None, :, :2]) ** 2).sum(-1))
-        rise = np.abs((t[:, None, 2] - 0.5 * h[:, None]) - (t[None, :, 2] - 0.5 * h[None]))
+        middle = t[:, 2] - 0.5 * h
+        rise = np.abs(middle[:, None] - middle[None])
         touch = (apart < r[:, None] + r[None] + _CLEAR) & (rise < 0.5 * (h[:, None] + h[None]) + 0.03)
-        free = np.ones(len(order), bool)
+        load, free, shoot = burden[number, order], np.ones(len(order), bool), order // BUNCHES
+        carried = np.zeros(per_vine)
         for i in range(len(order)):
-            if wanted and free[i]:
+            if wanted and free[i] and carried[shoot[i]] + load[i] < _UPRIGHT:
                 kept[number, order[i]] = True
                 free &= ~touch[i]
+                carried[shoot[i]] += load[i]
                 wanted -= 1
     return kept.reshape(-1, BUNCHES)
 
@@ -494,9 +519,9 @@ def _leaves(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str,
     many = np.where(main, s.nodes[:, None], SIDE_NODES)
     rank = np.where(main, node, node - NODES)
     share = np.minimum((rank + 0.7) / many, 0.999)
-    luck = s.luck
-    kept = _to_uniform(luck[..., 0]) < scene.season.leafiness
-    present = (rank < many) & kept & (main | s.side[:, None])
+    forward, rise, droop, swing, *lean, ageing = s.leaf_luck[..., None]
+    fate, turned, far, large = s.leaf_chance
+    present = (rank < many) & (fate < scene.season.leafiness) & (main | s.side[:, None])
 
     pieces = np.where(main, PIECES, SIDE_PIECES)
     piece = (share * pieces).astype(int)
@@ -506,40 +531,33 @@ def _leaves(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str,
     x = (share * pieces - piece) * length
     thick = b.radius[pick, slot, 0]
 
+    tendone = scene.training == "tendone"
     axis = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))
-    up = np.broadcast_to([0.0, 0.0, 1.0], axis.shape)
+    up = np.array([0.0, 0.0, 1.0])
     sideways = frames.normalize(np.cross(s.ref[:, None], axis))
     hand = np.where((rank + s.side_at[:, None]) % 2, 1.0, -1.0)[..., None]
-    lift = up if scene.training == "tendone" else 0.35 * up
-    out = frames.normalize(
-        hand * sideways + 0.35 * luck[..., 1, None] * axis + (0.55 + 0.3 * luck[..., 2, None]) * lift
-    )
-    petiole = leaf.petiole.at(_to_uniform(luck[..., 3]))
+    climb = (0.55 + 0.3 * rise) * (1.0 if tendone else 0.35)
+    out = frames.normalize(hand * sideways + 0.35 * forward * axis + climb * up)
     young = np.clip((share - 0.75) / 0.25, 0.0, 1.0)
     shrink = np.where(main, 1.0, 0.55) * (1.0 - (1.0 - leaf.young_area.value) * young)
-    area = leaf.area.at(_to_uniform(luck[..., 4])) * shrink
-    base = np.stack([x, 0.0 * x, 0.0 * x], -1) + thick[..., None] * frames.rotate(frames.conjugate(turn), out)
-    blade = base + (petiole * np.sqrt(shrink))[..., None] * frames.rotate(frames.conjugate(turn), out)
+    area = leaf.area.at(large) * shrink
+    petiole = leaf.petiole.at(far) * np.sqrt(shrink)
+    local = frames.rotate(frames.conjugate(turn), out)
+    base = np.stack([x, 0.0 * x, 0.0 * x], -1) + thick[..., None] * local
+    blade = base + petiole[..., None] * local
 
+    # blades lie on the light: flat over the net, hanging and facing outwards in a hedge
     flat = frames.normalize(out * [1.0, 1.0, 0.0])
-    droop = (-0.45 + 0.3 * luck[..., 5, None]) if scene.training == "tendone" else (-1.0 + 0.4 * luck[..., 5, None])
-    midrib = frames.normalize(flat + 0.3 * luck[..., 6, None] * axis + droop * up)
-    upper = up + (0.0 if scene.training == "tendone" else 0.9) * flat + 0.3 * luck[..., 7:10]
+    midrib = frames.normalize(flat + 0.3 * swing * axis + ((-0.45 if tendone else -1.0) + 0.3 * droop) * up)
+    upper = up + (0.0 if tendone else 0.9) * flat + 0.3 * np.concatenate(lean, -1)
     pose = np.concatenate([blade, frames.multiply(frames.conjugate(turn), frames.aligned(midrib, upper))], -1)
-
-    yellow = _to_uniform(luck[..., 11]) < scene.season.yellow
-    age = np.where(yellow, 0.75 + 0.08 * luck[..., 10], 0.45 * (1.0 - share) + 0.05 + 0.08 * luck[..., 10])
+    age = np.where(turned < scene.season.yellow, 0.75, 0.05 + 0.45 * (1.0 - share)) + 0.08 * ageing[..., 0]
 
     weight = np.where(present, leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink), 0.0)
     _load(b, slot, weight, blade)
     return {
         "present": present, "slot": slot, "base": base, "pose": pose, "area": area, "age": np.clip(age, 0.0, 1.0)
     }  # fmt: skip
-
-
-def _to_uniform(z: np.ndarray) -> np.ndarray:
-    """Standard normal numbers to uniform ones (logistic fit of the normal distribution, within 1e-3)."""
-    return 1.0 / (1.0 + np.exp(-1.5976 * z - 0.07056 * z**3))
 
 
 def _load(b: _Bodies, slot: np.ndarray, weight: np.ndarray, where: np.ndarray) -> None:
@@ -606,8 +624,8 @@ def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, 
         leaf["pose"][shown],
         leaf["age"][shown],
     )
-    blade = np.array([leaves.area(shape) for shape in range(leaves.SHAPES)])
-    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade[leaves.shape_of(np.arange(len(carrier)))])
+    blade = np.mean([leaves.area(shape) for shape in range(leaves.SHAPES)])
+    model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade)
 
     for name, value in wood.fixed.items():
         getattr(model, name)[:] = value

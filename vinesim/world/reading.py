@@ -75,7 +75,7 @@ def _explain(message: str, data: Any, kind: Any) -> str:
         return f"{named}{quoted[0]} is missing; add it: {quoted[0]} = ..."
     place = place or "the file"
     if what.startswith("Invalid enum value"):
-        return f"{place} is {quoted[0]!r}; give one of: {', '.join(_choices(kind, steps))}"
+        return f"{place} is {found!r}; give one of: {', '.join(_choices(kind, steps))}"
     if what.startswith("Expected") and quoted:
         types = [_KINDS.get(t.strip(), t.strip()) for t in re.split(r"\|", quoted[0])]
         bound = what.split("`", 2)[2].partition(", got")[0].strip()

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from vinesim.world import vine
 from vinesim.world.berries import VARIETIES
 from vinesim.world.places import NotFoundInData, find
 from vinesim.world.reading import DataError, read
@@ -140,6 +141,10 @@ def _trouble(scene: Scene) -> str:
             return f"fruit.varieties[{i}] is {name!r}; give one of: {', '.join(known)}"
     if len(scene.spawns) > MOST_ROBOTS:
         return f"spawns has {len(scene.spawns)} entries; give at most {MOST_ROBOTS}"
+    try:
+        vine.load(scene.plants)
+    except (NotFoundInData, DataError) as bad:
+        return f"plants is {scene.plants!r}; {bad}"
     names = [s.name for s in scene.spawns]
     for i, name in enumerate(names):
         if name in names[:i]:

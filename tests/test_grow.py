@@ -1,0 +1,95 @@
+"""Wood to bodies: mass and stiffness of a rod, and springs turned so that the drawn shape is the shape at rest."""
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.world import grow
+from vinesim.world.ids import Organ
+
+CANE = grow.Wood(modulus=5e9, density=800.0, damping=0.01)
+POSE = np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0])
+
+
+def beam(pieces=16, load=0.0, length=1.0, radius=0.004):
+    tree = grow.Tree(POSE)
+    tip = tree.rod(-1, length, (radius, radius), CANE, pieces)[-1]
+    if load:
+        small = {"mass": load, "inertia": (1e-6,) * 3, "stiffness": (5.0, 5.0, 5.0), "damping": (0.0,) * 3}
+        tree.add(tip, offset=(length / pieces, 0, 0), organ=int(Organ.BUNCH), **small)
+    return tree
+
+
+def test_a_rod_weighs_what_its_wood_weighs():
+    tree = grow.Tree(POSE)
+    tree.rod(-1, 1.2, (0.005, 0.002), CANE, 9)
+    cone = np.pi * 1.2 * (0.005**2 + 0.005 * 0.002 + 0.002**2) / 3.0
+    assert sum(b["mass"] for b in tree.bodies) == pytest.approx(800.0 * cone, rel=1e-12)
+
+
+def test_springs_are_ei_over_h_and_twice_that_at_the_root():
+    model = grow.assemble([beam()])
+    ei_over_h = 5e9 * np.pi * 0.004**4 / 4.0 * 16
+    assert model.joint_stiffness[0, 1] == pytest.approx(2.0 * ei_over_h, rel=1e-6)
+    assert model.joint_stiffness[1:, 1:] == pytest.approx(ei_over_h, rel=1e-6)
+    assert model.joint_stiffness[1:, 0] == pytest.approx(ei_over_h / 1.3, rel=1e-6)  # GJ, Poisson 0.3
+    assert model.joint_damping == pytest.approx(0.01 * model.joint_stiffness, rel=1e-6)
+
+
+def test_inertia_of_a_piece_is_that_of_a_cylinder():
+    mass, inertia, _ = grow.section(0.1, 0.01, 0.01, 1e9, 1000.0, False)
+    assert inertia == pytest.approx([mass * 0.01**2 / 2, *[mass * (3 * 0.01**2 + 0.1**2) / 12] * 2], rel=1e-12)
+
+
+def test_settle_keeps_the_drawn_shape_and_carries_the_load():
+    tree = beam(load=0.3)
+    tree.bodies[4]["rest"] = frames.exp(np.array([0.1, 0.3, -0.2]))
+    drawn = grow.assemble([tree]).forward(np.tile(frames.IDENTITY, (17, 1)))
+    tree.settle()
+    model = grow.assemble([tree])
+    assert np.abs(model.forward(model.joint_settled) - drawn).max() < 1e-5
+    root = model.joint_stiffness[0] * frames.log(model.joint_settled[0].astype(float))
+    lever = drawn[:, :3] + frames.rotate(drawn[:, 3:], model.body_com.astype(float)) - POSE[:3]
+    moment = np.cross(lever, model.body_mass[:, None] * grow.GRAVITY).sum(0)
+    axes = frames.multiply(POSE[3:], model.body_rest[0].astype(float))
+    assert frames.rotate(axes, root) == pytest.approx(moment, abs=1e-4)
+
+
+def test_a_weighted_beam_bends_by_the_angle_of_beam_theory():
+    """A beam held straight under its load is bent without it, by w L^3 / 6 EI + m g L^2 / 2 EI at its tip."""
+    load, length = 0.05, 1.0
+    tree = beam(pieces=64, load=load)
+    tree.settle()
+    model = grow.assemble([tree])
+    angle = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)[:-1].sum()
+    ei, weight = 5e9 * np.pi * 0.004**4 / 4.0, 800.0 * np.pi * 0.004**2 * 9.81
+    assert angle == pytest.approx(weight * length**3 / (6.0 * ei) + load * 9.81 * length**2 / (2.0 * ei), rel=2e-3)
+
+
+def test_settling_all_at_once_is_settling_each():
+    trees = [beam(pieces=n, load=0.1) for n in (3, 8)]
+    together = grow.settle(grow.assemble(trees))
+    for number, tree in enumerate(trees):
+        tree.settle()
+        alone = grow.assemble([tree])
+        assert np.array_equal(together.joint_settled[together.bodies_of(number)], alone.joint_settled)
+
+
+def test_fork_parents_and_numbers():
+    tree = beam(4)
+    side = tree.rod(1, 0.2, (0.002, 0.001), CANE, 2, rest=frames.yaw(0.5))
+    model = grow.assemble([beam(2), tree])
+    assert model.body_parent.tolist() == [-1, 0, -1, 2, 3, 4, 3, 6]
+    assert side == [4, 5]
+    assert model.body_offset[6, 0] == pytest.approx(0.25)
+
+
+def test_nonsense_is_refused_in_words():
+    with pytest.raises(ValueError, match="all must be positive"):
+        grow.Tree(POSE).rod(-1, -1.0, (0.01, 0.01), CANE, 3)
+    with pytest.raises(ValueError, match="names parent 3"):
+        grow.Tree(POSE).add(3)
+    slack = grow.Tree(POSE)
+    slack.add(-1, mass=1.0)
+    with pytest.raises(ValueError, match="body 0 has joint stiffness"):
+        slack.settle()
