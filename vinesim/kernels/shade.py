@@ -648,7 +648,7 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
     elif material == PAINT:
         s.gloss = 0.05
         s.polish = 80.0
-        s.mirror = 0.8
+        s.mirror = 0.4
     elif material == LAMP:
         s.glow = 3.0
     elif material == STEM:

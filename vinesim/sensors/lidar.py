@@ -102,9 +102,12 @@ class Lidar:
         if not np.isfinite(pose).all():
             raise ValueError(f"lidar {self.name!r} has the pose {pose.tolist()}; give finite numbers")
         turn = frames.normalize(pose[3:])
+        run = (
+            len(self.spec.elevation.value) if self.device == "cpu" else 1
+        )  # structs are handed to a thread, not to a ray
         wp.launch(
             rays.sweep,
-            len(self.offset),
+            len(self.offset) // run,
             inputs=[
                 primitives.shapes,
                 primitives.labels,
@@ -118,6 +121,7 @@ class Lidar:
                 int(Organ.GROUND),
                 self.spec.nearest.value,
                 self.spec.farthest.value,
+                run,
             ],
             outputs=[self._xyz, self._intensity, self._label],
             device=self.device,
