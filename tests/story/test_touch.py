@@ -1,4 +1,4 @@
-"""The whole way of a touch, in one process over the in-memory bus: every part but the network's wire is the real one."""
+"""The whole way of a touch, in one process over the in-memory bus: all is real but the network's wire."""
 
 import numpy as np
 import pytest

@@ -160,7 +160,7 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
             None if no_ros else start("stranger", "-m", "vinesim.ros.witness", *heard_topics(robot_named.cameras))
         )
         console.print(
-            f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (the first run compiles kernels)"
+            f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (a first run compiles kernels)"
         )
         pusher = start(
             PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
@@ -186,10 +186,11 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
 
 
 def heard_topics(cameras: Sequence[Mount]) -> list[str]:
-    """What the stranger subscribes to: all of the pusher's topics, and of the visitor's its joints and first picture."""
+    """What the stranger subscribes to: all of the pusher's topics, of the visitor's its joints and first picture."""
     topics = [
-        "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment", "/tf_environment_static",
-        "/lidar/points", "/vine/contacts", "/mobile_base_controller/odom", "/diagnostics", f"/{VISITOR}/joint_states",
+        "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",
+        "/tf_environment_static", "/lidar/points", "/vine/contacts", "/mobile_base_controller/odom", "/diagnostics",
+        f"/{VISITOR}/joint_states",
     ]  # fmt: skip
     pictures = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info", "depth/points", "labels")
     topics += [f"/{camera.name}/{picture}" for camera in cameras for picture in pictures]
@@ -256,7 +257,7 @@ def _table(newest: dict[str, dict[str, Any]]) -> Table:
 def summarise(
     out: pathlib.Path, bunch: int, heard: dict[str, Any], no_ros: str | None, scene: str, seed: int, seconds: float
 ) -> dict[str, Any]:
-    """Put the clients' reports together; writes ``summary.json``, ``touch.png`` and the pusher's pictures into ``out``."""
+    """Put the clients' reports together; ``summary.json``, ``touch.png`` and the pusher's pictures go to ``out``."""
     report = {name: json.loads((out / name / "report.json").read_text()) for name in (PUSHER, VISITOR)}
     traces = {name: Rows.load(out / name / "trace.npz") for name in (PUSHER, VISITOR)}
     plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PUSHER}, seen by {VISITOR}")

@@ -25,8 +25,8 @@ class WrongUse(ValueError):
 
 
 def run(
-    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int, back: float,
-    namespace: str, ros: bool, push: int | None, watch: int | None, near: float, seconds: float | None,
+    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int,
+    back: float, namespace: str, ros: bool, push: int | None, watch: int | None, near: float, seconds: float | None,
     out: pathlib.Path | None, status: str, device: str, camera_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
@@ -119,10 +119,11 @@ def _speak(reporter: Any, senses: Any, status: str, stop: threading.Event) -> No
             if status == "json":
                 print(json.dumps(figures), flush=True)
             elif status == "text":
+                company = ", ".join(figures["others"]) or "nobody"
                 print(
                     f"{figures['time']:7.1f} s  {figures['tick_hz']:6.2f} Hz  p99 {figures['tick_p99_ms']:5.2f} ms  "
                     f"awake {figures['awake']:3d}  force {figures['force']:6.2f} N  "
-                    f"in {figures['bytes_in']} B  out {figures['bytes_out']} B  with {', '.join(figures['others']) or 'nobody'}",
+                    f"in {figures['bytes_in']} B  out {figures['bytes_out']} B  with {company}",
                     flush=True,
                 )
     except BrokenPipeError:  # whoever listened is gone: that ends the run, not the log

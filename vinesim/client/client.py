@@ -151,7 +151,7 @@ class Client:
         log.info("%s joined with %s", hello.name, hello.robot)
 
     def _pull(self, inbox: Inbox) -> None:
-        """Draw the copies of others' trees towards their owners' states, every tick, while their own physics goes on."""
+        """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
         plants = self.physics.plants
         for update in inbox.trees:
             self._copies[update.tree] = update

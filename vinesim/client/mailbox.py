@@ -26,7 +26,7 @@ class Mailbox:
         self._owner = True
 
     def put(self, letter: bytes) -> bool:
-        """Leave a letter in the place of the last one. False if the reader has its hand in the box: try the next tick."""
+        """Leave a letter in the place of the last one. False if the reader has its hand in the box: try again."""
         if len(letter) > self.capacity:
             raise ValueError(f"letter of {len(letter)} bytes for a mailbox of {self.capacity}")
         if not self._lock.acquire(block=False):

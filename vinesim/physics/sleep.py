@@ -34,8 +34,9 @@ class Sleep:
         self.plants.wake(trees)
 
     def update(self, busy: np.ndarray | None = None) -> np.ndarray:
-        """After a commit: the trees that have just been put to rest [k]. ``busy`` [n] are touched or near somebody: they
-        stay awake, however quiet.
+        """After a commit: the trees that have just been put to rest [k].
+
+        ``busy`` [n] are touched or near somebody: they stay awake, however quiet.
         """
         awake = self.plants.awake
         self.ticks[awake] += 1
