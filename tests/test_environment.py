@@ -17,7 +17,7 @@ wheels_only = pytest.mark.skipif(not WHEELS, reason="ROS 2 is not installed as w
 @pytest.mark.ros
 @wheels_only
 def test_wheels_beside_a_sourced_ros_are_refused(monkeypatch):
-    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/home/somebody/ws")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/srv/ws")
     assert "sourced from /opt/ros/jazzy as well" in str(environment.available())
     with pytest.raises(environment.RosUnavailableError, match="nothing is sourced"):
         environment.prepare()
@@ -59,10 +59,10 @@ def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
     environment.without_profile()
     assert environment.PROFILE_VARIABLE not in os.environ
 
-    monkeypatch.setenv(environment.PROFILE_VARIABLE, "/home/somebody/own.xml")
+    monkeypatch.setenv(environment.PROFILE_VARIABLE, "/srv/own.xml")
     environment.prepare()
     environment.without_profile()
-    assert os.environ[environment.PROFILE_VARIABLE] == "/home/somebody/own.xml"
+    assert os.environ[environment.PROFILE_VARIABLE] == "/srv/own.xml"
 
 
 def test_the_segment_holds_several_of_the_largest_messages():

@@ -138,8 +138,8 @@ def see_sky(
 
 
 @wp.func
-def darken(m: ShadowMap, depth: wp.array(dtype=wp.float32), x: int, y: int, z: float):
-    wp.atomic_min(depth, y * m.side + x, z)
+def darken(m: ShadowMap, x: int, y: int, z: float, depth_out: wp.array(dtype=wp.float32)):
+    wp.atomic_min(depth_out, y * m.side + x, z)
 
 
 @wp.kernel
@@ -185,7 +185,7 @@ def cast_shadows(
                         dy = float(py) - y
                         h = rt * rt - dx * dx - dy * dy
                         if h > 0.0:
-                            darken(m, depth_out, px, py, z - wp.sqrt(h) * m.texel)
+                            darken(m, px, py, z - wp.sqrt(h) * m.texel, depth_out)
             elif kind == CONE or kind == CYLINDER:
                 rb = wp.where(kind == CONE, b4[3], r)
                 if wp.max(r, rb) > smallest * m.texel:
@@ -214,7 +214,7 @@ def cast_shadows(
                             rr = wp.max((r + (rb - r) * s) / m.texel, 0.55)
                             h = rr * rr - fx * fx - fy * fy
                             if h > 0.0:
-                                darken(m, depth_out, px, py, z + ez * s - wp.sqrt(h) * m.texel)
+                                darken(m, px, py, z + ez * s - wp.sqrt(h) * m.texel, depth_out)
             elif kind == LEAF:
                 rib = xyz(b4)
                 up = xyz(c4)
@@ -269,7 +269,7 @@ def cast_shadows(
                                     if int(shapes.outline[number, int((v + 0.75) * 128.0), int((u + 1.0) * 128.0)]) > 0:
                                         w = bend[0] * u * u + bend[2] * wp.abs(u) + bend[1] * v * v
                                         toward = wp.dot(m.sun, across) * u + wp.dot(m.sun, rib) * v + slant * w
-                                        darken(m, depth_out, px, py, z - toward * r)
+                                        darken(m, px, py, z - toward * r, depth_out)
             else:
                 o = xyz(a4)
                 reach_i = r
@@ -292,7 +292,7 @@ def cast_shadows(
                         )
                         t = hit(shapes, i, from_sun, -m.sun, 0)
                         if t < FAR:
-                            darken(m, depth_out, px, py, t)
+                            darken(m, px, py, t, depth_out)
 
 
 @wp.func

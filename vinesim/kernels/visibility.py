@@ -65,10 +65,10 @@ def ray_of(lens: Pinhole, x: int, y: int) -> wp.vec3:
 
 
 @wp.func
-def keep(keys: wp.array(dtype=wp.int64), pixel: int, t: float, i: int, reach: float):
+def keep(pixel: int, t: float, i: int, reach: float, keys_out: wp.array(dtype=wp.int64)):
     """Enter a hit."""
     if t < reach:
-        wp.atomic_min(keys, pixel, (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i))
+        wp.atomic_min(keys_out, pixel, (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i))
 
 
 @wp.func
@@ -239,7 +239,7 @@ def raster_cones(
                 for x in range(x0, x1):
                     at = y * lens.width + x
                     if keys_out[at] > nearest:
-                        keep(keys_out, at, hit_cone(a, a4[3], b, b4[3], ray_of(lens, x, y)), i, lens.reach)
+                        keep(at, hit_cone(a, a4[3], b, b4[3], ray_of(lens, x, y)), i, lens.reach, keys_out)
 
 
 @wp.kernel
@@ -408,7 +408,7 @@ def raster_solids(
                                 t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
                             else:
                                 t = hit_cylinder(p, end, a4[3], d)
-                            keep(keys_out, at, t, i, lens.reach)
+                            keep(at, t, i, lens.reach, keys_out)
 
 
 @wp.kernel
@@ -452,7 +452,7 @@ def raster_triangles(
                 for x in range(box[0], box[1]):
                     at = y * lens.width + x
                     if keys_out[at] > nearest:
-                        keep(keys_out, at, hit_triangle(p, q, r, ray_of(lens, x, y)), i, lens.reach)
+                        keep(at, hit_triangle(p, q, r, ray_of(lens, x, y)), i, lens.reach, keys_out)
 
 
 @wp.func

@@ -27,6 +27,8 @@ EVERY = 10_000
 class BusError(RuntimeError):
     """The network cannot be used as asked; the text says what, where and the remedy."""
 
+    exit_code = 4
+
 
 class NameTaken(BusError):
     """Another live actor has this name."""

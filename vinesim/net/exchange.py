@@ -52,6 +52,8 @@ _LONG_AGO = -1e9
 class Mismatch(RuntimeError):
     """Actors that cannot share a world: their vineyards or their protocols differ."""
 
+    exit_code = 4
+
 
 @dataclasses.dataclass(slots=True)
 class Traffic:
