@@ -165,11 +165,11 @@ def raster_spheroids(
                         at = y * lens.width + x
                         if keys_out[at] > nearest:
                             keep(
-                                keys_out,
                                 at,
                                 hit_sphere(centre, a4[3], squeeze(ray_of(lens, x, y), axis, stretch)),
                                 i,
                                 lens.reach,
+                                keys_out,
                             )
 
 
@@ -324,11 +324,11 @@ def raster_leaves(
                         at = y * lens.width + x
                         if keys_out[at] > nearest:
                             keep(
-                                keys_out,
                                 at,
                                 hit_leaf(shapes.outline, number, bend, eye, row + dx * float(x), smooth),
                                 i,
                                 lens.reach,
+                                keys_out,
                             )
 
 
