@@ -31,6 +31,10 @@ GRACE = 1.6
 """How long a process may take to end after SIGINT before it is killed [s]."""
 
 
+PATIENCE = 10.0
+"""How long the visitor may take to write what it saw [s]."""
+
+
 class DemoFailed(RuntimeError):
     """A process of the demo ended before its time; the text says which, and what it said."""
 
@@ -173,7 +177,7 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
         )  # fmt: skip
         watch(pusher, visitor, server, newest, console, headless)
         visitor.stop()
-        visitor.reap(GRACE)
+        visitor.reap(PATIENCE)
         if visitor.child.returncode:
             raise visitor.failed()
         heard = {}

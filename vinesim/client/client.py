@@ -29,7 +29,7 @@ from vinesim.robot.description import Description, DescriptionError
 from vinesim.robot.drives import RemoteRobot, Robot
 from vinesim.world.model import Model
 from vinesim.world.scene import Scene
-from vinesim.world.values import TreeUpdate
+from vinesim.world.values import RobotUpdate, TreeUpdate
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +76,8 @@ class Client:
         self.far = Faraway()
         self._clock = clock
         self._copies: dict[int, TreeUpdate] = {}
+        self._expected: dict[str, Hello] = {}
+        """Robots that joined and whose place is not known yet."""
 
     def tick(self) -> None:
         """Ten milliseconds of the vineyard."""
@@ -92,12 +94,17 @@ class Client:
         """Let others come and go, move their copies, and hear of the trees they touch."""
         inbox = self.exchange.receive(now)
         for hello in inbox.joined:
-            self._welcome(hello)
+            log.info("%s joined as %s", hello.name, hello.kind)
+            if hello.kind == "robot":
+                self._expected[hello.name] = hello
         for name in inbox.left:
+            self._expected.pop(name, None)
             if (other := self.others.pop(name, None)) is not None:
                 other.leave()
                 log.info("%s left", name)
         for name, update in inbox.robots.items():
+            if name in self._expected:
+                self._embody(self._expected.pop(name), update)
             if name in self.others:
                 self.others[name].follow(update)
         self._pull(inbox)
@@ -136,19 +143,15 @@ class Client:
 
     # ------------------------------------------------------------------ others
 
-    def _welcome(self, hello: Hello) -> None:
-        if hello.kind != "robot":
-            log.info("%s joined as %s", hello.name, hello.kind)
-            return
+    def _embody(self, hello: Hello, update: RobotUpdate) -> None:
+        """Let another client's robot stand where it is."""
         try:
             description = _description_of(hello, self.robot.description)
             self.others[hello.name] = RemoteRobot(
-                self.physics.rigid, description, hello.name, hello.index, np.array([0.0, 0.0, -10.0, 0, 0, 0, 1.0])
+                self.physics.rigid, description, hello.name, hello.index, update.base_q
             )
         except ValueError as error:
-            log.warning("%s joined, but its robot cannot be shown: %s", hello.name, error)
-            return
-        log.info("%s joined with %s", hello.name, hello.robot)
+            log.warning("the robot of %s cannot be shown: %s", hello.name, error)
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""

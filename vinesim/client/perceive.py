@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import os
 import pathlib
 import pickle
@@ -23,11 +24,13 @@ from vinesim.world.model import Model
 from vinesim.world.state import State
 from vinesim.world.values import CameraFrame, LidarScan, Link, RobotSample, View
 
+log = logging.getLogger(__name__)
+
 FIGURES_PERIOD = 0.1
 """Simulated time between two reports to the tick: what is wanted, what was sent [s]."""
 SWITCH = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
-NICE = 5
+NICE = 10
 """Where cores are scarce, the tick goes first."""
 
 
@@ -71,6 +74,7 @@ def perceive(setup: Setup, mailbox: Mailbox, pipe: Connection) -> None:
     sys.setswitchinterval(SWITCH)
     if hasattr(os, "nice"):
         os.nice(NICE)
+    code = 0
     try:
         with contextlib.ExitStack() as stack:
             stack.callback(mailbox.close)
@@ -78,9 +82,13 @@ def perceive(setup: Setup, mailbox: Mailbox, pipe: Connection) -> None:
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the client is gone
     except Exception as error:
+        log.exception("the senses fail")
         with contextlib.suppress(OSError):
             pipe.send(("failed", f"{type(error).__name__}: {error}"))
-        raise
+        code = 1
+    # All is closed. Taking the engines down in order would only keep the one who waits for us.
+    logging.shutdown()
+    os._exit(code)
 
 
 class _Perception:

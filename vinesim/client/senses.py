@@ -123,10 +123,13 @@ class Senses:
 
     def _listen(self) -> None:
         """Take what the process says: commands, figures, and which letters it has read."""
-        if not self._process.is_alive() and not self._pipe.poll():
-            raise SensesError(f"the senses of {self.client.name} ended with exit code {self._process.exitcode}")
         while self._pipe.poll():
-            kind, value = self._pipe.recv()
+            try:
+                kind, value = self._pipe.recv()
+            except EOFError:
+                self._process.join(PATIENCE)
+                code = self._process.exitcode
+                raise SensesError(f"the senses of {self.client.name} ended with exit code {code}") from None
             if kind == "commands":
                 self._commands += value
             elif kind == "figures":

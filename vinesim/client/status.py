@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,7 @@ class Status:
             "environment_bytes_when_far": client.far.bytes,
             "ticks_touching_when_far": client.far.ticks_touching,
             "malformed": client.exchange.counters.malformed,
+            "network": dataclasses.asdict(client.exchange.counters),
             "deadlines_dropped": self.pace.dropped,
         }
         if client.trace is not None:

@@ -18,6 +18,7 @@ class Sleep:
 
     def __init__(self, plants: Plants, *, quiet: float = QUIET, patience: int = PATIENCE) -> None:
         self.plants, self.quiet, self.patience = plants, quiet, patience
+        self._busy = np.zeros(len(plants.model.tree_first), bool)
         self.ticks = np.zeros(len(plants.model.tree_first), np.int32)
         """How long each awake tree has been quiet [tree] ticks."""
 
@@ -42,7 +43,11 @@ class Sleep:
         self.ticks[awake] += 1
         self.ticks[awake[~(self.plants.tree_rate[awake] < self.quiet)]] = 0
         quiet = awake[self.ticks[awake] >= self.patience]
-        tired = quiet if busy is None else np.setdiff1d(quiet, busy)
-        self.plants.rest(tired)
-        self.ticks[tired] = 0
-        return tired
+        if len(quiet) and busy is not None:
+            self._busy[busy] = True
+            quiet = quiet[~self._busy[quiet]]
+            self._busy[busy] = False
+        if len(quiet):
+            self.plants.rest(quiet)
+            self.ticks[quiet] = 0
+        return quiet
