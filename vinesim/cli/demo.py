@@ -168,12 +168,12 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
         )
         pusher = start(
             PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
-            "--seconds", str(seconds), "--out", str(out / PUSHER), "--camera-hz", "5",
+            "--seconds", str(seconds), "--out", str(out / PUSHER), "--camera-hz", "2",
         )  # fmt: skip
         newest = {PUSHER: json.loads(pusher.line(300.0))}
         visitor = start(
             VISITOR, *common, "--name", VISITOR, "--connect", endpoint, "--spawn", "1", "--back", "8",
-            "--namespace", VISITOR, "--out", str(out / VISITOR), "--camera-hz", "2",
+            "--namespace", VISITOR, "--out", str(out / VISITOR), "--camera-hz", "1",
         )  # fmt: skip
         watch(pusher, visitor, server, newest, console, headless)
         visitor.stop()
