@@ -339,3 +339,21 @@ def test_a_tree_that_a_robot_reaches_into_stays_awake():
         physics.step()
     assert physics.touching.near.tolist() == [0]
     assert physics.plants.awake.tolist() == [0]
+
+
+def test_a_copy_touches_only_trees_of_which_its_owner_tells():
+    physics = Physics(rows_of_canes())
+    reached = int(physics.model.tree_first[20])
+    at = physics.state.body_q[reached + 5, :3].copy()
+    physics.add_robot(bar(at, "ghost"))
+    physics.touching.copies.add("ghost")
+    asleep = physics.state.joint_q.copy()
+    for _ in range(5):
+        physics.step()
+    assert physics.contacts == ()
+    assert len(physics.plants.awake) == 0
+    assert np.array_equal(physics.state.joint_q, asleep)
+
+    physics.touching.told[20] = True
+    physics.step()
+    assert {tree for tree, _ in physics.touched} == {20}

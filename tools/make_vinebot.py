@@ -274,7 +274,7 @@ def head(urdf: Urdf) -> None:
     optical = (-math.pi / 2, 0, -math.pi / 2)
     for eye in ("rgb", "depth"):
         urdf.link(f"head_front_camera_{eye}_frame")
-        urdf.fix(f"head_front_camera_{eye}_frame", "head_front_camera_link")
+        urdf.fix(f"head_front_camera_{eye}_frame", "head_front_camera_link", (0.003, 0, 0))  # just before the glass
         urdf.link(f"head_front_camera_{eye}_optical_frame")
         urdf.fix(f"head_front_camera_{eye}_optical_frame", f"head_front_camera_{eye}_frame", rpy=optical)
 

@@ -17,7 +17,7 @@ def text_files():
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in filter(None, listed.split("\0")):
         path = ROOT / name
-        if path.suffix not in {".png", ".stl", ".npz"} and path.is_file() and path != pathlib.Path(__file__):
+        if path.suffix not in {".png", ".jpg", ".stl", ".npz"} and path.is_file() and path != pathlib.Path(__file__):
             yield path
 
 

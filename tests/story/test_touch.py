@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.places import bunch_centres, bunch_in_reach, spawn_pose
 from vinesim.client.trace import Trace, remote_error, touch_to_motion
@@ -40,10 +39,9 @@ class World:
         self.picker, self.visitor = self.clients.values()
         for client in self.clients.values():
             client.trace = Trace(self.model, self.bunch, client.physics.state.body_q[self.body].copy(), 20000)
-        base = self.picker.robot.rigid.base("picker")[0]
-        sideways = frames.rotate(frames.conjugate(base[3:]), self.picker.trace.centre() - base[:3])[1]
-        side = "left" if sideways >= 0 else "right"
-        self.reach = ReachAndPush(self.picker.robot, side, self.picker.trace.centre, repeat=False)
+        self.reach = ReachAndPush(
+            self.picker.robot, self.picker.side_of(self.picker.trace.centre()), self.picker.trace.centre, repeat=False
+        )
         self.picker.jobs.append(self.reach.control)
 
     def tick(self):

@@ -39,8 +39,6 @@ def run(
     # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
     sys.setswitchinterval(SWITCH)
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
 
     from vinesim.client.client import Client
     from vinesim.client.jobs import DriveTo, LookAt
@@ -73,10 +71,14 @@ def run(
             from vinesim.net.zenoh_bus import ZenohBus
 
             bus = stack.enter_context(ZenohBus(name, connect=connect))
-        client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device)
         senses = stack.enter_context(
-            Senses(client, namespace=namespace, ros=ros, keep_pictures=out is not None, camera_hz=camera_hz)
-        )
+            Senses(
+                name, plan, model, description,
+                namespace=namespace, ros=ros, keep_pictures=out is not None, camera_hz=camera_hz,
+            )
+        )  # fmt: skip
+        client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device)
+        senses.attach(client)
         pace = Pace(client.physics.dt)
         watched = watch if watch is not None else push
         if watched is not None:
@@ -85,7 +87,7 @@ def run(
         if back > 0.0:
             client.jobs.append(DriveTo(client.robot, goal))
         if push is not None and client.trace is not None:
-            reach = ReachAndPush(client.robot, senses.side_of(client.trace.centre()), client.trace.centre)
+            reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
             client.jobs.append(reach.control)
         if client.trace is not None:
             client.jobs.append(LookAt(client.robot, client.trace.centre))
@@ -94,6 +96,9 @@ def run(
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
+        # until here Ctrl-C simply interrupts; from now on it ends the run in order
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
         limit = None if seconds is None else round(seconds / client.physics.dt)
         while not stop.is_set() and (limit is None or pace.ticks < limit):
             pace.begin()

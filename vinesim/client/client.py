@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vinesim import frames
 from vinesim.client.trace import Trace
 from vinesim.net import interest
 from vinesim.net.bus import Bus
@@ -101,6 +102,7 @@ class Client:
             self._expected.pop(name, None)
             if (other := self.others.pop(name, None)) is not None:
                 other.leave()
+                self.physics.touching.copies.discard(name)
                 log.info("%s left", name)
         for name, update in inbox.robots.items():
             if name in self._expected:
@@ -141,6 +143,12 @@ class Client:
             physics.plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
         self.far.note(self, bool(touched))
 
+    def side_of(self, point: np.ndarray) -> str:
+        """The arm that is on the same side as a point [3] in the world."""
+        base, _ = self.physics.rigid.base(self.name)
+        local = frames.rotate(frames.conjugate(base[3:]), point - base[:3])
+        return "left" if local[1] >= 0.0 else "right"
+
     # ------------------------------------------------------------------ others
 
     def _embody(self, hello: Hello, update: RobotUpdate) -> None:
@@ -152,14 +160,21 @@ class Client:
             )
         except ValueError as error:
             log.warning("the robot of %s cannot be shown: %s", hello.name, error)
+            return
+        self.physics.touching.copies.add(hello.name)
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
-        plants = self.physics.plants
+        plants, told = self.physics.plants, self.physics.touching.told
         for update in inbox.trees:
+            if update.tree not in self._copies:
+                plants.wake(update.tree)
+                plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
+                told[update.tree] = True
             self._copies[update.tree] = update
         for tree in [tree for tree in self._copies if self.exchange.owner(tree) in (None, self.name)]:
             update = self._copies.pop(tree)
+            told[tree] = False
             if update.resting:
                 plants.pull(tree, update.joint_q, update.joint_qd, 1.0)
         for tree, update in self._copies.items():

@@ -17,18 +17,22 @@ from typing import Any, Self
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.jobs import Obey
 from vinesim.client.mailbox import Mailbox
 from vinesim.client.perceive import Letter, Setup, perceive
+from vinesim.robot.description import Description
 from vinesim.ros import environment
 from vinesim.ros.types import Command
+from vinesim.world.model import Model
+from vinesim.world.scene import Scene
 
 log = logging.getLogger(__name__)
 
 VIEW_TICKS = 2
 """Ticks between two views for the eyes: 50 Hz, faster than any camera here."""
+START = 300.0
+"""How long the process may take to start; a first run compiles kernels [s]."""
 ANSWER = 10.0
 """How long the process may take to write its pictures [s]."""
 PATIENCE = 1.2
@@ -46,49 +50,50 @@ class Senses:
 
     def __init__(
         self,
-        client: Client,
+        name: str,
+        scene: Scene,
+        model: Model,
+        description: Description,
         *,
         namespace: str = "",
         ros: bool = True,
         keep_pictures: bool = False,
         camera_hz: float | None = None,
     ) -> None:
-        """``keep_pictures`` renders the first camera even if no ROS peer listens, and keeps the picture of the greatest
+        """Starts the process; :meth:`attach` gives it something to perceive.
+
+        ``keep_pictures`` renders the first camera even if no ROS peer listens, and keeps the picture of the greatest
         displacement of the watched bunch for :meth:`save`. ``camera_hz`` replaces the cameras' own rate.
         """
-        self.client = client
+        self.name = name
         if ros and (reason := environment.available()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
-        description = client.robot.description
+        self._ros = ros
         self._sensors = {place.name: place.frame for place in (*description.cameras, *description.lidars)}
         self._commands: list[Command] = []
         self._figures: dict[str, Any] = {"sent": {}, "eyes": keep_pictures}
-        self._moved = np.zeros(len(client.model.tree_first), bool)
+        self._moved = np.zeros(len(model.tree_first), bool)
         self._links: Any = None
         self._acknowledged, self._letters = 0, 0
         self._asked: list[tuple[int, np.ndarray]] = []
         context = multiprocessing.get_context("spawn")
-        self._mailbox = Mailbox(40 * len(client.model.body_mass) + (4 << 20), context)
+        self._mailbox = Mailbox(40 * len(model.body_mass) + (4 << 20), context)
         self._pipe, theirs = context.Pipe()
-        setup = Setup(
-            client.name,
-            client.model,
-            description,
-            client.scene.sun.direction(),
-            namespace,
-            ros,
-            keep_pictures,
-            camera_hz,
-        )
+        sun = scene.sun.direction()
+        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, camera_hz)
         self._process = context.Process(
-            target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {client.name}", daemon=True
+            target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {name}", daemon=True
         )
         self._process.start()
         theirs.close()
-        self._wait_for("ready", 120.0)
+
+    def attach(self, client: Client) -> None:
+        """Perceive this client's world from now on; waits until the process is ready."""
+        self.client = client
+        self._wait_for("ready", START)
         client.senses.append(self._every_tick)
-        if ros:
+        if self._ros:
             client.jobs.insert(0, Obey(client.robot, self._take_commands))
 
     # ------------------------------------------------------------------ the tick
@@ -129,7 +134,7 @@ class Senses:
             except EOFError:
                 self._process.join(PATIENCE)
                 code = self._process.exitcode
-                raise SensesError(f"the senses of {self.client.name} ended with exit code {code}") from None
+                raise SensesError(f"the senses of {self.name} ended with exit code {code}") from None
             if kind == "commands":
                 self._commands += value
             elif kind == "figures":
@@ -137,7 +142,7 @@ class Senses:
             elif kind == "read":
                 self._read(*value)
             elif kind == "failed":
-                raise SensesError(f"the senses of {self.client.name} failed: {value}")
+                raise SensesError(f"the senses of {self.name} failed: {value}")
 
     def _read(self, number: int, links_seen: bool) -> None:
         """A letter with a view was read: what moved until then, and rests since, needs no telling again."""
@@ -157,12 +162,6 @@ class Senses:
         return commands
 
     # ------------------------------------------------------------------ questions
-
-    def side_of(self, point: np.ndarray) -> str:
-        """The arm that is on the same side as a point [3] in the world."""
-        base, _ = self.client.robot.rigid.base(self.client.name)
-        local = frames.rotate(frames.conjugate(base[3:]), point - base[:3])
-        return "left" if local[1] >= 0.0 else "right"
 
     def sent(self) -> dict[str, int]:
         """Messages sent so far, by topic."""
@@ -190,12 +189,12 @@ class Senses:
             except EOFError:
                 break
             if kind == "failed":
-                raise SensesError(f"the senses of {self.client.name} failed: {value}")
+                raise SensesError(f"the senses of {self.name} failed: {value}")
             if kind == "figures":
                 self._figures = value
             if kind == answer:
                 return
-        raise SensesError(f"the senses of {self.client.name} did not get {answer} within {timeout:.0f} s")
+        raise SensesError(f"the senses of {self.name} did not get {answer} within {timeout:.0f} s")
 
     def close(self) -> None:
         """End the process."""
@@ -203,7 +202,7 @@ class Senses:
             self._pipe.send(("stop", None))
         self._process.join(PATIENCE)
         if self._process.is_alive():
-            log.warning("the senses of %s did not end by themselves", self.client.name)
+            log.warning("the senses of %s did not end by themselves", self.name)
             self._process.kill()
             self._process.join()
         self._pipe.close()

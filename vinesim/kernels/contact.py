@@ -271,7 +271,9 @@ def apart(a_low: wp.vec3, a_high: wp.vec3, b_low: wp.vec3, b_high: wp.vec3):
 def reach(
     # model
     actor_first: wp.array(dtype=wp.int32),
+    actor_copy: wp.array(dtype=wp.bool),
     # in
+    tree_told: wp.array(dtype=wp.bool),
     tree_low: wp.array(dtype=wp.vec3),
     tree_high: wp.array(dtype=wp.vec3),
     actor_low: wp.array(dtype=wp.vec3),
@@ -281,13 +283,14 @@ def reach(
     # out
     near_out: wp.array(dtype=wp.bool),
 ):
-    """Say of one tree whether some shape of an actor reaches into its box."""
+    """Say of one tree whether some shape of an actor reaches into its box; a copy counts only at trees told of."""
     tree = wp.tid()
     low = tree_low[tree]
     high = tree_high[tree]
     near = bool(False)
     for actor in range(actor_first.shape[0] - 1):
-        if not apart(low, high, actor_low[actor], actor_high[actor]):
+        counts = tree_told[tree] or not actor_copy[actor]
+        if counts and not apart(low, high, actor_low[actor], actor_high[actor]):
             for g in range(actor_first[actor], actor_first[actor + 1]):
                 if not apart(low, high, geom_low[g], geom_high[g]):
                     near = True
@@ -307,7 +310,9 @@ def meet(
     geom_size: wp.array(dtype=wp.vec3d),
     geom_center: wp.array(dtype=wp.vec3d),
     geom_radius: wp.array(dtype=wp.float64),
+    geom_copy: wp.array(dtype=wp.bool),
     # in
+    tree_told: wp.array(dtype=wp.bool),
     bunch_attached: wp.array(dtype=wp.bool),
     trees: wp.array(dtype=wp.int32),
     tree_low: wp.array(dtype=wp.vec3),
@@ -335,7 +340,8 @@ def meet(
     tree = trees[i]
     close = int(0)  # noqa: RUF046 (Warp's way to say that it will change)
     for g in range(geom_id.shape[0]):
-        if not apart(tree_low[tree], tree_high[tree], geom_low[g], geom_high[g]):
+        counts = tree_told[tree] or not geom_copy[g]
+        if counts and not apart(tree_low[tree], tree_high[tree], geom_low[g], geom_high[g]):
             close_out[i, close] = g
             close = close + 1
     found = int(0)  # noqa: RUF046

@@ -120,6 +120,12 @@ class Touching:
         """When contacts were last left out and how many: empty if never."""
         self.near = np.zeros(0, np.int32)
         """Trees [k] whose box a robot or a moving box reaches into: these must not fall asleep."""
+        self.copies: set[str] = set()
+        """Robots that another client controls. What they touch is that client's to compute: here they touch only trees
+        of whose state it tells, so that a touch counts once and a copy in the distance disturbs nothing.
+        """
+        self.told = np.zeros(len(model.tree_first), np.bool_)
+        """[tree] whose state another client tells."""
         self._generation = 0
         self._awake = np.zeros(0, np.int32)
         self._allocate()
@@ -321,6 +327,8 @@ class Touching:
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
         first = [i for i in range(count) if i == 0 or g.actor[i] != g.actor[i - 1]]
         self._actor_first = np.array([*first, count], np.int32)
+        self._actor_copy = np.array([g.actor[i] in self.copies for i in first], np.bool_)
+        self._geom_copy = np.array([actor in self.copies for actor in g.actor], np.bool_)
         self._actor_lies = np.array([g.actor[i] not in self.rigid.robots for i in first], np.bool_)
         self._actor_low, self._actor_high = np.zeros((len(first), 3), np.float32), np.zeros((len(first), 3), np.float32)
         self._make_room(max(self._room, 64))
@@ -377,7 +385,11 @@ class Touching:
              body_qd],
             [*s_at, s_speed, *t_box],
         )  # fmt: skip
-        self._reach = bind(kernels.reach, [a_first, *t_box, *a_box, *g_box], [shared(self._near, wp.bool)])
+        told = shared(self.told, wp.bool)
+        a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
+        self._reach = bind(
+            kernels.reach, [a_first, a_copy, told, *t_box, *a_box, *g_box], [shared(self._near, wp.bool)]
+        )
         hit = [shared(x, wp.int32) for x in (self._hit_shape, self._hit_geom)]
         hit += [
             shared(self._hit_gap, wp.float64),
@@ -386,7 +398,8 @@ class Touching:
         ]
         self._meeting = bind(
             kernels.meet,
-            [dt, SLOTS, s_tree, s_bunch, s_radius, g_id, g_kind, g_size, g_center, g_radius, attached, *ints("trees"),
+            [dt, SLOTS, s_tree, s_bunch, s_radius, g_id, g_kind, g_size, g_center, g_radius, g_copy, told, attached,
+             *ints("trees"),
              *t_box, *s_at, s_speed, xpos, xmat, moving, speed, *g_box],
             [*ints("close"), *hit, *ints("missed")],
         )  # fmt: skip
