@@ -30,7 +30,7 @@ def children_of(marker):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    done = subprocess.run([*DEMO, "--seconds", "16", "--out", str(out)], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([*DEMO, "--seconds", "20", "--out", str(out)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return out, json.loads((out / "summary.json").read_text())
 

@@ -9,10 +9,12 @@ Exit codes: 0 done; 2 wrong use or bad input; 3 a part is missing on this machin
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import pathlib
 import sys
+import traceback
 from typing import Annotated
 
 import typer
@@ -173,15 +175,33 @@ def options(
 
 
 def main() -> None:
-    """Entry point. An error that vinesim raises itself is one line in words; any other is a defect with a traceback."""
+    """Entry point of the command line.
+
+    Leaves without taking the interpreter down in order: all is closed by then, and Python 3.11 would end threads of
+    foreign runtimes (Zenoh's are Rust) in a way that makes them abort the process.
+    """
     # Small matrices gain nothing from BLAS threads, and those would take the other core from the eyes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    code = _run()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    logging.shutdown()
+    os._exit(code)
+
+
+def _run() -> int:
+    """The exit code. An error that vinesim raises itself is one line in words; any other is a defect with a traceback."""
     try:
         app()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
     except KeyboardInterrupt:
-        sys.exit(130)
+        return 130
     except Exception as error:
         if not type(error).__module__.startswith("vinesim."):
-            raise
+            traceback.print_exc()
+            return 1
         print(f"vinesim: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(getattr(error, "exit_code", 2))
+        return getattr(error, "exit_code", 2)
+    return 0

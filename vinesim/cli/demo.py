@@ -31,6 +31,8 @@ GRACE = 1.6
 """How long a process may take to end after SIGINT before it is killed [s]."""
 
 
+START = 300.0
+"""How long a client may take to start; a first run compiles kernels [s]."""
 PATIENCE = 10.0
 """How long the visitor may take to write what it saw [s]."""
 
@@ -170,11 +172,11 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
             PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
             "--seconds", str(seconds), "--out", str(out / PUSHER), "--camera-hz", "2",
         )  # fmt: skip
-        newest = {PUSHER: json.loads(pusher.line(300.0))}
         visitor = start(
-            VISITOR, *common, "--name", VISITOR, "--connect", endpoint, "--spawn", "1", "--back", "8",
+            VISITOR, *common, "--name", VISITOR, "--connect", endpoint, "--spawn", "1", "--back", "14",
             "--namespace", VISITOR, "--out", str(out / VISITOR), "--camera-hz", "1",
         )  # fmt: skip
+        newest = {process.name: json.loads(process.line(START)) for process in (pusher, visitor)}
         watch(pusher, visitor, server, newest, console, headless)
         visitor.stop()
         visitor.reap(PATIENCE)

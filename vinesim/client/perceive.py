@@ -30,8 +30,8 @@ FIGURES_PERIOD = 0.1
 """Simulated time between two reports to the tick: what is wanted, what was sent [s]."""
 SWITCH = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
-NICE = 10
-"""Where cores are scarce, the tick goes first."""
+NICE, EYES_NICE = 5, 10
+"""Where cores are scarce, the tick goes first, then what ROS is told, then the pictures."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +141,7 @@ class _Perception:
         for place in setup.description.lidars:
             lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame)
             mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name)))
-        return stack.enter_context(Eyes(setup.model, mounts))
+        return stack.enter_context(Eyes(setup.model, mounts, nice=EYES_NICE))
 
     def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:
         return lambda: always or (self.node is not None and self.node.wanted(name))

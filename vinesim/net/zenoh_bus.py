@@ -194,12 +194,16 @@ class ZenohBus:
         self._worker.start()
 
     def _claim_name(self) -> zenoh.LivelinessToken:
-        """Declare the token of this name, unless another session has it; of two at once the lower id stays."""
+        """Declare the token of this name, unless another session has it.
+
+        Of two who come at once, the one whose token the router took second sees the first's, so never both stay; if
+        both look after both declared, neither does.
+        """
         liveliness, mine = self._session.liveliness(), str(self._session.zid())
         if self._holders() - {mine}:
             raise NameTaken(self.name, self.world)
         token = liveliness.declare_token(f"{self._prefix}live/{self.name}/{mine}")
-        if any(other < mine for other in self._holders() - {mine}):
+        if self._holders() - {mine}:
             raise NameTaken(self.name, self.world)
         return token
 

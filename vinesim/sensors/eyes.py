@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
+import sys
 import threading
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -50,13 +52,20 @@ class Eyes:
     """All sensors of one client in one thread. Use as a context manager, or :meth:`start` and :meth:`stop`."""
 
     def __init__(
-        self, model: Model, mounts: list[Mount] | tuple[Mount, ...], *, primitives: Primitives | None = None
+        self,
+        model: Model,
+        mounts: list[Mount] | tuple[Mount, ...],
+        *,
+        primitives: Primitives | None = None,
+        nice: int = 0,
     ) -> None:
+        """``nice``: how far the thread stands back where cores are scarce, as in nice(1); Linux only."""
         names = [m.name for m in mounts]
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)
             raise ValueError(f"two sensors are named {twice!r}; give each its own name")
         self.mounts = tuple(mounts)
+        self._nice = nice
         self.primitives = primitives or Primitives(model)
         self.frames = dict.fromkeys(names, 0)
         """Frames delivered by each sensor."""
@@ -120,6 +129,8 @@ class Eyes:
 
     def _run(self) -> None:
         moved: list[np.ndarray] = []
+        if self._nice and sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
         try:
             while True:
                 with self._news:
