@@ -191,7 +191,7 @@ def main() -> None:
 
 
 def _run() -> int:
-    """The exit code. An error that vinesim raises itself is one line in words; any other is a defect with a traceback."""
+    """The exit code. An error of vinesim's own is one line in words; any other is a defect with a traceback."""
     try:
         app()
     except SystemExit as end:

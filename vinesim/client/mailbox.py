@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import multiprocessing.context
+import select
 import struct
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 from multiprocessing.shared_memory import SharedMemory
 
 _HEAD = struct.Struct("<QQ")
@@ -63,3 +66,12 @@ class Mailbox:
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_owner": False, "_number": 0}
+
+
+def poller(pipe: Connection) -> Callable[[], bool]:
+    """Whether a pipe has something to read; by ``select.poll`` where there is one, a tenth of ``pipe.poll``'s time."""
+    if not hasattr(select, "poll"):
+        return pipe.poll
+    poll = select.poll()
+    poll.register(pipe.fileno(), select.POLLIN)
+    return lambda: bool(poll.poll(0))

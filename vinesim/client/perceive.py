@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.mailbox import Mailbox
+from vinesim.client.mailbox import Mailbox, poller
 from vinesim.robot.description import Description
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
@@ -149,11 +149,13 @@ class _Perception:
     # ------------------------------------------------------------------ running
 
     def run(self, mailbox: Mailbox) -> None:
+        """Until somebody says stop."""
+        has_news = poller(self.pipe)
         while True:
             letter = mailbox.take(0.05)
             if letter is not None:
                 self._read(pickle.loads(letter))
-            while self.pipe.poll():
+            while has_news():
                 kind, value = self.pipe.recv()
                 if kind == "stop":
                     return

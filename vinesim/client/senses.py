@@ -12,17 +12,14 @@ import logging
 import multiprocessing
 import pathlib
 import pickle
-import select
 import types
-from collections.abc import Callable
-from multiprocessing.connection import Connection
 from typing import Any, Self
 
 import numpy as np
 
 from vinesim.client.client import Client
 from vinesim.client.jobs import Obey
-from vinesim.client.mailbox import Mailbox
+from vinesim.client.mailbox import Mailbox, poller
 from vinesim.client.perceive import Letter, Setup, perceive
 from vinesim.robot.description import Description
 from vinesim.ros import environment
@@ -40,15 +37,6 @@ ANSWER = 10.0
 """How long the process may take to write its pictures [s]."""
 PATIENCE = 1.2
 """How long it may take to end [s]."""
-
-
-def _poller(pipe: Connection) -> Callable[[], bool]:
-    """Whether a pipe has something to read; by ``select.poll`` where there is one, a tenth of ``pipe.poll``'s time."""
-    if not hasattr(select, "poll"):
-        return pipe.poll
-    poll = select.poll()
-    poll.register(pipe.fileno(), select.POLLIN)
-    return lambda: bool(poll.poll(0))
 
 
 class SensesError(RuntimeError):
@@ -99,7 +87,7 @@ class Senses:
         )
         self._process.start()
         theirs.close()
-        self._has_news = _poller(self._pipe)
+        self._has_news = poller(self._pipe)
 
     def attach(self, client: Client) -> None:
         """Perceive this client's world from now on; waits until the process is ready."""
