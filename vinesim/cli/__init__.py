@@ -96,10 +96,9 @@ def client(
     seconds: Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")] = None,
     out: Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")] = None,
     status: Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")] = "text",
-    camera_hz: Annotated[
-        float | None, typer.Option(min=0.1, help="Pictures a second; the camera's own rate unless given.")
+    sensor_hz: Annotated[
+        float | None, typer.Option(min=0.1, help="Pictures and scans a second; each sensor's own rate unless given.")
     ] = None,
-    device: Annotated[str, typer.Option(help="Where plants are simulated: cpu or cuda:0.")] = "cpu",
 ) -> None:
     """Join the vineyard as one actor, with a simulation of its own.
 

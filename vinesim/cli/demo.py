@@ -170,11 +170,11 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
         )
         pusher = start(
             PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
-            "--seconds", str(seconds), "--out", str(out / PUSHER), "--camera-hz", "2",
+            "--seconds", str(seconds), "--out", str(out / PUSHER), "--sensor-hz", "2",
         )  # fmt: skip
         visitor = start(
             VISITOR, *common, "--name", VISITOR, "--connect", endpoint, "--spawn", "1", "--back", "14",
-            "--namespace", VISITOR, "--out", str(out / VISITOR), "--camera-hz", "1",
+            "--namespace", VISITOR, "--out", str(out / VISITOR), "--sensor-hz", "1",
         )  # fmt: skip
         newest = {process.name: json.loads(process.line(START)) for process in (pusher, visitor)}
         watch(pusher, visitor, server, newest, console, headless)

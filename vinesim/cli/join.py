@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import logging
 import os
@@ -27,7 +28,7 @@ class WrongUse(ValueError):
 def run(
     *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int,
     back: float, namespace: str, ros: bool, push: int | None, watch: int | None, near: float, seconds: float | None,
-    out: pathlib.Path | None, status: str, device: str, camera_hz: float | None,
+    out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
@@ -74,10 +75,10 @@ def run(
         senses = stack.enter_context(
             Senses(
                 name, plan, model, description,
-                namespace=namespace, ros=ros, keep_pictures=out is not None, camera_hz=camera_hz,
+                namespace=namespace, ros=ros, keep_pictures=out is not None, sensor_hz=sensor_hz,
             )
         )  # fmt: skip
-        client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device)
+        client = Client(plan, model, description, bus, name=name, pose=start, near=near)
         senses.attach(client)
         pace = Pace(client.physics.dt)
         watched = watch if watch is not None else push
@@ -96,6 +97,8 @@ def run(
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
+        gc.collect()
+        gc.freeze()  # what lives now lives to the end; the collector need not look at it in a tick
         # until here Ctrl-C simply interrupts; from now on it ends the run in order
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())

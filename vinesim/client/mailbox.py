@@ -59,10 +59,11 @@ class Mailbox:
             return bytes(self._memory.buf[_HEAD.size : _HEAD.size + size])
 
     def close(self) -> None:
-        """Let go of the memory; its owner frees it."""
+        """Let go of the memory and the semaphores; their owner frees them."""
         self._memory.close()
         if self._owner:
             self._memory.unlink()
+        del self._lock, self._news  # a semaphore is freed with the last reference to it
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_owner": False, "_number": 0}

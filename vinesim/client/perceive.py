@@ -30,7 +30,7 @@ FIGURES_PERIOD = 0.1
 """Simulated time between two reports to the tick: what is wanted, what was sent [s]."""
 SWITCH = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
-NICE, EYES_NICE = 5, 10
+NICE, EYES_NICE = 10, 15
 """Where cores are scarce, the tick goes first, then what ROS is told, then the pictures."""
 
 
@@ -45,7 +45,7 @@ class Setup:
     namespace: str
     ros: bool
     keep_pictures: bool
-    camera_hz: float | None
+    sensor_hz: float | None
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -137,10 +137,10 @@ class _Perception:
             spec = CameraSpec.load(place.type)
             camera = Camera(spec, spec.info(place.frame), place.name, setup.sun)
             wanted = self._wanted(place.name, always=setup.keep_pictures and i == 0)
-            mounts.append(Mount(camera, self._deliver_camera, wanted, setup.camera_hz))
+            mounts.append(Mount(camera, self._deliver_camera, wanted, setup.sensor_hz))
         for place in setup.description.lidars:
             lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame)
-            mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name)))
+            mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name), setup.sensor_hz))
         return stack.enter_context(Eyes(setup.model, mounts, nice=EYES_NICE))
 
     def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:

@@ -58,14 +58,15 @@ class Senses:
         namespace: str = "",
         ros: bool = True,
         keep_pictures: bool = False,
-        camera_hz: float | None = None,
+        sensor_hz: float | None = None,
     ) -> None:
         """Starts the process; :meth:`attach` gives it something to perceive.
 
         ``keep_pictures`` renders the first camera even if no ROS peer listens, and keeps the picture of the greatest
-        displacement of the watched bunch for :meth:`save`. ``camera_hz`` replaces the cameras' own rate.
+        displacement of the watched bunch for :meth:`save`. ``sensor_hz`` replaces the sensors' own rates.
         """
         self.name = name
+        self._attached = False
         if ros and (reason := environment.available()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
@@ -81,7 +82,7 @@ class Senses:
         self._mailbox = Mailbox(40 * len(model.body_mass) + (4 << 20), context)
         self._pipe, theirs = context.Pipe()
         sun = scene.sun.direction()
-        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, camera_hz)
+        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz)
         self._process = context.Process(
             target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {name}", daemon=True
         )
@@ -93,6 +94,7 @@ class Senses:
         """Perceive this client's world from now on; waits until the process is ready."""
         self.client = client
         self._wait_for("ready", START)
+        self._attached = True
         client.senses.append(self._every_tick)
         if self._ros:
             client.jobs.insert(0, Obey(client.robot, self._take_commands))
@@ -201,9 +203,11 @@ class Senses:
         """End the process."""
         with contextlib.suppress(OSError):
             self._pipe.send(("stop", None))
-        self._process.join(PATIENCE)
+        if self._attached:
+            self._process.join(PATIENCE)
         if self._process.is_alive():
-            log.warning("the senses of %s did not end by themselves", self.name)
+            if self._attached:
+                log.warning("the senses of %s did not end by themselves", self.name)
             self._process.kill()
             self._process.join()
         self._pipe.close()
