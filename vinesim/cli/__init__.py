@@ -85,6 +85,10 @@ def client(
     seed: Seed = None,
     robot: Robot = "vinebot",
     spawn: Annotated[int, typer.Option(min=0, help="Which of the scene's start places.")] = 0,
+    place: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Start at X Y [m] with YAW [rad], not at one of the scene's."),
+    ] = None,
     back: Annotated[float, typer.Option(help="Start this far behind the place and drive to it [m].")] = 0.0,
     namespace: Annotated[str, typer.Option(help="Prefix of all ROS topics.")] = "",
     ros: Annotated[bool, typer.Option(help="Talk ROS 2, if it is installed.")] = True,

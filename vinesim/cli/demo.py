@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import pathlib
 import queue
@@ -25,6 +26,8 @@ from vinesim.client import plot
 from vinesim.client.trace import Rows, remote_error
 from vinesim.robot.description import Mount
 from vinesim.ros import environment
+from vinesim.world.model import Model
+from vinesim.world.scene import Scene
 
 PUSHER, VISITOR = "picker", "visitor"
 GRACE = 1.6
@@ -33,6 +36,8 @@ GRACE = 1.6
 
 START = 300.0
 """How long a client may take to start; a first run compiles kernels [s]."""
+WAY = 14
+"""The visitor comes from so far [m]."""
 PATIENCE = 10.0
 """How long the visitor may take to write what it saw [s]."""
 
@@ -133,7 +138,6 @@ def company() -> Iterator[list[Process]]:
 
 def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
     """Run the demo and write ``out``; 0 if all went well."""
-    from vinesim.client.places import bunch_in_reach, spawn_pose
     from vinesim.robot.description import load as load_robot
     from vinesim.world.generate import generate
     from vinesim.world.scene import load as load_scene
@@ -143,7 +147,7 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
     plan = reseeded(load_scene(scene), seed)
     robot_named = load_robot(robot)  # say now, and once, what is wrong with it
     model = generate(plan)
-    bunch = bunch_in_reach(model, spawn_pose(plan, 0))
+    bunch, places = set_the_stage(plan, model)
     for folder in (out, out / PUSHER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
@@ -169,11 +173,11 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
             f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (a first run compiles kernels)"
         )
         pusher = start(
-            PUSHER, *common, "--name", PUSHER, "--connect", endpoint, "--spawn", "0", "--push", str(bunch),
+            PUSHER, *common, "--name", PUSHER, "--connect", endpoint, *places[0], "--push", str(bunch),
             "--seconds", str(seconds), "--out", str(out / PUSHER), "--sensor-hz", "2",
         )  # fmt: skip
         visitor = start(
-            VISITOR, *common, "--name", VISITOR, "--connect", endpoint, "--spawn", "1", "--back", "14",
+            VISITOR, *common, "--name", VISITOR, "--connect", endpoint, *places[1], "--back", str(WAY),
             "--namespace", VISITOR, "--out", str(out / VISITOR), "--sensor-hz", "1",
         )  # fmt: skip
         newest = {process.name: json.loads(process.line(START)) for process in (pusher, visitor)}
@@ -189,6 +193,21 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
     console.print(_result(summary))
     console.print(f"pictures, plot and summary.json are in {out}/")
     return 0
+
+
+def set_the_stage(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:
+    """The bunch to push, and where both robots start, as options: the scene's places if a bunch is in reach there."""
+    from vinesim.client import places
+
+    try:
+        return places.bunch_in_reach(model, places.spawn_pose(plan, 0)), (["--spawn", "0"], ["--spawn", "1"])
+    except places.NoPlace:
+        bunch, pusher = places.stand_before_a_bunch(model, places.spawn_pose(plan, 0)[:2])
+    poses = (pusher, places.way_to(model, pusher, WAY))
+    pusher_at, visitor_at = (
+        ["--place", *(f"{v:.4f}" for v in (p[0], p[1], 2.0 * math.atan2(p[5], p[6])))] for p in poses
+    )
+    return bunch, (pusher_at, visitor_at)
 
 
 def heard_topics(cameras: Sequence[Mount]) -> list[str]:

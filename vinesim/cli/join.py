@@ -27,6 +27,7 @@ class WrongUse(ValueError):
 
 def run(
     *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int,
+    place: tuple[float, float, float] | None,
     back: float, namespace: str, ros: bool, push: int | None, watch: int | None, near: float, seconds: float | None,
     out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
@@ -44,7 +45,7 @@ def run(
     from vinesim.client.client import Client
     from vinesim.client.jobs import DriveTo, LookAt
     from vinesim.client.pace import Pace
-    from vinesim.client.places import checked_bunch, spawn_pose
+    from vinesim.client.places import checked_bunch, placed, spawn_pose
     from vinesim.client.senses import Senses
     from vinesim.client.status import Status
     from vinesim.client.trace import Trace
@@ -57,6 +58,9 @@ def run(
 
     plan = reseeded(load_scene(scene), seed)
     description = load_robot(robot)
+    if place is not None:
+        plan = placed(plan, *place)
+        spawn = 0
     start, goal = spawn_pose(plan, spawn, back), spawn_pose(plan, spawn)
     model = generate(plan)
     name = name or f"robot-{os.getpid()}"

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 
 from vinesim import frames
+from vinesim.world.ids import Organ
 from vinesim.world.model import Model
-from vinesim.world.scene import Scene
+from vinesim.world.scene import Scene, Spawn
 
 REACH = (0.35, 0.85)
 """How far a bunch may be ahead of a robot's base to be pushed by an arm [m]."""
 HEIGHT = (1.2, 1.75)
 """Height of a bunch's centre that an arm reaches [m]."""
+
+
+ROOM = 0.55
+"""A robot's base needs this much around its middle [m]."""
 
 
 class NoPlace(ValueError):
@@ -28,6 +34,11 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
     spawn = scene.spawns[number]
     ahead = np.array([np.cos(spawn.yaw), np.sin(spawn.yaw), 0.0])
     return frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.yaw(spawn.yaw))
+
+
+def placed(scene: Scene, x: float, y: float, yaw: float) -> Scene:
+    """The same scene with one start place, at (x, y) [m] with ``yaw`` [rad]."""
+    return msgspec.structs.replace(scene, spawns=(Spawn(name="given", x=x, y=y, yaw=yaw),))
 
 
 def bunch_centres(model: Model) -> np.ndarray:
@@ -58,3 +69,46 @@ def checked_bunch(model: Model, bunch: int | None) -> int | None:
     if bunch is not None and not 0 <= bunch < len(model.bunch_body):
         raise NoPlace(f"no bunch {bunch}: this vineyard has 0 to {len(model.bunch_body) - 1}")
     return bunch
+
+
+def free_room(model: Model, points: np.ndarray) -> np.ndarray:
+    """Distance on the ground from points [n, 2] to the nearest post, trunk or box [n] m (infinite in an empty scene)."""
+    solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
+    middles = np.concatenate([model.fixed_start[solid, :2], model.box_pose[:, :2]])
+    radii = np.concatenate([model.fixed_radius[solid].max(1), 0.5 * np.hypot(*model.box_size[:, :2].T)])
+    if not len(middles):
+        return np.full(len(points), np.inf)
+    return (np.linalg.norm(points[:, None] - middles, axis=-1) - radii).min(1)
+
+
+def stand_before_a_bunch(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
+    """A bunch that an arm can push, and a pose [7] of a base before it with room around; the nearest to ``near`` [2]."""
+    centres = bunch_centres(model)
+    heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    ahead = np.stack([np.cos(heading), np.sin(heading)], -1)
+    places = centres[:, None, :2] - 0.6 * ahead
+    fits = (free_room(model, places.reshape(-1, 2)) > ROOM).reshape(places.shape[:2])
+    fits &= ((centres[:, 2] > HEIGHT[0]) & (centres[:, 2] < HEIGHT[1]))[:, None]
+    if not fits.any():
+        raise NoPlace(
+            f"no bunch of this vineyard can be pushed: none hangs {HEIGHT[0]} to {HEIGHT[1]} m high with {ROOM} m of "
+            "room for a robot before it; choose another scene or seed"
+        )
+    distance = np.where(fits, np.linalg.norm(places - near, axis=-1), np.inf)
+    bunch, turn = np.unravel_index(int(np.argmin(distance)), distance.shape)
+    return int(bunch), frames.pose(np.append(places[bunch, turn], 0.0), frames.yaw(heading[turn]))
+
+
+def way_to(model: Model, place: np.ndarray, length: float) -> np.ndarray:
+    """A pose [7] 1.6 m from a robot at ``place`` [7], at the end of a straight way of ``length`` [m] free of obstacles."""
+    heading = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+    best, most = place, -np.inf
+    for side in heading:
+        goal = place[:2] + 1.6 * np.array([np.cos(side), np.sin(side)])
+        for angle in heading:
+            back = np.array([np.cos(angle), np.sin(angle)])
+            way = goal - np.linspace(0.0, length, 40)[:, None] * back
+            room = min(float(free_room(model, way).min()), float(np.linalg.norm(way - place[:2], axis=1).min()) - 0.6)
+            if room > most:
+                best, most = frames.pose(np.append(goal, 0.0), frames.yaw(angle)), room
+    return best
