@@ -87,7 +87,7 @@ def client(
     spawn: Annotated[int, typer.Option(min=0, help="Which of the scene's start places.")] = 0,
     place: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Start at X Y [m] with YAW [rad], not at one of the scene's."),
+        typer.Option(help="Start at X Y [m] with YAW [rad] instead."),
     ] = None,
     back: Annotated[float, typer.Option(help="Start this far behind the place and drive to it [m].")] = 0.0,
     namespace: Annotated[str, typer.Option(help="Prefix of all ROS topics.")] = "",

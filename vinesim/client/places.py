@@ -20,6 +20,10 @@ ROOM = 0.55
 """A robot's base needs this much around its middle [m]."""
 
 
+CANDIDATES = 200
+"""So many of the nearest bunches are tried."""
+
+
 class NoPlace(ValueError):
     """A start place or a bunch that the scene does not have; the text says what it has."""
 
@@ -72,7 +76,7 @@ def checked_bunch(model: Model, bunch: int | None) -> int | None:
 
 
 def free_room(model: Model, points: np.ndarray) -> np.ndarray:
-    """Distance on the ground from points [n, 2] to the nearest post, trunk or box [n] m (infinite in an empty scene)."""
+    """Distance on the ground from points [n, 2] to the nearest post, trunk or box [n] m (infinite if there is none)."""
     solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
     middles = np.concatenate([model.fixed_start[solid, :2], model.box_pose[:, :2]])
     radii = np.concatenate([model.fixed_radius[solid].max(1), 0.5 * np.hypot(*model.box_size[:, :2].T)])
@@ -82,13 +86,15 @@ def free_room(model: Model, points: np.ndarray) -> np.ndarray:
 
 
 def stand_before_a_bunch(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
-    """A bunch that an arm can push, and a pose [7] of a base before it with room around; the nearest to ``near`` [2]."""
+    """A bunch that an arm can push, and a pose [7] of a base before it with room around; nearest to ``near`` [2]."""
     centres = bunch_centres(model)
+    high = np.flatnonzero((centres[:, 2] > HEIGHT[0]) & (centres[:, 2] < HEIGHT[1]))
+    high = high[np.argsort(np.linalg.norm(centres[high, :2] - near, axis=1), kind="stable")][:CANDIDATES]
+    centres = centres[high]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     ahead = np.stack([np.cos(heading), np.sin(heading)], -1)
     places = centres[:, None, :2] - 0.6 * ahead
     fits = (free_room(model, places.reshape(-1, 2)) > ROOM).reshape(places.shape[:2])
-    fits &= ((centres[:, 2] > HEIGHT[0]) & (centres[:, 2] < HEIGHT[1]))[:, None]
     if not fits.any():
         raise NoPlace(
             f"no bunch of this vineyard can be pushed: none hangs {HEIGHT[0]} to {HEIGHT[1]} m high with {ROOM} m of "
@@ -96,11 +102,11 @@ def stand_before_a_bunch(model: Model, near: np.ndarray) -> tuple[int, np.ndarra
         )
     distance = np.where(fits, np.linalg.norm(places - near, axis=-1), np.inf)
     bunch, turn = np.unravel_index(int(np.argmin(distance)), distance.shape)
-    return int(bunch), frames.pose(np.append(places[bunch, turn], 0.0), frames.yaw(heading[turn]))
+    return int(high[bunch]), frames.pose(np.append(places[bunch, turn], 0.0), frames.yaw(heading[turn]))
 
 
 def way_to(model: Model, place: np.ndarray, length: float) -> np.ndarray:
-    """A pose [7] 1.6 m from a robot at ``place`` [7], at the end of a straight way of ``length`` [m] free of obstacles."""
+    """A pose [7] 1.6 m from a robot at ``place`` [7], where a straight free way of ``length`` [m] ends."""
     heading = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     best, most = place, -np.inf
     for side in heading:
