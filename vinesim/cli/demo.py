@@ -174,11 +174,11 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
         )
         pusher = start(
             PUSHER, *common, "--name", PUSHER, "--connect", endpoint, *places[0], "--push", str(bunch),
-            "--seconds", str(seconds), "--out", str(out / PUSHER), "--sensor-hz", "2",
+            "--seconds", str(seconds), "--out", str(out / PUSHER), "--sensor-hz", "1",
         )  # fmt: skip
         visitor = start(
             VISITOR, *common, "--name", VISITOR, "--connect", endpoint, *places[1], "--back", str(WAY),
-            "--namespace", VISITOR, "--out", str(out / VISITOR), "--sensor-hz", "1",
+            "--namespace", VISITOR, "--out", str(out / VISITOR), "--sensor-hz", "0.5",
         )  # fmt: skip
         newest = {process.name: json.loads(process.line(START)) for process in (pusher, visitor)}
         watch(pusher, visitor, server, newest, console, headless)
