@@ -32,7 +32,7 @@ def demo() -> Model:
 
 @functools.cache
 def empty() -> Model:
-    return Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, box=0)
+    return Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=0)
 
 
 def shape(kind: str, *size: float, at=(0.0, 0.0, 0.0), turn=frames.IDENTITY, **others) -> Shape:

@@ -21,7 +21,7 @@ def lidar() -> Lidar:
 
 
 def _post(x: float, y: float, radius: float) -> Primitives:
-    model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=1, box=0)
+    model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=1, tie=0, box=0)
     model.fixed_start[0], model.fixed_end[0], model.fixed_radius[0] = (x, y, -1.0), (x, y, 4.0), radius
     return Primitives(model, grass=0.0)
 

@@ -60,7 +60,7 @@ def arm(name: str = "anna", index: int = 0, x: float = 0.0, y: float = 0.0, head
 
 
 def yard(boxes: int = 0, **counts: int) -> Model:
-    model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=2, box=boxes)
+    model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=2, tie=0, box=boxes)
     model.fixed_start[:], model.fixed_end[:] = [[3, 0, 0], [3, 2, 0]], [[3, 0, 2], [3, 2, 2]]
     model.fixed_radius[:] = 0.05
     model.fixed_organ[:] = Organ.POLE, Organ.WIRE

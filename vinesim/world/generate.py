@@ -596,9 +596,10 @@ def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, 
 
     model = Model.allocate(
         tree=len(size), body=int(size.sum()), bunch=int(s.bunch.sum()), leaf=int(shown.sum()),
-        fixed=len(wood.fixed["fixed_start"]), box=len(scene.boxes),
+        fixed=len(wood.fixed["fixed_start"]), tie=0, box=len(scene.boxes),
     )  # fmt: skip
     model.tree_first[:], model.tree_size[:], model.tree_vine[:] = first, size, s.vine
+    model.tree_core[:] = size
     model.tree_pose[:] = frames.pose(b.origin[:, 0], b.turn[:, 0])
 
     parent = b.parent[has]

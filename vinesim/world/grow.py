@@ -176,12 +176,14 @@ def assemble(trees: list[Tree], **others: np.ndarray) -> Model:
         "bunch": sum(len(t.bunches) for t in trees),
         "leaf": sum(len(t.leaves) for t in trees),
         "fixed": len(others.get("fixed_start", ())),
+        "tie": len(others.get("tie_body", ())),
         "box": len(others.get("box_pose", ())),
     }
     model = Model.allocate(**counts)
     first = bunch = leaf = 0
     for number, tree in enumerate(trees):
         model.tree_first[number], model.tree_size[number] = first, len(tree.bodies)
+        model.tree_core[number] = len(tree.bodies)
         model.tree_pose[number], model.tree_vine[number] = tree.pose, tree.vine
         for i, body in enumerate(tree.bodies):
             at = first + i

@@ -36,6 +36,9 @@ class Model(Arrays):
     tree_pose: np.ndarray = array("tree", 7, unit="m, 1", fill=_UNIT_POSE)
     """Pose in the world of the frame on which the root's joint sits."""
     tree_vine: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
+    tree_core: np.ndarray = array("tree", unit="1", dtype=np.int32)
+    """How many of its bodies move while nobody is close; the rest are the berry clusters of its bunches, which then
+    ride on their bunch as one *compound*. A tree without clusters is all core."""
 
     # bodies
     body_tree: np.ndarray = array("body", unit="1", dtype=np.int32)
@@ -54,6 +57,8 @@ class Model(Arrays):
     body_length: np.ndarray = array("body", unit="m")
     body_radius: np.ndarray = array("body", 2, unit="m")
     """Radius at the origin and at the tip."""
+    body_drag: np.ndarray = array("body", unit="m^2")
+    """Drag area Cd A of leaves and wood in the wind, acting at the centre of mass."""
     joint_stiffness: np.ndarray = array("body", 3, unit="N m/rad")
     """About the joint frame's axes: torsion, bending, bending."""
     joint_damping: np.ndarray = array("body", 3, unit="N m s/rad")
@@ -71,6 +76,27 @@ class Model(Arrays):
     bunch_berries: np.ndarray = array("bunch", unit="1", dtype=np.int32)
     bunch_pull: np.ndarray = array("bunch", unit="N", fill=60.0)
     """Pulling force that parts the peduncle."""
+    bunch_bend: np.ndarray = array("bunch", unit="N m", fill=2.0)
+    """Moment that breaks the peduncle."""
+    bunch_cluster: np.ndarray = array("bunch", unit="1", dtype=np.int32, fill=-1)
+    """First body of its berry clusters (Organ.BUNCH, behind the core of the tree), -1 if it has none: then the bunch is
+    always one compound. ``body_mass``, ``body_com`` and ``body_inertia`` of ``bunch_body`` are the compound's."""
+    bunch_clusters: np.ndarray = array("bunch", unit="1", dtype=np.int32)
+    """How many clusters follow from ``bunch_cluster`` on."""
+    bunch_head_mass: np.ndarray = array("bunch", unit="kg")
+    """What of ``bunch_body`` is no cluster: the head of the rachis. Compound = head + clusters at ``joint_settled``."""
+    bunch_head_com: np.ndarray = array("bunch", 3, unit="m")
+    bunch_head_inertia: np.ndarray = array("bunch", 3, unit="kg m^2")
+
+    # ties: canes bound to wires; springs between a point of a body and a point of the world, slack as drawn
+    tie_body: np.ndarray = array("tie", unit="1", dtype=np.int32)
+    """Sorted."""
+    tie_point: np.ndarray = array("tie", 3, unit="m")
+    """In the body's frame."""
+    tie_anchor: np.ndarray = array("tie", 3, unit="m")
+    """In the world."""
+    tie_stiffness: np.ndarray = array("tie", unit="N/m")
+    tie_damping: np.ndarray = array("tie", unit="N s/m")
 
     # leaves ride on bodies; seen by sensors, felt as drag and mass only
     leaf_body: np.ndarray = array("leaf", unit="1", dtype=np.int32)

@@ -22,6 +22,15 @@ class State(Arrays):
     """World pose (position, quaternion xyzw), derived from ``joint_q``."""
     body_qd: np.ndarray = array("body", 6, unit="m/s, rad/s")
     """World velocity of the body's origin, then angular velocity, derived from ``joint_qd``."""
+    body_cut: np.ndarray = array("body", unit="1", dtype=np.bool_)
+    """Whether the body has been cut off its parent: then it is a floating root of what grows on it, ``joint_q`` its
+    rotation in the world and ``joint_qd`` its angular velocity in world axes."""
+    joint_x: np.ndarray = array("body", 3, unit="m")
+    """World position of a body that has been cut off; of no meaning for others."""
+    joint_xd: np.ndarray = array("body", 3, unit="m/s")
+    """World velocity of its origin."""
+    tree_fine: np.ndarray = array("tree", unit="1", dtype=np.bool_)
+    """Whether the berry clusters of the tree's bunches move, each for itself; else each bunch is one compound."""
     tree_awake: np.ndarray = array("tree", unit="1", dtype=np.bool_)
     bunch_attached: np.ndarray = array("bunch", unit="1", dtype=np.bool_, fill=1)
 

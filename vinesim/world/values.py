@@ -122,6 +122,26 @@ class Contact:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class Parting:
+    """Something left its plant: a bunch its peduncle, or a cane the rest of its tree."""
+
+    tick: int
+    tree: int
+    body: int
+    """The body that left; what grows on it went with it."""
+    bunch: int
+    """Which bunch, -1 for a cane."""
+    cause: str
+    """``"pull"`` (too much force), ``"bend"`` (too much moment), ``"blade"`` (a cutter closed on it), ``"command"``."""
+    actor: str
+    """Whose doing it was, as far as is known; empty otherwise."""
+    force: np.ndarray
+    """[3] N that the joint carried at the end, world axes, on what left."""
+    moment: np.ndarray
+    """[3] N m about the joint."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class JointSample:
     """Joints of one robot at one instant, in the order of ``names``."""
 
