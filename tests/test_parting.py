@@ -5,12 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from touch_scenes import bunch_scene, cane, grasp, gripper
+from touch_scenes import bar, bunch_scene, cane, grasp, gripper
 
 from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.world.grow import assemble
 from vinesim.world.ids import Organ
+from vinesim.world.values import Parting
 
 
 def momentum(physics: Physics, name: str) -> np.ndarray:
@@ -64,50 +65,135 @@ def test_the_vine_springs_up_without_its_bunch():
     assert np.isfinite(physics.view().body_q).all()
 
 
-def test_a_bunch_cut_in_the_grasp_stays_in_it():
+def detached_in_the_grasp() -> tuple[Physics, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Grasp, lift, let the shears take it: bunch in the hand, finger forces of each later tick, what was before."""
     model, _, middle = bunch_scene()
     physics = Physics(model)
     physics.add_robot(gripper(middle))
     for tick in range(290):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         physics.step()
-    squeeze = physics.rigid.read("grip")[3][2]
-    hand = physics.rigid.link_pose("grip", "hand")[2]
+    squeeze = physics.rigid.read("grip")[3][2:].copy()
+    start = physics.rigid.link_pose("grip", "hand")[2]
     physics.pick(0)
-    start = physics.rigid.link_q()[-1, :3].copy()
-    heights = []
+    seen = []
     for _ in range(200):
         physics.step()
-        heights.append(physics.view().link_q[-1, 2] - physics.rigid.link_pose("grip", "hand")[2])
-    assert physics.rigid.read("grip")[3][2] == pytest.approx(squeeze, rel=0.02)
-    assert abs(heights[-1] - heights[0]) < 1e-4  # over 2 s
-    assert np.linalg.norm(physics.rigid.link_q()[-1, :3] - start) < 3e-3
+        hand = physics.rigid.link_pose("grip", "hand")[:3]
+        seen.append([*(physics.rigid.bunch_pose(0)[:3] - hand), *physics.rigid.read("grip")[3][2:]])
+    return physics, np.array(seen)[:, :3], np.array(seen)[:, 3:], squeeze, start
+
+
+def test_a_bunch_cut_in_the_grasp_stays_in_it():
+    physics, place, fingers, squeeze, start = detached_in_the_grasp()
+    assert np.abs(fingers / squeeze - 1.0).max() < 0.015  # in every tick of 2 s
+    assert np.abs(place - place[0]).max() < 5e-5
     # the lift now carries the bunch's weight, which its peduncle no longer does
     assert physics.rigid.read("grip")[3][1] == pytest.approx(-0.5 * 9.81, rel=0.02)
-    assert hand == pytest.approx(physics.rigid.link_pose("grip", "hand")[2], abs=3e-3)
+    assert start == pytest.approx(physics.rigid.link_pose("grip", "hand")[2], abs=3e-3)
     assert not physics.plants.state.bunch_attached[0]
 
 
-def test_a_peduncle_parts_when_it_is_pulled_harder_than_it_holds():
+def test_twice_the_same_bits():
+    data = [detached_in_the_grasp()[0].rigid.data for _ in range(2)]
+    assert data[0].qpos.tobytes() + data[0].qvel.tobytes() == data[1].qpos.tobytes() + data[1].qvel.tobytes()
+
+
+def pulled(pull: float, bend: float, ticks: int = 400) -> tuple[Physics, tuple[Parting, ...], np.ndarray]:
+    """A gripper closes on a bunch and goes down and down: the partings, and the peduncle's wrench tick by tick."""
     model, _, middle = bunch_scene()
-    model.bunch_pull[0] = 12.0
+    model.bunch_pull[0], model.bunch_bend[0] = pull, bend
     physics = Physics(model)
     physics.add_robot(gripper(middle, effort=80.0))
-    picked_at, pulls = None, []
-    for tick in range(400):
+    wrenches: list[np.ndarray] = []
+    for tick in range(ticks):
         target, _ = grasp(0.01 * min(tick, 130))
-        target[1] = -0.002 * max(tick - 150, 0)  # down and down
+        target[1] = -0.002 * max(tick - 150, 0)
+        if pull > 1e3:  # turn it aside rather than pull
+            target[:2] = 0.002 * max(tick - 150, 0), 0.0
         physics.rigid.command("grip", target)
         physics.step()
-        pulls.append(float(np.linalg.norm(physics.plants.joint_wrench(model.bunch_body)[0, :3])))
+        wrenches.append(physics.plants.joint_wrench(model.bunch_body)[0])
         if physics.partings:
-            picked_at = tick
             break
-    assert picked_at is not None
-    assert picked_at > 155
-    assert min(pulls[-3:-1]) > 12.0  # the third tick too strong, after which it hangs no more
-    assert max(pulls[:150]) < 12.0
+    return physics, physics.partings, np.array(wrenches)
+
+
+def test_a_peduncle_parts_when_it_is_pulled_harder_than_it_holds():
+    physics, partings, wrenches = pulled(12.0, 1e3)
+    (parting,) = partings
+    force = np.linalg.norm(wrenches[:, :3], axis=1)
+    assert len(force) > 155
+    assert force[-3:-1].min() > 12.0  # the third tick too strong, after which it hangs no more
+    assert force[:150].max() < 12.0
+    assert (parting.bunch, parting.cause, parting.actor) == (0, "pull", "grip")
+    assert (parting.tick, parting.body) == (physics.tick, physics.model.bunch_body[0])
+    assert np.linalg.norm(parting.force) > 12.0
+    assert parting.force[2] > 10.0  # what the vine held on with, upwards
     assert physics.rigid.loose == (0,)
+
+
+def test_a_peduncle_breaks_when_it_is_bent_further_than_it_gives():
+    _, (parting,), wrenches = pulled(1e4, 0.05)
+    moment = np.linalg.norm(wrenches[:, 3:], axis=1)
+    assert (parting.bunch, parting.cause, parting.actor) == (0, "bend", "grip")
+    assert np.linalg.norm(parting.moment) > 0.05
+    assert moment[-3:-1].min() > 0.05
+
+
+def test_nothing_parts_without_strain():
+    physics, partings, _ = pulled(1e5, 1e5, 200)
+    assert partings == ()
+    assert physics.rigid.loose == ()
+
+
+def test_a_command_is_told_with_the_weight_the_stalk_carried():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    physics.pick(0)
+    assert physics.partings == ()
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.tree, parting.body, parting.bunch, parting.cause, parting.actor) == (0, body, 0, "command", "")
+    np.testing.assert_allclose(parting.force, [0.0, 0.0, 0.5 * 9.81], atol=1e-4)
+    physics.step()
+    assert physics.partings == ()
+    with pytest.raises(ValueError, match="no bunch 7"):
+        physics.pick(7)
+
+
+def test_a_blade_that_closes_on_the_stalk_takes_the_bunch():
+    model, body, middle = bunch_scene()
+    physics = Physics(model)
+    stalk = physics.view().body_q[body - 1, :3]
+    physics.add_robot(bar(stalk + [0.0, -0.5, -0.2]))
+    mouth = physics.blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.18])), np.array([0.03, 0.03, 0.002]))
+    physics.step()
+    assert physics.partings == ()
+    mouth.close()
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.bunch, parting.body, parting.cause, parting.actor) == (0, body, "blade", "bar")
+    assert parting.force[2] == pytest.approx(0.5 * 9.81, rel=0.05)
+    mouth.close()  # on the stub of the stalk: nothing is left to cut
+    physics.step()
+    assert physics.partings == ()
+    with pytest.raises(ValueError, match="no link 'hand'"):
+        physics.blade("bar", "hand", mouth.pose, mouth.half)
+    physics.remove_robot("bar")
+    assert physics.parting.blades == []
+
+
+def test_a_blade_beside_the_stalk_cuts_nothing():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    stalk = physics.view().body_q[body - 1, :3]
+    physics.add_robot(bar(stalk + [0.0, -0.5, -0.2]))
+    for offset in ([0.05, 0.5, 0.18], [0.0, 0.54, 0.18], [0.0, 0.5, 0.12]):
+        mouth = physics.blade("bar", "bar", frames.pose(np.array(offset)), np.array([0.03, 0.03, 0.002]))
+        mouth.close()
+        physics.step()
+        assert physics.partings == (), offset
 
 
 def test_a_bunch_dropped_over_a_crate_ends_in_it():

@@ -780,8 +780,14 @@ def _place_of(slot: int) -> np.ndarray:
 
 
 def _alone(loose: Loose) -> mujoco.MjModel:
-    """A bunch in a world of its own: a free body of round shapes, hard enough not to creep out of a gripper."""
+    """A bunch in a world of its own."""
     spec = mujoco.MjSpec()
+    _drop(spec, loose)
+    return spec.compile()
+
+
+def _drop(spec: mujoco.MjSpec, loose: Loose) -> None:
+    """A bunch as a free body of round shapes, hard enough not to creep out of a gripper."""
     if not 0 < len(loose.radius) <= LUMPS:
         raise ValueError(f"a bunch of {len(loose.radius)} shapes; a loose one has 1 to {LUMPS}")
     body = spec.worldbody.add_body(mass=loose.mass, ipos=loose.com, inertia=loose.inertia, explicitinertial=True)
@@ -799,7 +805,6 @@ def _alone(loose: Loose) -> mujoco.MjModel:
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=loose.start[0], mass=0.0, contype=_BOX,
             conaffinity=_ALL,
         )  # fmt: skip
-    return spec.compile()
 
 
 def _tracks(spec: RobotSpec) -> tuple[np.ndarray, np.ndarray]:
