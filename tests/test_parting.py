@@ -163,10 +163,10 @@ def test_a_command_is_told_with_the_weight_the_stalk_carried():
 
 
 def test_a_blade_that_closes_on_the_stalk_takes_the_bunch():
-    model, body, middle = bunch_scene()
+    model, body, _ = bunch_scene()
     physics = Physics(model)
     stalk = physics.view().body_q[body - 1, :3]
-    physics.add_robot(bar(stalk + [0.0, -0.5, -0.2]))
+    physics.add_robot(bar(stalk + np.array([0.0, -0.5, -0.2])))
     mouth = physics.blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.18])), np.array([0.03, 0.03, 0.002]))
     physics.step()
     assert physics.partings == ()
@@ -188,7 +188,7 @@ def test_a_blade_beside_the_stalk_cuts_nothing():
     model, body, _ = bunch_scene()
     physics = Physics(model)
     stalk = physics.view().body_q[body - 1, :3]
-    physics.add_robot(bar(stalk + [0.0, -0.5, -0.2]))
+    physics.add_robot(bar(stalk + np.array([0.0, -0.5, -0.2])))
     for offset in ([0.05, 0.5, 0.18], [0.0, 0.54, 0.18], [0.0, 0.5, 0.12]):
         mouth = physics.blade("bar", "bar", frames.pose(np.array(offset)), np.array([0.03, 0.03, 0.002]))
         mouth.close()

@@ -17,7 +17,7 @@ CRATE = 2.0
 
 
 def dropped(into_crate: bool) -> Physics:
-    """Ten bunches let fall one after the other, in any attitude: from the crate's rim, or from 15 cm over the ground."""
+    """Ten bunches let fall one after the other, in any attitude: from the crate's rim, or from 15 cm above ground."""
     trees = [cane((1.5 * i, 20.0, 1.0), bunch=float(mass)) for i, mass in enumerate(MASSES)]
     box = {"box_pose": [[0.0, 0.0, 0.001, 0, 0, 0, 1]], "box_size": [[0.6, 0.4, 0.3]], "box_mass": [[CRATE]]}
     physics = Physics(assemble(trees, **box))

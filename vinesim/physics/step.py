@@ -112,7 +112,7 @@ class Physics:
         self._body_q = None
 
     def cut(self, body: int) -> None:
-        """Cut a piece of cane off its vine, between ticks; of a peduncle, its bunch leaves: see :meth:`Partings.cut`."""
+        """Cut a piece of wood off its vine, between ticks; see :meth:`Partings.cut`."""
         self.parting.cut(body)
         self._body_q = None
 
