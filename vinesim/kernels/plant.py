@@ -19,7 +19,8 @@ Ties and air drag are forces at a point c of a body that grow against its veloci
 mass W at c: W = phi dt (phi dt k + c) for a spring and damper, dt c for drag.
 
 Gyroscopic and centrifugal terms stay explicit and err by about dt w^2 a second. A body turning faster than ``brisk``
-is therefore held back by a drag dt (w^2 - brisk^2) times its momentum, and no joint is integrated beyond ``limit``.
+is therefore held back by a drag dt (w^2 - brisk^2) times its momentum, and a tree with a joint beyond ``limit`` goes on
+at half of it.
 
 Signs and frames: world axes; velocities and accelerations are (linear of the body's origin, angular), wrenches (force
 at the origin, moment about it). The inertia of a body or subtree about the body's origin is held as three blocks,
@@ -588,13 +589,15 @@ def integrate(
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
     sound = fastest <= bound * bound
     phi = tree_phi[tree]
+    # a tree beyond limit is slowed as a whole and well below it: holding back single joints would feed energy into the
+    # others, and a loaded cane would thrash at the limit for ever
+    slower = float(1.0)
+    if fastest > limit * limit:
+        slower = 0.5 * limit / wp.sqrt(fastest)
     for k in range(first, last):
         floats = body_parent[k] < 0 and body_root[k] >= 0
         if sound:
-            rate = joint_qd_free[k]
-            square = wp.length_sq(rate)
-            if square > limit * limit:
-                rate = rate * (limit / wp.sqrt(square))
+            rate = slower * joint_qd_free[k]
             mean = (1.0 - phi) * joint_qd[k] + phi * rate
             joint_qd_out[k] = rate
             joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q[k])
