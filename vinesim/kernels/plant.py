@@ -19,7 +19,8 @@ Ties and air drag are forces at a point c of a body that grow against its veloci
 mass W at c: W = phi dt (phi dt k + c) for a spring and damper, dt c for drag.
 
 Gyroscopic and centrifugal terms stay explicit and err by about dt w^2 a second. A body turning faster than ``brisk``
-is therefore held back by a drag dt (w^2 - brisk^2) times its momentum, and no joint is integrated beyond ``limit``.
+is therefore held back by a drag dt (w^2 - brisk^2) times its momentum, and a tree with a joint beyond ``limit`` goes on
+at half of it.
 
 Signs and frames: world axes; velocities and accelerations are (linear of the body's origin, angular), wrenches (force
 at the origin, moment about it). The inertia of a body or subtree about the body's origin is held as three blocks,
@@ -583,23 +584,26 @@ def integrate(
     first = tree_first[tree]
     last = first + tree_moving[tree]
     fastest = float(0.0)
+    falling = float(0.0)
     for k in range(first, last):
         square = wp.length_sq(joint_qd_free[k])
-        if body_parent[k] < 0 and body_root[k] >= 0:
-            square += wp.length_sq(joint_xd_free[k])
         if square > fastest or square != square:  # NaN enters, and stays
             fastest = square
-    tree_rate_out[tree] = wp.sqrt(fastest)
+        if body_parent[k] < 0 and body_root[k] >= 0:
+            falling = wp.max(falling, wp.length_sq(joint_xd_free[k]))
+    tree_rate_out[tree] = wp.sqrt(fastest + falling)
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
-    sound = fastest <= bound * bound
+    sound = fastest + falling <= bound * bound
     phi = tree_phi[tree]
+    # a tree beyond limit is slowed as a whole and well below it: holding back single joints would feed energy into the
+    # others, and a loaded cane would thrash at the limit for ever
+    slower = float(1.0)
+    if fastest > limit * limit:
+        slower = 0.5 * limit / wp.sqrt(fastest)
     for k in range(first, last):
         floats = body_parent[k] < 0 and body_root[k] >= 0
         if sound:
-            rate = joint_qd_free[k]
-            square = wp.length_sq(rate)
-            if square > limit * limit:
-                rate = rate * (limit / wp.sqrt(square))
+            rate = slower * joint_qd_free[k]
             share = phi
             if floats:  # no spring turns it: nothing to be had from phi but error
                 share = 0.5
