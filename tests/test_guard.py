@@ -294,7 +294,7 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
         ({"wood": Wood(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
         ({"wood": Wood(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
         ({"pieces": 0}, r"rod of .* 0 pieces.*all must be positive"),
-        ({"parent": 3}, r"body 0 names parent 3, which does not stand before it"),
+        ({"parent": 3, "offset": (0, 0, 0)}, r"body 0 names parent 3, which does not stand before it"),
     ],
 )
 def test_wood_that_cannot_be_is_refused_in_words(change: dict, says: str) -> None:
