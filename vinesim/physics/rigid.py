@@ -394,6 +394,17 @@ class Rigid:
             label[:-1] = np.where(d.tree_island >= 0, m.ntree + 1 + d.tree_island, label[:-1])
         return label[m.body_treeid[m.geom_bodyid]]
 
+    def bound(self, bodies: np.ndarray) -> bool:
+        """Whether native constraints that are active now bind one of these MuJoCo bodies [k].
+
+        If not, the metric of the tick is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.
+        """
+        m, d = self.world, self.data
+        if d.nefc == 0:
+            return False
+        tree = m.body_treeid[bodies]
+        return d.nisland == 0 or bool((d.tree_island[tree[tree >= 0]] >= 0).any())
+
     def inverse(self, J: np.ndarray) -> np.ndarray:
         """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
 
