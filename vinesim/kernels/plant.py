@@ -450,13 +450,15 @@ def integrate(
     tree_awake: wp.array(dtype=wp.bool),
     tree_phi: wp.array(dtype=float),
     joint_qd_free: wp.array(dtype=wp.vec3),
+    joint_q: wp.array(dtype=wp.quat),
+    joint_qd: wp.array(dtype=wp.vec3),
     # out
     tree_rate_out: wp.array(dtype=float),
     tree_onset_out: wp.array(dtype=wp.int32),
     joint_q_out: wp.array(dtype=wp.quat),
     joint_qd_out: wp.array(dtype=wp.vec3),
 ):
-    """Move the joints of one tree to the end of the tick; a tree beyond bound stops where the tick began."""
+    """Move the joints of one tree to the end of the tick (in place or not); beyond bound it stays where it began."""
     tree = trees[wp.tid()]
     if not tree_awake[tree]:
         return
@@ -477,11 +479,12 @@ def integrate(
             square = wp.length_sq(rate)
             if square > limit * limit:
                 rate = rate * (limit / wp.sqrt(square))
-            mean = (1.0 - phi) * joint_qd_out[k] + phi * rate
+            mean = (1.0 - phi) * joint_qd[k] + phi * rate
             joint_qd_out[k] = rate
-            joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q_out[k])
+            joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q[k])
         else:
             joint_qd_out[k] = wp.vec3()
+            joint_q_out[k] = joint_q[k]
 
 
 @wp.kernel

@@ -9,7 +9,9 @@ The scheme (:mod:`vinesim.kernels.plant`) damps as if every joint's beta (dampin
 
 from __future__ import annotations
 
+import functools
 import math
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -17,7 +19,8 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import plant
-from vinesim.kernels.launch import bind
+from vinesim.kernels.launch import Crew, bind
+from vinesim.physics.memory import Memory
 from vinesim.world.grow import GRAVITY
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -34,6 +37,12 @@ LIMIT = 50.0
 BOUND = 5000.0
 """[rad/s] A tree of which a joint would turn faster than this is not integrated: see :mod:`vinesim.physics.guard`."""
 
+FEW = 100
+"""[tree] For fewer awake trees a thread, handing ``free()`` to other threads costs more than it saves."""
+
+FEW_MOVES = 1000
+"""[tree] The same for the move at the end of ``commit()``, which is twelve times as short."""
+
 
 class Plants:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
@@ -46,12 +55,15 @@ class Plants:
         state: its arrays are read and written in place.
         dt: tick [s].
         phi: 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
-        device: ``"cpu"``; the views need memory that both sides see.
+        device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
+            them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
+        threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
         brisk: [rad/s] see :data:`BRISK`.
         limit: [rad/s] see :data:`LIMIT`.
         bound: [rad/s] see :data:`BOUND`.
         tension: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without it a heavy
             bunch on a soft peduncle gains energy every tick; off only to compare with solvers that do without.
+        memory: where arrays live, instead of what ``device`` says.
     """
 
     def __init__(
@@ -62,13 +74,16 @@ class Plants:
         dt: float = 0.01,
         phi: float = 0.55,
         device: str = "cpu",
+        threads: int = 1,
         brisk: float = BRISK,
         limit: float = LIMIT,
         bound: float = BOUND,
         tension: bool = True,
+        memory: Memory | None = None,
     ) -> None:
-        if device != "cpu":
-            raise ValueError(f"device {device!r}: plants share memory with NumPy; use 'cpu'")
+        memory = Memory(device) if memory is None else memory
+        if threads < 1 or (threads > 1 and not memory.device.is_cpu):
+            raise ValueError(f"{threads} threads on {device}: 1 or more on cpu; a GPU needs none, leave threads at 1")
         if not dt > 0.0 or not 0.5 <= phi <= 1.0:
             raise ValueError(f"dt {dt} s, phi {phi}: need dt above 0 and phi from 0.5 to 1")
         check(model, state)
@@ -99,6 +114,17 @@ class Plants:
         self._subset = np.zeros(trees, np.int32)
         self._stepped = np.zeros(0, np.int32)
         self._capacity = 0
+        self._memory, self.threads = memory, threads
+        for owner in (self, state):
+            for name, value in vars(owner).items():
+                if isinstance(value, np.ndarray):
+                    setattr(owner, name, memory.within_reach(value))
+        self._crew = Crew(threads) if threads > 1 else None
+        if self._crew is not None:
+            weakref.finalize(self, self._crew.close)
+        self._share_ends = [0] * (threads + 1)
+        self._graph: wp.Graph | None = None
+        self._graph_count = -1
         self._record(tension)
         self._pack()
 
@@ -141,9 +167,11 @@ class Plants:
 
     def free(self) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the tick and solve the motion without contacts."""
-        self._stepped = self._list
-        self._stepping[: len(self._list)] = self._list
-        self._free(len(self._list))
+        self._choose()
+        self._carry_in(len(self._stepped))
+        self._all(self._free, FEW)
+        self._carry_out_free(len(self._stepped))
+        self._memory.wait()
 
     def response(self, bodies: np.ndarray) -> np.ndarray:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
@@ -160,6 +188,7 @@ class Plants:
         self._asked[:n] = bodies
         self._asked[n] = -1
         self._respond(n)
+        self._memory.wait()
         y = self._response[:n, :, :n].reshape(6 * n, 6 * n)
         return (0.5 * (y + y.T)).reshape(n, 6, n, 6)
 
@@ -168,6 +197,7 @@ class Plants:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
+        changed = len(self._pushed) > 0
         self._wrench[self._pushed] = 0.0
         self._pushed = np.zeros(0, np.int32)
         if bodies is not None and len(bodies):
@@ -177,12 +207,48 @@ class Plants:
             self._pushed = bodies.astype(np.int32)
             touched = np.unique(self.model.body_tree[bodies])
             self._subset[: len(touched)] = touched
+            self._carry_wrench(len(self._stepped))
             self._push(len(touched))
             begun = touched[self._touched[touched] < self.tick - 1]
             self._onset[begun] = ONSET + 1  # integrating counts this tick
             self._touched[touched] = self.tick
-        self._integrate(len(self._stepped))
+        elif changed:
+            self._carry_wrench(len(self._stepped))
+        self._all(self._integrate, FEW_MOVES)
+        self._carry_out_commit(len(self._stepped))
+        self._memory.wait()
         self.tick += 1
+
+    def advance(self, ticks: int) -> None:
+        """Many ticks of the awake trees with nothing in between: no contacts, no sleep, no guard.
+
+        Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
+        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free`` and
+        ``acceleration`` are of the last tick; a tree that went wrong stays where it was (``tree_rate`` is NaN or above
+        ``bound``).
+        """
+        self._choose()
+        if len(self._pushed) and ticks > 0:  # the next prediction still knows the last contacts
+            self._together(1)
+            self._wrench[self._pushed] = 0.0
+            self._pushed = np.zeros(0, np.int32)
+            self._carry_wrench(len(self._stepped))
+            self._together(ticks - 1)
+        else:
+            self._together(ticks)
+        self.tick += ticks
+
+    def upload(self) -> None:
+        """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
+        self._choose()
+        self._carry_in(len(self._stepped))
+        self._memory.wait()
+
+    def download(self) -> None:
+        """Bring the host's arrays of the awake trees up to the device's copies, as ``free()`` and ``commit()`` do."""
+        self._carry_out_free(len(self._stepped))
+        self._carry_out_commit(len(self._stepped))
+        self._memory.wait()
 
     def brace(self, trees: np.ndarray) -> None:
         """Use phi = 1 in the next ``ONSET`` ticks of trees about to be touched (``commit()`` sees to new touches)."""
@@ -192,7 +258,10 @@ class Plants:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""
         trees = self._list if trees is None else np.atleast_1d(trees)
         self._subset[: len(trees)] = trees
+        self._carry_in_place(len(trees))
         self._place(len(trees))
+        self._carry_out_place(len(trees))
+        self._memory.wait()
 
     def pull(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
@@ -217,11 +286,11 @@ class Plants:
 
         Of the last tick, and only for bodies of trees that were awake in it. At rest it carries what hangs below.
         """
-        n = len(bodies)
-        out = wp.zeros(n, dtype=wp.spatial_vector, device="cpu")
-        asked = wp.array(np.asarray(bodies, np.int32), dtype=wp.int32, device="cpu")
+        n, device = len(bodies), self._memory.device
+        out = wp.zeros(n, dtype=wp.spatial_vector, device=device)
+        asked = wp.array(np.asarray(bodies, np.int32), dtype=wp.int32, device=device)
         if n:
-            m = self._arrays
+            m = self._memory.arrays
             wp.launch(
                 plant.joint_wrench,
                 n,
@@ -231,7 +300,7 @@ class Plants:
                     m["body_load"], m["wrench"],
                 ],
                 outputs=[out],
-                device="cpu",
+                device=device,
             )  # fmt: skip
         return out.numpy()
 
@@ -259,9 +328,54 @@ class Plants:
             late = next(i for i, tree in enumerate(trees) if tree not in self._stepped)
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before free()")
 
+    def _choose(self) -> None:
+        """The awake trees are the ones that this tick steps; deal them out to the threads."""
+        if self._stepped is self._list:
+            return
+        self._stepped = trees = self._list
+        self._stepping[: len(trees)] = trees
+        bodies = np.cumsum(self.model.tree_size[trees])
+        parts = np.arange(self.threads + 1) * (int(bodies[-1]) if len(trees) else 0) // self.threads
+        self._share_ends[:] = np.searchsorted(bodies, parts, side="right").tolist()
+
+    def _all(self, launch: Callable[..., None], few: int) -> None:
+        """Launch over the trees that this tick steps, on all threads if there are ``few`` for each."""
+        if self._crew is None or len(self._stepped) < few * self.threads:
+            launch(len(self._stepped))
+        else:
+            self._crew.share(self._shares[launch])
+
+    def _together(self, ticks: int) -> None:
+        """Predict and move, so many times, without coming back in between."""
+        count, ends = len(self._stepped), self._share_ends
+        if count == 0:
+            return
+        if not self._memory.device.is_cpu:
+            if count != self._graph_count:
+                with wp.ScopedCapture(self._memory.device) as capture:
+                    self._free(count)
+                    self._integrate(count)
+                self._graph, self._graph_count = capture.graph, count
+            for _ in range(ticks):
+                wp.capture_launch(self._graph)
+            self._memory.wait()
+        elif self._crew is None or count < self.threads:
+            _run(self._free, self._integrate, ticks, count)
+        else:
+            self._crew.share(
+                [
+                    functools.partial(_run, self._free, self._integrate, ticks, ends[i + 1] - ends[i], ends[i], i)
+                    for i in range(self.threads)
+                ]
+            )
+
     def _record(self, tension: bool) -> None:
-        """Bind every kernel to the arrays once."""
-        model, state = self.model, self.state
+        """Bind every kernel to the arrays once.
+
+        Arrays of the model are constants. Of the others, floats with a row for each body are what a GPU keeps a copy
+        of (see :mod:`vinesim.physics.memory`); they are carried to it before every ``free()`` unless ``made`` there.
+        """
+        model, state, memory = self.model, self.state, self._memory
         kinds = {
             wp.int32: {"tree_first": model.tree_first, "tree_size": model.tree_size, "body_tree": model.body_tree,
                        "body_parent": model.body_parent, "stepping": self._stepping, "subset": self._subset,
@@ -277,15 +391,19 @@ class Plants:
             wp.spatial_vector: {"body_qd": state.body_qd, "body_load": self.body_load, "wrench": self._wrench,
                                 "acceleration": self.acceleration, "velocity_free": self.velocity_free},
         }  # fmt: skip
-        self._arrays = a = {
-            name: wp.array(data, dtype=dtype, device="cpu", copy=False)
-            for dtype, arrays in kinds.items()
-            for name, data in arrays.items()
-        }
-        for arrays in kinds.values():
+        made = ("body_q", "body_qd", "velocity_free", "acceleration", "wrench")
+        given = []
+        constants = {id(value) for value in vars(model).values()}
+        bodies = len(model.body_mass)
+        for dtype, arrays in kinds.items():
             for name, data in arrays.items():
-                if data.size and a[name].ptr != data.ctypes.data:
-                    raise ValueError(f"{name} cannot be shared with Warp; give a C-contiguous array of its own")
+                if id(data) in constants:
+                    memory.constant(name, data, dtype)
+                elif data.dtype == np.float32 and len(data) == bodies and not name.startswith("tree"):
+                    memory.rows(name, data, dtype)
+                    given += [name] if name not in made else []
+                else:
+                    memory.reach(name, data, dtype)
         scratch = {
             wp.vec3: ("lever", "drawn", "Du", "joint_qd_free"),
             wp.quat: ("axes",),
@@ -293,14 +411,28 @@ class Plants:
             wp.spatial_vector: ("bias", "spread"),
         }
         for dtype, names in scratch.items():
-            a |= {name: wp.empty(len(model.body_mass), dtype=dtype, device="cpu") for name in names}
+            for name in names:
+                memory.scratch(name, bodies, dtype)
+        a, largest = memory.arrays, int(model.tree_size.max(initial=1))
 
-        def record(kernel: wp.Kernel, *inputs: object) -> Callable[[int], None]:
-            return bind(kernel, [a[value] if isinstance(value, str) else value for value in inputs], [])
+        def record(kernel: wp.Kernel, *inputs: object, **options: object) -> Callable[..., None]:
+            given = [a[value] if isinstance(value, str) else value for value in inputs]
+            return bind(kernel, given, [], device=str(memory.device), **options)
+
+        def carrier(trees: str, *names: str, back: bool = False) -> Callable[[int], None]:
+            return memory.carrier(names, trees, largest, back=back)
+
+        self._carry_in = carrier("stepping", *given)
+        self._carry_out_free = carrier("stepping", "body_q", "body_qd", "velocity_free", back=True)
+        self._carry_wrench = carrier("stepping", "wrench")
+        self._carry_out_commit = carrier("stepping", "joint_q", "joint_qd", "acceleration", back=True)
+        self._carry_in_place = carrier("subset", "joint_q", "joint_qd")
+        self._carry_out_place = carrier("subset", "body_q", "body_qd", back=True)
 
         gravity, dt = wp.vec3(GRAVITY), self.dt
         tree, joint = ("tree_first", "tree_size"), ("body_parent", "body_offset", "body_rest")
         factors = ("axes", "lever", "D", "DJ", "DH")
+        dealt = {"over": "trees", "shares": self.threads}
         self._place = record(
             plant.place, *tree, "tree_pose", *joint, "subset", "joint_q", "joint_qd", "body_q", "body_qd"
         )
@@ -308,7 +440,7 @@ class Plants:
             plant.free, dt, self.brisk, float(tension), gravity, *tree, "tree_pose", *joint, "body_mass", "body_com",
             "body_inertia", "joint_stiffness", "joint_damping", "stepping", "tree_phi", "onset", "body_load", "wrench",
             "joint_q", "joint_qd", "body_q", "body_qd", "phi_used", "axes", "lever", "J", "H", "M", "bias", "drawn",
-            "D", "DJ", "DH", "Du", "acceleration", "joint_qd_free", "velocity_free",
+            "D", "DJ", "DH", "Du", "acceleration", "joint_qd_free", "velocity_free", **dealt,
         )  # fmt: skip
         self._push = record(
             plant.push, dt, *tree, "body_parent", "subset", "wrench", *factors, "spread", "Du", "acceleration",
@@ -316,23 +448,40 @@ class Plants:
         )  # fmt: skip
         self._integrate = record(
             plant.integrate, dt, self.limit, self.bound, *tree, "stepping", "tree_awake", "phi_used", "joint_qd_free",
-            "tree_rate", "onset", "joint_q", "joint_qd",
+            "joint_q", "joint_qd", "tree_rate", "onset", "joint_q", "joint_qd", **dealt,
         )  # fmt: skip
         self._bind = record
+        ends = self._share_ends
+
+        def part(launch: Callable[..., None], i: int) -> Callable[[], None]:
+            return lambda: launch(ends[i + 1] - ends[i], ends[i], i)
+
+        self._shares = {
+            launch: [part(launch, i) for i in range(self.threads)] for launch in (self._free, self._integrate)
+        }
 
     def _record_response(self, capacity: int) -> None:
         """Room for the responses of ``capacity`` bodies at once."""
-        self._capacity, a = capacity, self._arrays
-        self._asked = np.full(capacity + 1, -1, np.int32)
-        self._response = np.zeros((capacity, 6, capacity, 6), np.float32)
+        self._capacity, memory = capacity, self._memory
+        self._asked = memory.within_reach(np.full(capacity + 1, -1, np.int32))
+        self._response = memory.within_reach(np.zeros((capacity, 6, capacity, 6), np.float32))
         stride = int(self.model.tree_size.max())
-        columns = [wp.empty(capacity * stride, dtype=wp.mat33, device="cpu") for _ in range(4)]
-        a["asked"] = wp.array(self._asked, dtype=wp.int32, device="cpu", copy=False)
-        a["response"] = wp.array(self._response, dtype=float, device="cpu", copy=False)
+        columns = [wp.empty(capacity * stride, dtype=wp.mat33, device=memory.device) for _ in range(4)]
+        memory.reach("asked", self._asked, wp.int32)
+        memory.reach("response", self._response, float)
         self._respond = self._bind(
             plant.response, "tree_first", "body_tree", "body_parent", stride, "asked", "lever", "D", "DJ", "DH",
             *columns, "response",
         )  # fmt: skip
+
+
+def _run(
+    free: Callable[..., None], integrate: Callable[..., None], ticks: int, count: int, first: int = 0, share: int = 0
+) -> None:
+    """Many ticks of some of the listed trees, on one thread."""
+    for _ in range(ticks):
+        free(count, first, share)
+        integrate(count, first, share)
 
 
 def check(model: Model, state: State) -> None:
