@@ -81,6 +81,17 @@ def taut(lever: wp.vec3, force: wp.vec3):
     return stiffness
 
 
+@wp.func
+def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int):
+    """Fastest of some joint rates [rad/s]; NaN enters, and stays. (A function: an adjoint does not repeat loops.)"""
+    most = float(0.0)
+    for k in range(first, first + size):
+        rate = wp.length(rates[k])
+        if rate > most or rate != rate:
+            most = rate
+    return most
+
+
 @wp.kernel
 def place(
     # model
@@ -168,11 +179,8 @@ def free(
     size = tree_size[tree]
 
     # outward: poses and velocities at the start of the tick, each body's own inertia and bias
-    fastest = float(0.0)
-    for k in range(first, first + size):
-        fastest = wp.max(fastest, wp.length_sq(joint_qd[k]))
     phi = tree_phi[tree]
-    if fastest > brisk * brisk or tree_onset[tree] > 0:
+    if fastest(joint_qd, first, size) > brisk or tree_onset[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
     ahead = tension * (1.0 - phi) * dt
@@ -463,17 +471,13 @@ def integrate(
     if not tree_awake[tree]:
         return
     first = tree_first[tree]
-    last = first + tree_size[tree]
-    fastest = float(0.0)
-    for k in range(first, last):
-        square = wp.length_sq(joint_qd_free[k])
-        if square > fastest or square != square:  # NaN enters, and stays
-            fastest = square
-    tree_rate_out[tree] = wp.sqrt(fastest)
+    size = tree_size[tree]
+    most = fastest(joint_qd_free, first, size)
+    tree_rate_out[tree] = most
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
-    sound = fastest <= bound * bound
+    sound = most <= bound
     phi = tree_phi[tree]
-    for k in range(first, last):
+    for k in range(first, first + size):
         if sound:
             rate = joint_qd_free[k]
             square = wp.length_sq(rate)

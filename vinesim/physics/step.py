@@ -26,7 +26,7 @@ class Physics:
     def __init__(
         self, model: Model, *, dt: float = 0.01, device: str = "cpu", threads: int = 1, picking: bool = True
     ) -> None:
-        """``dt`` [s]; ``device`` and ``threads`` for the plants; ``picking``: bunches part from their vines when pulled too hard."""
+        """``dt`` [s]; ``device`` and ``threads``: see :class:`Plants`; ``picking``: bunches part when pulled too hard."""
         self.model, self.dt = model, dt
         self.state = State.at_rest(model)
         self.plants = Plants(model, self.state, dt=dt, device=device, threads=threads)
