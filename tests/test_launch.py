@@ -14,26 +14,20 @@ def ints(*values: int) -> wp.array:
     return wp.array(np.array(values, np.int32), dtype=wp.int32, device="cpu")
 
 
-def floats(values: np.ndarray) -> wp.array:
-    return wp.array(values, dtype=float, device="cpu")
-
-
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_share_takes_its_part_of_the_list(packed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three trees of 1, 2 and 3 bodies with rows of two; without Warp's inner handles it is slower and the same."""
     if not packed:
         monkeypatch.setattr("vinesim.kernels.launch.ctypes", None)
-    rows, out = np.arange(12, dtype=np.float32), floats(np.zeros(12, np.float32))
-    launch = bind(
-        carry, [2, 6, ints(0, 1, 3), ints(1, 2, 3), ints(2, 0, 1), floats(rows)], [out], over="trees", shares=2
-    )
+    rows, out = ints(*range(12)), ints(*[0] * 12)
+    launch = bind(carry, [2, 6, ints(0, 1, 3), ints(1, 2, 3), ints(2, 0, 1), rows], [out], over="trees", shares=2)
     launch(6, 1, 1)
     np.testing.assert_array_equal(out.numpy(), [0, 1, *[0] * 10])
     launch(6, 2, 1)
     np.testing.assert_array_equal(out.numpy(), [0, 1, 2, 3, 4, 5, *[0] * 6])
     launch(0)
     launch(6)
-    np.testing.assert_array_equal(out.numpy(), rows)
+    np.testing.assert_array_equal(out.numpy(), np.arange(12))
 
 
 def test_a_crew_works_at_once_and_all_is_done_when_it_returns() -> None:

@@ -243,7 +243,7 @@ def grove(rng: np.random.Generator, count: int = 7) -> Model:
 
 
 def eventful(**options: object) -> tuple[list[bytes], np.ndarray]:
-    """Trees are pushed, loaded, woken, reweighed, pulled and put to rest: what was told, and a response."""
+    """Trees are pushed, loaded, woken, reweighed, pulled, cut and put to rest: what was told, and a response."""
     rng = np.random.default_rng(5)
     model = grove(rng)
     plants = Plants(model, State.at_rest(model), **options)
@@ -256,6 +256,8 @@ def eventful(**options: object) -> tuple[list[bytes], np.ndarray]:
         if tick == 4:
             plants.wake(1)
             plants.reweigh(int(first[3]) + 1, 0.2)
+        if tick == 9:
+            plants.cut(int(first[6]) + 1)
         if tick == 7:
             plants.rest(5)
             plants.pull(0, model.joint_settled[model.bodies_of(0)], np.zeros((model.tree_size[0], 3)), 0.5)
@@ -273,7 +275,7 @@ def eventful(**options: object) -> tuple[list[bytes], np.ndarray]:
     plants.advance(5)
     plants.download()
     plants.kinematics()
-    told += [x.tobytes() for x in (state.joint_q, state.joint_qd, state.body_q, plants.acceleration)]
+    told += [x.tobytes() for x in (state.joint_q, state.joint_qd, state.joint_x, state.body_q, plants.acceleration)]
     return told, response
 
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from vinesim import frames
+from vinesim.physics import rigid as rigid_module
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.urdf import RobotError
+from vinesim.world.grow import assemble
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.values import Drive, RobotSpec
@@ -429,3 +431,74 @@ def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
     np.testing.assert_allclose(rigid.read("anna")[0], HOME, atol=1e-2)
     np.testing.assert_allclose(rigid.base("bert")[0], alone.base("bert")[0], atol=1e-6)
     assert rigid.data.time == pytest.approx(alone.data.time)
+
+
+def loose(shapes: int, mass: float = 0.6) -> rigid_module.Loose:
+    """A bunch of some spheres and, last, a capsule."""
+    start = np.stack([0.02 * np.arange(shapes), 0.003 * np.arange(shapes), np.zeros(shapes)], 1)
+    end = start.copy()
+    end[-1, 0] += 0.03
+    inertia = np.array([6e-4, 1.5e-3, 1.4e-3])
+    return rigid_module.Loose(mass, np.array([0.07, 2e-3, 0.0]), inertia, start, end, 0.04 - 0.001 * np.arange(shapes))
+
+
+@pytest.mark.parametrize("shapes", [1, 5, rigid_module.LUMPS])
+def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
+    """All constants that MuJoCo derives from weight and shapes, against a world compiled with the bunch in it."""
+    model = assemble([], box_pose=[[1.0, 0, 0, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.3]], box_mass=[[2.0]])
+    rigid = Rigid(model)
+    bunch = loose(shapes)
+    rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
+    spec = rigid_module._scene(model, rigid.dt)
+    rigid_module._drop(spec, bunch)
+    ours, theirs = rigid.world, spec.compile()
+    a, b = ours.body("loose/0").id, theirs.nbody - 1
+    for name in rigid_module._OF_BODY:
+        np.testing.assert_allclose(getattr(ours, name)[a], getattr(theirs, name)[b], rtol=1e-12, err_msg=name)
+    at, there = ours.body_geomadr[a], theirs.body_geomadr[b]
+    for name in rigid_module._OF_GEOM:
+        mine, other = getattr(ours, name)[at : at + shapes], getattr(theirs, name)[there : there + shapes]
+        np.testing.assert_allclose(mine, other, rtol=1e-12, err_msg=name)
+    mine, other = slice(ours.body_dofadr[a], ours.body_dofadr[a] + 6), slice(theirs.nv - 6, theirs.nv)
+    for name in ("dof_M0", "dof_invweight0", "dof_length", "dof_simplenum"):
+        np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], rtol=1e-12, err_msg=name)
+    mine = slice(ours.body_bvhadr[a], ours.body_bvhadr[a] + ours.body_bvhnum[a])
+    other = slice(theirs.body_bvhadr[b], theirs.body_bvhadr[b] + theirs.body_bvhnum[b])
+    np.testing.assert_allclose(ours.bvh_aabb[mine], theirs.bvh_aabb[other], rtol=1e-12)
+    assert (ours.bvh_child[mine] == theirs.bvh_child[other]).all()
+    nodes, others = ours.bvh_nodeid[mine], theirs.bvh_nodeid[other]
+    assert (np.where(nodes < 0, -1, nodes - at) == np.where(others < 0, -1, others - there)).all()
+
+
+def test_waiting_bodies_sleep_and_nobody_sees_them():
+    rigid = Rigid(assemble([]))
+    for _ in range(20):
+        rigid.prep()
+        rigid.finish()
+    assert rigid.links() == ()
+    assert len(rigid.geoms.id) == 0
+    assert rigid.data.nv_awake == 0
+    assert rigid.data.ncon == 0
+
+
+def test_more_bunches_than_bodies_wait_for_them():
+    """The pool grows by a compilation when it is used up; those that fall go on falling."""
+    rigid = Rigid(assemble([]))
+    generations = []
+    for bunch in range(rigid_module.WAITING + 2):
+        rigid.add_bunch(bunch, loose(3), frames.pose(np.array([float(bunch), 0.0, 5.0])), np.zeros(6))
+        generations.append(rigid.world)
+        rigid.prep()
+        rigid.finish()
+    assert all(world is generations[0] for world in generations[: rigid_module.WAITING])
+    assert generations[-1] is not generations[0]
+    ticks = np.arange(len(generations), 0, -1)
+    fallen = 5.0 - 9.81 * rigid.dt**2 * ticks * (ticks + 1) / 2.0
+    heights = [rigid.bunch_pose(bunch)[2] for bunch in rigid.loose]
+    np.testing.assert_allclose(heights, fallen, atol=1e-9)
+    rigid.remove_bunch(4)
+    assert 4 not in rigid.loose
+    assert [link.name for link in rigid.links()] == [f"bunch/{bunch}" for bunch in rigid.loose]
+    with pytest.raises(ValueError, match="shapes; a loose one has"):
+        rigid.add_bunch(4, loose(rigid_module.LUMPS + 1), frames.pose(np.zeros(3)), np.zeros(6))
+    assert 4 not in rigid.loose

@@ -149,55 +149,70 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
     assert rigid_error < 1e-12
 
 
-def sweep(speed: float, seconds: float, damping: float):
-    """A bar of 3 kg goes through five canes, coasting or (with damping) driven: ours and the oracle at 1 ms.
+def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, give: float | None = None):
+    """A bar of 3 kg goes through five canes, coasting or (with damping) driven: ours, and the oracle in substeps.
 
-    Returns our physics, impulses on the bar along y [N s], peak forces [N], trees that were met.
+    Returns our physics, force on the bar along y [N] tick by tick, ours and theirs [tick, 2], trees that were met.
     """
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005) for i in range(5)])
     spec = bar((0.7, -0.08, 0.95), damping=damping)
-    ours, oracle = Physics(model), Whole(model, spec, dt=0.001)
+    ours, oracle = Physics(model), Whole(model, spec, dt=0.01 / substeps, give=give)
     ours.add_robot(spec)
     for rigid in (ours.rigid, oracle.rigid):
         rigid.command("bar", np.zeros(1), np.array([speed]))
         rigid.data.qvel[rigid._robots["bar"].v] = speed
-    impulse, peak, met = np.zeros(2), np.zeros(2), set()
+    force, met = [], set()
     base = ours.rigid._robots["bar"].base_v[:2]
-    for _ in range(int(seconds / ours.dt)):
+    for _ in range(round(seconds / ours.dt)):
         ours.step()
         on_bar, theirs = force_on(ours, "bar"), np.zeros(3)
-        for _ in range(10):
+        for _ in range(substeps):
             oracle.step()
-            theirs += oracle.force_on("bar") / 10
-        impulse += ours.dt * np.array([on_bar[1], theirs[1]])
-        peak = np.maximum(peak, np.abs([on_bar, theirs]).max(1))
+            theirs += oracle.force_on("bar") / substeps
+        force.append((on_bar[1], theirs[1]))
         met.update(tree for tree, _ in ours.touched)
         np.testing.assert_allclose(ours.touching.wrenches[:, :3].sum(0), -on_bar, atol=1e-9)
         if ours.touching.force is not None:
             np.testing.assert_allclose(ours.touching.force[base], on_bar[:2], atol=1e-9)
-    return ours, impulse, peak, met
+    return ours, np.array(force), met
+
+
+def peaks(force: np.ndarray) -> np.ndarray:
+    """Largest mean force over 30 ms: within one tick it depends on whether a blow falls into one tick or on two."""
+    return np.abs(force[:-2] + force[1:-1] + force[2:]).max(0) / 3.0
 
 
 def test_a_coasting_bar_is_thrown_back_as_the_oracle_says():
-    _, impulse, peak, _ = sweep(0.5, 3.0, 0.0)
+    _, force, _ = sweep(0.5, 3.0, 0.0)
+    impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
     assert impulse[0] == pytest.approx(impulse[1], rel=0.02)
     assert peak[0] == pytest.approx(peak[1], rel=0.05)
 
 
-@pytest.mark.parametrize(("speed", "share"), [(0.5, 0.02), (3.0, 0.25)])
-def test_a_driven_bar_passes_five_canes_and_loses_none(speed, share):
-    """Every cane is met, none is passed through, and all swing back to where they hung.
+@pytest.mark.parametrize("speed", [0.25, 0.5, 1.0, 2.0, 3.0])
+def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
+    """Impulse and peak are the oracle's, every cane is met, none is passed through, all swing back to where they hung.
 
-    At 3 m/s the bar goes 3 cm a tick, five times a cane's radius: it loses none, but the impulse is coarse.
+    At 3 m/s the bar goes 3 cm a tick, five times a cane's radius. The oracle takes 1 ms, where it has converged: with
+    0.25 ms and contacts ten times as stiff its impulse changes by 1.7 % at 3 m/s, by 0.4 % at 0.5 m/s.
     """
-    ours, impulse, _, met = sweep(speed, 2.0 / speed, 200.0)
+    ours, force, met = sweep(speed, 2.0 / speed, 200.0)
+    impulse, peak = 0.01 * force.sum(0), peaks(force)
     assert met == {0, 1, 2, 3, 4}
     assert ours.rigid.read("bar")[0][0] > 1.2
-    assert impulse[0] == pytest.approx(impulse[1], rel=share)
+    assert impulse[0] == pytest.approx(impulse[1], rel=0.02)
+    assert peak[0] == pytest.approx(peak[1], rel=0.05)
     ours.remove_robot("bar")
     for _ in range(1500):
         ours.step()
     assert np.abs(ours.view().body_q - ours.model.forward(ours.model.joint_settled))[:, :3].max() < 0.01
+
+
+def test_a_fast_sweep_agrees_with_hard_contacts_in_quarters_of_a_millisecond():
+    _, force, _ = sweep(3.0, 0.66, 200.0, substeps=40, give=0.002)
+    impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
+    assert impulse[0] == pytest.approx(impulse[1], rel=0.01)
+    assert peak[0] == pytest.approx(peak[1], rel=0.05)
 
 
 def test_two_runs_agree_to_the_bit():

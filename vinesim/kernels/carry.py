@@ -14,11 +14,11 @@ def carry(
     tree_size: wp.array(dtype=wp.int32),
     # in
     trees: wp.array(dtype=wp.int32),
-    rows: wp.array(dtype=float),
+    rows: wp.array(dtype=wp.int32),
     # out
-    rows_out: wp.array(dtype=float),
+    rows_out: wp.array(dtype=wp.int32),
 ):
-    """Copy one number of one listed tree; each body has a row of ``width``, each tree ``stride`` threads."""
+    """Copy one word of four bytes of one listed tree; each body has a row of ``width``, a tree ``stride`` threads."""
     slot = wp.tid() / stride
     i = wp.tid() - slot * stride
     tree = trees[slot]

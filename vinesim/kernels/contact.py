@@ -21,6 +21,14 @@ CYLINDER = wp.constant(5)
 SKIN = wp.constant(wp.float64(0.002))
 """Contacts are seen from this gap on [m], and from as far as the two can come together in one tick."""
 
+AGREE = wp.constant(wp.float64(0.5))
+"""Least cosine between the normals before and after a tick for which the contact moves on smoothly."""
+
+ABRUPT = wp.constant(wp.float64(0.3))
+"""[m/s] A contact that closes faster is a blow."""
+
+vec5d = wp.types.vector(length=5, dtype=wp.float64)
+
 BISECTIONS = wp.constant(30)
 FASTEST_EXIT = wp.constant(wp.float64(1.0))
 """Overlap is undone at this speed at most [m/s]."""
@@ -125,6 +133,28 @@ def closest(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 
 @wp.func
+def nearest(kind: int, size: wp.vec3d, rotation: wp.mat33d, middle: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
+    """World normal (0 to 2) and distance (3) of a primitive from a segment, and where on the segment that is (4)."""
+    back = wp.transpose(rotation)
+    start = back * (a - middle)
+    along = back * (b - middle) - start
+    t = closest(kind, size, start, start + along)
+    n = distance(kind, size, start + t * along)
+    normal = rotation * wp.vec3d(n[0], n[1], n[2])
+    return vec5d(normal[0], normal[1], normal[2], n[3], t)
+
+
+@wp.func
+def turn(angle: wp.vec3d, rotation: wp.mat33d):
+    """A rotation turned by a small angle, to second order."""
+    columns = wp.transpose(rotation)
+    x = columns[0] + wp.cross(angle, columns[0] + wp.float64(0.5) * wp.cross(angle, columns[0]))
+    y = columns[1] + wp.cross(angle, columns[1] + wp.float64(0.5) * wp.cross(angle, columns[1]))
+    z = columns[2] + wp.cross(angle, columns[2] + wp.float64(0.5) * wp.cross(angle, columns[2]))
+    return wp.matrix_from_cols(x, y, z)
+
+
+@wp.func
 def tangent(n: wp.vec3d):
     """A unit vector across n, the same for the same n."""
     zero = wp.float64(0.0)
@@ -156,11 +186,13 @@ def bound_geoms(
     subtree_com: wp.array(dtype=wp.vec3d),
     # out
     middle_out: wp.array(dtype=wp.vec3d),
+    velocity_out: wp.array(dtype=wp.vec3d),
+    spin_out: wp.array(dtype=wp.vec3d),
     speed_out: wp.array(dtype=wp.float64),
     low_out: wp.array(dtype=wp.vec3),
     high_out: wp.array(dtype=wp.vec3),
 ):
-    """Box in the world of one rigid shape, grown by how far it can come in a tick."""
+    """Motion of one rigid shape's middle, and its box in the world, grown by how far it can come in a tick."""
     g = wp.tid()
     rotation = xmat[geom_id[g]]
     middle = xpos[geom_id[g]] + rotation * geom_center[g]
@@ -177,15 +209,30 @@ def bound_geoms(
         box[i] = wp.float32(extent + grown)
     center = wp.vec3(wp.float32(middle[0]), wp.float32(middle[1]), wp.float32(middle[2]))
     middle_out[g] = middle
+    velocity_out[g] = velocity
+    spin_out[g] = spin
     speed_out[g] = speed
     low_out[g] = center - box
     high_out[g] = center + box
+
+
+@wp.func
+def ahead(dt: float, pose: wp.transform, motion: wp.spatial_vector, bend: wp.spatial_vector, point: wp.vec3):
+    """Where a point of a body will be after a tick, to second order in the tick."""
+    arm = point - wp.transform_get_translation(pose)
+    omega = wp.spatial_bottom(motion)
+    velocity = wp.spatial_top(motion) + wp.cross(omega, arm)
+    turn = wp.cross(omega, wp.cross(omega, arm))
+    return point + dt * (velocity + 0.5 * dt * (wp.spatial_top(bend) + wp.cross(wp.spatial_bottom(bend), arm) + turn))
 
 
 @wp.kernel
 def bound_trees(
     # model
     dt: float,
+    tree_first: wp.array(dtype=wp.int32),
+    tree_size: wp.array(dtype=wp.int32),
+    body_parent: wp.array(dtype=wp.int32),
     tree_shape: wp.array(dtype=wp.int32),
     shape_body: wp.array(dtype=wp.int32),
     shape_start: wp.array(dtype=wp.vec3),
@@ -195,15 +242,35 @@ def bound_trees(
     trees: wp.array(dtype=wp.int32),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
+    body_cut: wp.array(dtype=wp.bool),
     # out
+    bend_out: wp.array(dtype=wp.spatial_vector),
     start_out: wp.array(dtype=wp.vec3),
     end_out: wp.array(dtype=wp.vec3),
+    start_ahead_out: wp.array(dtype=wp.vec3),
+    end_ahead_out: wp.array(dtype=wp.vec3),
     speed_out: wp.array(dtype=float),
     low_out: wp.array(dtype=wp.vec3),
     high_out: wp.array(dtype=wp.vec3),
 ):
-    """Put the shapes of one tree into the world and find the box around them, grown by how far they come in a tick."""
+    """Put the shapes of one tree into the world, now and after a tick of steady joint rates, and find their box."""
     tree = trees[wp.tid()]
+    # bend: the acceleration of a body while all joints turn steadily
+    first = tree_first[tree]
+    for k in range(first, first + tree_size[tree]):
+        above = body_parent[k]
+        bend = wp.spatial_vector()
+        if above >= 0 and not body_cut[k]:
+            motion = body_qd[above]
+            turning = wp.spatial_bottom(motion)
+            arm = wp.transform_get_translation(body_q[k]) - wp.transform_get_translation(body_q[above])
+            carried = bend_out[above]
+            alpha = wp.spatial_bottom(carried)
+            bend = wp.spatial_vector(
+                wp.spatial_top(carried) + wp.cross(alpha, arm) + wp.cross(turning, wp.cross(turning, arm)),
+                alpha + wp.cross(turning, wp.spatial_bottom(body_qd[k])),
+            )
+        bend_out[k] = bend
     low = wp.vec3(1.0e30)
     high = wp.vec3(-1.0e30)
     for s in range(tree_shape[tree], tree_shape[tree + 1]):
@@ -219,6 +286,8 @@ def bound_trees(
         high = wp.max(high, wp.max(start, end) + grown)
         start_out[s] = start
         end_out[s] = end
+        start_ahead_out[s] = ahead(dt, pose, motion, bend_out[body], start)
+        end_ahead_out[s] = ahead(dt, pose, motion, bend_out[body], end)
         speed_out[s] = speed
     low_out[tree] = low
     high_out[tree] = high
@@ -303,12 +372,12 @@ def meet(
     dt: wp.float64,
     slots: int,
     tree_shape: wp.array(dtype=wp.int32),
+    shape_body: wp.array(dtype=wp.int32),
     shape_bunch: wp.array(dtype=wp.int32),
     shape_radius: wp.array(dtype=float),
     geom_id: wp.array(dtype=wp.int32),
     geom_kind: wp.array(dtype=wp.int32),
     geom_size: wp.array(dtype=wp.vec3d),
-    geom_center: wp.array(dtype=wp.vec3d),
     geom_radius: wp.array(dtype=wp.float64),
     geom_copy: wp.array(dtype=wp.bool),
     # in
@@ -317,12 +386,17 @@ def meet(
     trees: wp.array(dtype=wp.int32),
     tree_low: wp.array(dtype=wp.vec3),
     tree_high: wp.array(dtype=wp.vec3),
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
+    start_ahead: wp.array(dtype=wp.vec3),
+    end_ahead: wp.array(dtype=wp.vec3),
     shape_speed: wp.array(dtype=float),
-    xpos: wp.array(dtype=wp.vec3d),
     xmat: wp.array(dtype=wp.mat33d),
     middle: wp.array(dtype=wp.vec3d),
+    geom_velocity: wp.array(dtype=wp.vec3d),
+    geom_spin: wp.array(dtype=wp.vec3d),
     geom_speed: wp.array(dtype=wp.float64),
     geom_low: wp.array(dtype=wp.vec3),
     geom_high: wp.array(dtype=wp.vec3),
@@ -331,8 +405,10 @@ def meet(
     hit_shape_out: wp.array2d(dtype=wp.int32),
     hit_geom_out: wp.array2d(dtype=wp.int32),
     hit_gap_out: wp.array2d(dtype=wp.float64),
+    hit_room_out: wp.array2d(dtype=wp.float64),
     hit_normal_out: wp.array2d(dtype=wp.vec3d),
     hit_point_out: wp.array2d(dtype=wp.vec3d),
+    onset_out: wp.array(dtype=wp.bool),
     missed_out: wp.array(dtype=wp.int32),
 ):
     """Find where one tree touches rigid shapes or may touch them before the tick ends, by (shape, geom)."""
@@ -344,6 +420,8 @@ def meet(
         if counts and not apart(tree_low[tree], tree_high[tree], geom_low[g], geom_high[g]):
             close_out[i, close] = g
             close = close + 1
+    zero = wp.float64(0.0)
+    onset = bool(False)
     found = int(0)  # noqa: RUF046
     last = tree_shape[tree + 1]
     if close == 0:
@@ -365,22 +443,48 @@ def meet(
                 limit = bound + geom_radius[g] + margin
                 if wp.dot(between, between) < limit * limit:
                     rotation = xmat[geom_id[g]]
-                    back = wp.transpose(rotation)
-                    at = xpos[geom_id[g]]
-                    local_a = back * (a - at) - geom_center[g]
-                    local_b = back * (b - at) - geom_center[g]
-                    t = closest(geom_kind[g], geom_size[g], local_a, local_b)
-                    n = distance(geom_kind[g], geom_size[g], local_a + t * (local_b - local_a))
-                    gap = n[3] - radius
+                    near = nearest(geom_kind[g], geom_size[g], rotation, middle[g], a, b)
+                    gap = near[3] - radius
                     if gap < margin:
                         if found < slots:
-                            normal = rotation * wp.vec3d(n[0], n[1], n[2])
+                            normal = wp.vec3d(near[0], near[1], near[2])
+                            point = a + near[4] * (b - a) - (radius + wp.float64(0.5) * gap) * normal
+                            # how the two would come together if both went on as they go, and where they would touch
+                            body = shape_body[s]
+                            motion = body_qd[body]
+                            spin = to_double(wp.spatial_bottom(motion))
+                            lever = point - to_double(wp.transform_get_translation(body_q[body]))
+                            velocity = to_double(wp.spatial_top(motion)) + wp.cross(spin, lever)
+                            push = geom_velocity[g] + wp.cross(geom_spin[g], point - middle[g])
+                            come = dt * wp.dot(normal, velocity - push)
+                            turned = turn(dt * geom_spin[g], rotation)
+                            later = nearest(
+                                geom_kind[g],
+                                geom_size[g],
+                                turned,
+                                middle[g] + dt * geom_velocity[g],
+                                to_double(start_ahead[s]),
+                                to_double(end_ahead[s]),
+                            )
+                            normal_later = wp.vec3d(later[0], later[1], later[2])
+                            bent = wp.float64(0.0)
+                            if wp.dot(normal, normal_later) > AGREE:
+                                moved = dt * wp.length(velocity - push)
+                                bent = wp.clamp(later[3] - radius - gap - come, -moved, moved)
+                                onto = to_double(start_ahead[s]) + later[4] * to_double(end_ahead[s] - start_ahead[s])
+                                onto = onto - (later[3] - wp.float64(0.5) * gap) * normal_later - dt * velocity
+                                normal = wp.normalize(normal + normal_later)
+                                point = wp.float64(0.5) * (point + onto)
+                            if gap + come + bent < zero and come < -ABRUPT * dt:
+                                onset = True
                             hit_shape_out[i, found] = s
                             hit_geom_out[i, found] = g
                             hit_gap_out[i, found] = gap
+                            hit_room_out[i, found] = gap + bent
                             hit_normal_out[i, found] = normal
-                            hit_point_out[i, found] = a + t * (b - a) - (radius + wp.float64(0.5) * gap) * normal
+                            hit_point_out[i, found] = point
                         found = found + 1
+    onset_out[i] = onset
     missed_out[i] = wp.max(found - slots, 0)
     for k in range(wp.min(found, slots), slots):
         hit_shape_out[i, k] = -1
@@ -399,6 +503,7 @@ def couple(
     hits: wp.array(dtype=wp.int32),
     hit_geom: wp.array(dtype=wp.int32),
     hit_gap: wp.array(dtype=wp.float64),
+    hit_room: wp.array(dtype=wp.float64),
     hit_normal: wp.array(dtype=wp.vec3d),
     hit_point: wp.array(dtype=wp.vec3d),
     contact_shape: wp.array(dtype=wp.int32),
@@ -474,10 +579,11 @@ def couple(
 
     # the spring of an open gap has nothing to push yet: it only must not be overrun within the tick
     give = stiffness * dt + damping
-    if gap > zero:
-        offset_out[3 * c] = gap / dt
+    room = hit_room[h]
+    if room > zero:
+        offset_out[3 * c] = room / dt
     else:
-        offset_out[3 * c] = wp.max(gap * stiffness / give, -FASTEST_EXIT)
+        offset_out[3 * c] = wp.max(room * stiffness / give, -FASTEST_EXIT)
     for k in range(known_count[0]):
         if known_shape[k] == contact_shape[c] and known_geom[k] == g:
             impulse_out[3 * c] = known_push[k]

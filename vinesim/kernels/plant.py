@@ -11,8 +11,16 @@ it gives a swing of rate w the damping ratio -(1 - phi) dt w / 2 (-0.018 for a b
 softer than what it carries it blows up. So it enters the inertia with phi^2 dt^2, and the force's moment is taken where
 the lever will be (1 - phi) dt later: a swing then neither gains nor loses. F is weight, load and the last contacts.
 
+A body with parent -1 is a root: it hangs on its tree's pose, or *floats* if it has been cut off (``body_root`` names the
+cut body that everything on it moves with, -1 for what still stands). A floating root has no spring and no lever; what is
+left of its inertia after its rotation is eliminated gives its linear acceleration, ``lift`` times the force left over.
+
+Ties and air drag are forces at a point c of a body that grow against its velocity. Taken implicitly they look like a
+mass W at c: W = phi dt (phi dt k + c) for a spring and damper, dt c for drag.
+
 Gyroscopic and centrifugal terms stay explicit and err by about dt w^2 a second. A body turning faster than ``brisk``
-is therefore held back by a drag dt (w^2 - brisk^2) times its momentum, and no joint is integrated beyond ``limit``.
+is therefore held back by a drag dt (w^2 - brisk^2) times its momentum, and a tree with a joint beyond ``limit`` goes on
+at half of it.
 
 Signs and frames: world axes; velocities and accelerations are (linear of the body's origin, angular), wrenches (force
 at the origin, moment about it). The inertia of a body or subtree about the body's origin is held as three blocks,
@@ -25,6 +33,9 @@ and after elimination of its joint a body keeps only D = (J + metric)^-1, D J an
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
+
+AIR = wp.constant(1.2)
+"""[kg/m^3] density of air at 20 degrees"""
 
 
 @wp.func
@@ -82,13 +93,69 @@ def taut(lever: wp.vec3, force: wp.vec3):
 
 
 @wp.func
+def at_lever(mass: float, lever: wp.vec3):
+    """Moment of inertia about the origin [kg m^2] of a point mass at a lever."""
+    return mass * (wp.dot(lever, lever) * wp.identity(n=3, dtype=float) - wp.outer(lever, lever))
+
+
+@wp.func
+def tensor(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
+    """Inertia in world axes from its diagonal and its entries yz, zx, xy in the body's axes."""
+    inertia = turned(rotation, moments)
+    if wp.length_sq(products) > 0.0:
+        mixed = wp.mat33(
+            0.0, products[2], products[1], products[2], 0.0, products[0], products[1], products[0], 0.0
+        )  # fmt: skip
+        inertia = inertia + rotation * mixed * wp.transpose(rotation)
+    return inertia
+
+
+@wp.func
+def remaining(damping: float, stiffness: float, phi: float, dt: float):
+    """Damper that is left to add when the scheme damps a spring as if beta were larger by (2 phi - 1) dt."""
+    return wp.max(damping - (2.0 * phi - 1.0) * dt * stiffness, 0.0)
+
+
+@wp.func
+def tied(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3, phi: float, dt: float):
+    """Force [N] of a tie whose point moves on at its present speed; ``damping`` is the remaining one."""
+    return -stiffness * (stretch + phi * dt * speed) - damping * speed
+
+
+@wp.func
+def blown(area: float, wind: wp.vec3):
+    """Drag [N s/m] per relative speed, of a drag area Cd A [m^2] in a wind relative to it."""
+    return 0.5 * AIR * area * wp.length(wind)
+
+
+@wp.func
 def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int):
-    """Fastest of some joint rates [rad/s]; NaN enters, and stays. (A function: an adjoint does not repeat loops.)"""
+    """Fastest of some joint rates [rad/s]; NaN enters, and stays. (A function, since an adjoint does not repeat the
+    loops of its kernel before it goes back, but calls functions.)
+    """
     most = float(0.0)
     for k in range(first, first + size):
         rate = wp.length(rates[k])
         if rate > most or rate != rate:
             most = rate
+    return most
+
+
+@wp.func
+def fleeing(
+    speeds: wp.array(dtype=wp.vec3),
+    body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
+    first: int,
+    size: int,
+):
+    """Fastest of the floating roots [m/s]; NaN enters, and stays."""
+    most = float(0.0)
+    for k in range(first, first + size):
+        if body_parent[k] < 0 and body_root[k] >= 0:
+            speed = wp.length(speeds[k])
+            if speed > most or speed != speed:
+                most = speed
     return most
 
 
@@ -99,10 +166,13 @@ def place(
     tree_size: wp.array(dtype=wp.int32),
     tree_pose: wp.array(dtype=wp.transform),
     body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
     body_offset: wp.array(dtype=wp.vec3),
     body_rest: wp.array(dtype=wp.quat),
     # in
     trees: wp.array(dtype=wp.int32),
+    joint_x: wp.array(dtype=wp.vec3),
+    joint_xd: wp.array(dtype=wp.vec3),
     joint_q: wp.array(dtype=wp.quat),
     joint_qd: wp.array(dtype=wp.vec3),
     # out
@@ -119,6 +189,9 @@ def place(
         if parent >= 0:
             above = body_q_out[parent]
             motion = body_qd_out[parent]
+        elif body_root[k] >= 0:
+            above = wp.transform(joint_x[k], wp.quat_identity())
+            motion = wp.spatial_vector(joint_xd[k], wp.vec3())
         turning = wp.spatial_bottom(motion)
         axes = wp.transform_get_rotation(above) * body_rest[k]
         lever = wp.quat_rotate(wp.transform_get_rotation(above), body_offset[k])
@@ -136,22 +209,33 @@ def free(
     tension: float,
     gravity: wp.vec3,
     tree_first: wp.array(dtype=wp.int32),
-    tree_size: wp.array(dtype=wp.int32),
+    tree_moving: wp.array(dtype=wp.int32),
     tree_pose: wp.array(dtype=wp.transform),
     body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
     body_offset: wp.array(dtype=wp.vec3),
     body_rest: wp.array(dtype=wp.quat),
     body_mass: wp.array(dtype=float),
     body_com: wp.array(dtype=wp.vec3),
     body_inertia: wp.array(dtype=wp.vec3),
+    body_product: wp.array(dtype=wp.vec3),
+    body_drag: wp.array(dtype=float),
     joint_stiffness: wp.array(dtype=wp.vec3),
     joint_damping: wp.array(dtype=wp.vec3),
+    tie_first: wp.array(dtype=wp.int32),
+    tie_point: wp.array(dtype=wp.vec3),
+    tie_stiffness: wp.array(dtype=float),
+    tie_damping: wp.array(dtype=float),
     # in
     trees: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_onset: wp.array(dtype=wp.int32),
+    tree_air: wp.array(dtype=wp.vec3),
+    tie_anchor: wp.array(dtype=wp.vec3),
     body_load: wp.array(dtype=wp.spatial_vector),
     body_wrench: wp.array(dtype=wp.spatial_vector),
+    joint_x: wp.array(dtype=wp.vec3),
+    joint_xd: wp.array(dtype=wp.vec3),
     joint_q: wp.array(dtype=wp.quat),
     joint_qd: wp.array(dtype=wp.vec3),
     # out
@@ -169,14 +253,16 @@ def free(
     DJ_out: wp.array(dtype=wp.mat33),
     DH_out: wp.array(dtype=wp.mat33),
     Du_out: wp.array(dtype=wp.vec3),
+    lift_out: wp.array(dtype=wp.mat33),
     body_acceleration_out: wp.array(dtype=wp.spatial_vector),
+    joint_xd_free_out: wp.array(dtype=wp.vec3),
     joint_qd_free_out: wp.array(dtype=wp.vec3),
     body_qd_free_out: wp.array(dtype=wp.spatial_vector),
 ):
     """Solve the motion of one tree over a tick without contacts, and keep the factors of its implicit inertia."""
     tree = trees[wp.tid()]
     first = tree_first[tree]
-    size = tree_size[tree]
+    size = tree_moving[tree]
 
     # outward: poses and velocities at the start of the tick, each body's own inertia and bias
     phi = tree_phi[tree]
@@ -193,6 +279,9 @@ def free(
         if parent >= 0:
             above = body_q_out[parent]
             motion = body_qd_out[parent]
+        elif body_root[k] >= 0:
+            above = wp.transform(joint_x[k], wp.quat_identity())
+            motion = wp.spatial_vector(joint_xd[k], wp.vec3())
         turning = wp.spatial_bottom(motion)
         axes = wp.transform_get_rotation(above) * body_rest[k]
         lever = wp.quat_rotate(wp.transform_get_rotation(above), body_offset[k])
@@ -207,24 +296,47 @@ def free(
         mass = body_mass[k]
         rotation = wp.quat_to_matrix(pose)
         com = rotation * body_com[k]
-        inertia = turned(rotation, body_inertia[k])
+        inertia = tensor(rotation, body_inertia[k], body_product[k])
         load = body_load[k]
         slip = wp.cross(omega, com)
         drag = dt * wp.max(wp.length_sq(omega) - brisk * brisk, 0.0)
         burden = 1.0 + dt * drag
         force = mass * (wp.cross(omega, slip) + drag * (velocity + slip) - gravity)
+        weight = mass * gravity
+        if body_root[k] >= 0:
+            weight = wp.vec3()  # what falls is not drawn out by its weight
         moment = (
             wp.cross(omega, inertia * omega)
             + wp.cross(com, force)
             + drag * (inertia * omega)
-            - ahead * wp.cross(slip, mass * gravity)
+            - ahead * wp.cross(slip, weight)
         )
         bias_out[k] = wp.spatial_vector(force, moment) - load
-        drawn_out[k] = mass * gravity + wp.spatial_top(load) + wp.spatial_top(body_wrench[k])
-        still = inertia + mass * (wp.dot(com, com) * wp.identity(n=3, dtype=float) - wp.outer(com, com))
-        J_out[k] = burden * still + reach * taut(com, mass * gravity)
+        drawn_out[k] = weight + wp.spatial_top(load) + wp.spatial_top(body_wrench[k])
+        J_out[k] = burden * (inertia + at_lever(mass, com)) + reach * taut(com, weight)
         H_out[k] = burden * mass * wp.skew(com)
         M_out[k] = burden * mass * wp.identity(n=3, dtype=float)
+
+        area = body_drag[k]
+        if area > 0.0:
+            wind = tree_air[tree] - velocity - slip
+            c = blown(area, wind)
+            J_out[k] += at_lever(dt * c, com)
+            H_out[k] += dt * c * wp.skew(com)
+            M_out[k] += dt * c * wp.identity(n=3, dtype=float)
+            bias_out[k] += wp.spatial_vector(-c * wind, -c * wp.cross(com, wind))
+        for t in range(tie_first[k], tie_first[k + 1]):
+            at = rotation * tie_point[t]
+            stretch = wp.transform_get_translation(above) + lever + at - tie_anchor[t]
+            tie = tie_stiffness[t]
+            damper = remaining(tie_damping[t], tie, phi, dt)
+            grip = phi * dt * (phi * dt * tie + damper)
+            hold = tied(tie, damper, stretch, velocity + wp.cross(omega, at), phi, dt)
+            J_out[k] += at_lever(grip, at)
+            H_out[k] += grip * wp.skew(at)
+            M_out[k] += grip * wp.identity(n=3, dtype=float)
+            bias_out[k] += wp.spatial_vector(-hold, -wp.cross(at, hold))
+            drawn_out[k] += -tie * stretch
 
     # inward: eliminate each joint and hand what is left of the subtree to the parent
     for i in range(size):
@@ -263,22 +375,17 @@ def free(
             force = wp.spatial_top(bias) + wp.transpose(H) * Du + M_left * centripetal
             moment = wp.spatial_bottom(bias) + J * Du + H_left * centripetal + wp.cross(lever, force)
             drawn = drawn_out[k]
-            drawn_out[parent] = drawn_out[parent] + drawn
+            drawn_out[parent] += drawn
             M_arm = wp.transpose(crossed(M_left, lever))
             H_arm = crossed(H_left, lever)
-            J_out[parent] = (
-                J_out[parent]
-                + reach * taut(lever, drawn)
-                + J_left
-                + crossed(M_arm, lever)
-                - H_arm
-                - wp.transpose(H_arm)
-            )
-            H_out[parent] = H_out[parent] + H_left - M_arm
-            M_out[parent] = M_out[parent] + M_left
-            bias_out[parent] = bias_out[parent] + wp.spatial_vector(
-                force, moment - ahead * wp.cross(wp.cross(turning, lever), drawn)
-            )
+            J_out[parent] += reach * taut(lever, drawn) + J_left + crossed(M_arm, lever) - H_arm - wp.transpose(H_arm)
+            H_out[parent] += H_left - M_arm
+            M_out[parent] += M_left
+            bias_out[parent] += wp.spatial_vector(force, moment - ahead * wp.cross(wp.cross(turning, lever), drawn))
+        else:
+            lift_out[k] = wp.mat33()
+            if body_root[k] >= 0:
+                lift_out[k] = wp.inverse(M - wp.transpose(H) * DH)
 
     # outward: accelerations, and the rates and velocities they lead to
     for k in range(first, first + size):
@@ -290,6 +397,12 @@ def free(
             pushed = body_acceleration_out[parent]
             motion = body_qd_free_out[parent]
             turning = wp.spatial_bottom(body_qd_out[parent])
+        elif body_root[k] >= 0:
+            force = wp.spatial_top(bias_out[k]) + wp.transpose(H_out[k]) * Du_out[k]
+            falling = -(lift_out[k] * force)
+            pushed = wp.spatial_vector(falling, wp.vec3())
+            joint_xd_free_out[k] = joint_xd[k] + dt * falling
+            motion = wp.spatial_vector(joint_xd_free_out[k], wp.vec3())
         lever = lever_out[k]
         alpha = wp.spatial_bottom(pushed)
         a = wp.spatial_top(pushed) + wp.cross(alpha, lever) + wp.cross(turning, wp.cross(turning, lever))
@@ -315,6 +428,7 @@ def response(
     D: wp.array(dtype=wp.mat33),
     DJ: wp.array(dtype=wp.mat33),
     DH: wp.array(dtype=wp.mat33),
+    lift: wp.array(dtype=wp.mat33),
     # out
     a_by_force_out: wp.array(dtype=wp.mat33),
     a_by_moment_out: wp.array(dtype=wp.mat33),
@@ -346,6 +460,8 @@ def response(
         k = last - i
         alpha_by_force_out[shift + k] = zero
         alpha_by_moment_out[shift + k] = zero
+        a_by_force_out[shift + k] = zero
+        a_by_moment_out[shift + k] = zero
         if k == path:
             alpha_by_force_out[shift + k] = D[k] * moment_f
             alpha_by_moment_out[shift + k] = D[k] * moment_m
@@ -357,11 +473,14 @@ def response(
             moment_f = moment_f - DJt * moment_f + arm * force_f
             moment_m = moment_m - DJt * moment_m + arm * force_m
             path = body_parent[k]
+            if path < 0:
+                a_by_force_out[shift + k] = lift[k] * force_f
+                a_by_moment_out[shift + k] = lift[k] * force_m
 
     for k in range(first, last + 1):
         parent = body_parent[k]
-        a_f = wp.mat33()
-        a_m = wp.mat33()
+        a_f = a_by_force_out[shift + k]
+        a_m = a_by_moment_out[shift + k]
         alpha_f = wp.mat33()
         alpha_m = wp.mat33()
         if parent >= 0:
@@ -399,8 +518,9 @@ def push(
     # model
     dt: float,
     tree_first: wp.array(dtype=wp.int32),
-    tree_size: wp.array(dtype=wp.int32),
+    tree_moving: wp.array(dtype=wp.int32),
     body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
     # in
     trees: wp.array(dtype=wp.int32),
     body_wrench: wp.array(dtype=wp.spatial_vector),
@@ -409,16 +529,19 @@ def push(
     D: wp.array(dtype=wp.mat33),
     DJ: wp.array(dtype=wp.mat33),
     DH: wp.array(dtype=wp.mat33),
+    lift: wp.array(dtype=wp.mat33),
     # out
     spread_out: wp.array(dtype=wp.spatial_vector),
+    added_out: wp.array(dtype=wp.spatial_vector),
     Du_out: wp.array(dtype=wp.vec3),
     body_acceleration_out: wp.array(dtype=wp.spatial_vector),
+    joint_xd_free_out: wp.array(dtype=wp.vec3),
     joint_qd_free_out: wp.array(dtype=wp.vec3),
 ):
     """Add what the wrenches on one touched tree do to its free accelerations and joint rates."""
     tree = trees[wp.tid()]
     first = tree_first[tree]
-    size = tree_size[tree]
+    size = tree_moving[tree]
     for k in range(first, first + size):
         spread_out[k] = body_wrench[k]
     for i in range(size):
@@ -430,19 +553,23 @@ def push(
         if parent >= 0:
             force = wp.spatial_top(wrench) - wp.transpose(DH[k]) * moment
             moment = moment - wp.transpose(DJ[k]) * moment + wp.cross(lever[k], force)
-            spread_out[parent] = spread_out[parent] + wp.spatial_vector(force, moment)
+            spread_out[parent] += wp.spatial_vector(force, moment)
     for k in range(first, first + size):
         parent = body_parent[k]
         above = wp.spatial_vector()
         if parent >= 0:
-            above = spread_out[parent]
+            above = added_out[parent]
+        elif body_root[k] >= 0:
+            wrench = spread_out[k]
+            force = wp.spatial_top(wrench) - wp.transpose(DH[k]) * wp.spatial_bottom(wrench)
+            above = wp.spatial_vector(lift[k] * force, wp.vec3())
+            joint_xd_free_out[k] += dt * (lift[k] * force)
         alpha = wp.spatial_bottom(above)
         a = wp.spatial_top(above) + wp.cross(alpha, lever[k])
         relative = Du_out[k] - DJ[k] * alpha - DH[k] * a
-        added = wp.spatial_vector(a, alpha + relative)
-        spread_out[k] = added
-        body_acceleration_out[k] = body_acceleration_out[k] + added
-        joint_qd_free_out[k] = joint_qd_free_out[k] + dt * wp.quat_rotate_inv(axes[k], relative)
+        added_out[k] = wp.spatial_vector(a, alpha + relative)
+        body_acceleration_out[k] += added_out[k]
+        joint_qd_free_out[k] += dt * wp.quat_rotate_inv(axes[k], relative)
 
 
 @wp.kernel
@@ -452,58 +579,245 @@ def integrate(
     limit: float,
     bound: float,
     tree_first: wp.array(dtype=wp.int32),
-    tree_size: wp.array(dtype=wp.int32),
+    tree_moving: wp.array(dtype=wp.int32),
+    body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
     # in
     trees: wp.array(dtype=wp.int32),
     tree_awake: wp.array(dtype=wp.bool),
     tree_phi: wp.array(dtype=float),
-    joint_qd_free: wp.array(dtype=wp.vec3),
+    joint_x: wp.array(dtype=wp.vec3),
+    joint_xd: wp.array(dtype=wp.vec3),
     joint_q: wp.array(dtype=wp.quat),
     joint_qd: wp.array(dtype=wp.vec3),
+    joint_xd_free: wp.array(dtype=wp.vec3),
+    joint_qd_free: wp.array(dtype=wp.vec3),
     # out
     tree_rate_out: wp.array(dtype=float),
     tree_onset_out: wp.array(dtype=wp.int32),
+    joint_x_out: wp.array(dtype=wp.vec3),
+    joint_xd_out: wp.array(dtype=wp.vec3),
     joint_q_out: wp.array(dtype=wp.quat),
     joint_qd_out: wp.array(dtype=wp.vec3),
 ):
-    """Move the joints of one tree to the end of the tick (in place or not); beyond bound it stays where it began."""
+    """Move the joints of one tree to the end of the tick; a tree beyond bound stops where the tick began."""
     tree = trees[wp.tid()]
     if not tree_awake[tree]:
         return
     first = tree_first[tree]
-    size = tree_size[tree]
-    most = fastest(joint_qd_free, first, size)
+    size = tree_moving[tree]
+    speed = fleeing(joint_xd_free, body_parent, body_root, first, size)
+    most = wp.length(wp.vec2(fastest(joint_qd_free, first, size), speed))
     tree_rate_out[tree] = most
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
     sound = most <= bound
     phi = tree_phi[tree]
+    # a tree beyond limit is slowed as a whole and well below it: holding back single joints would feed energy into the
+    # others, and a loaded cane would thrash at the limit for ever
+    slower = float(1.0)
+    if most > limit:
+        slower = 0.5 * limit / most
     for k in range(first, first + size):
+        floats = body_parent[k] < 0 and body_root[k] >= 0
         if sound:
-            rate = joint_qd_free[k]
-            square = wp.length_sq(rate)
-            if square > limit * limit:
-                rate = rate * (limit / wp.sqrt(square))
+            rate = slower * joint_qd_free[k]
             mean = (1.0 - phi) * joint_qd[k] + phi * rate
             joint_qd_out[k] = rate
             joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q[k])
+            if floats:
+                joint_x_out[k] = joint_x[k] + dt * ((1.0 - phi) * joint_xd[k] + phi * joint_xd_free[k])
+                joint_xd_out[k] = joint_xd_free[k]
         else:
             joint_qd_out[k] = wp.vec3()
             joint_q_out[k] = joint_q[k]
+            if floats:
+                joint_xd_out[k] = wp.vec3()
+                joint_x_out[k] = joint_x[k]
+
+
+@wp.func
+def held(
+    k: int,
+    dt: float,
+    phi: float,
+    air: wp.vec3,
+    body_com: wp.array(dtype=wp.vec3),
+    body_drag: wp.array(dtype=float),
+    tie_first: wp.array(dtype=wp.int32),
+    tie_point: wp.array(dtype=wp.vec3),
+    tie_anchor: wp.array(dtype=wp.vec3),
+    tie_stiffness: wp.array(dtype=float),
+    tie_damping: wp.array(dtype=float),
+    pose: wp.transform,
+    motion: wp.spatial_vector,
+    acceleration: wp.spatial_vector,
+):
+    """What ties and air did to a body in the last tick: force [N], moment about its origin [N m]."""
+    velocity = wp.spatial_top(motion)
+    omega = wp.spatial_bottom(motion)
+    a = wp.spatial_top(acceleration)
+    alpha = wp.spatial_bottom(acceleration)
+    wrench = wp.spatial_vector()
+    area = body_drag[k]
+    if area > 0.0:
+        com = wp.quat_rotate(wp.transform_get_rotation(pose), body_com[k])
+        wind = air - velocity - wp.cross(omega, com)
+        force = blown(area, wind) * (wind - dt * (a + wp.cross(alpha, com)))
+        wrench += wp.spatial_vector(force, wp.cross(com, force))
+    for t in range(tie_first[k], tie_first[k + 1]):
+        at = wp.quat_rotate(wp.transform_get_rotation(pose), tie_point[t])
+        stretch = wp.transform_get_translation(pose) + at - tie_anchor[t]
+        tie = tie_stiffness[t]
+        damper = remaining(tie_damping[t], tie, phi, dt)
+        grip = phi * dt * (phi * dt * tie + damper)
+        force = tied(tie, damper, stretch, velocity + wp.cross(omega, at), phi, dt)
+        force = force - grip * (a + wp.cross(alpha, at))
+        wrench += wp.spatial_vector(force, wp.cross(at, force))
+    return wrench
+
+
+@wp.kernel
+def conserve(
+    # model
+    dt: float,
+    bound: float,
+    gravity: wp.vec3,
+    tree_first: wp.array(dtype=wp.int32),
+    tree_moving: wp.array(dtype=wp.int32),
+    body_tree: wp.array(dtype=wp.int32),
+    body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
+    body_offset: wp.array(dtype=wp.vec3),
+    body_rest: wp.array(dtype=wp.quat),
+    body_mass: wp.array(dtype=float),
+    body_com: wp.array(dtype=wp.vec3),
+    body_inertia: wp.array(dtype=wp.vec3),
+    body_product: wp.array(dtype=wp.vec3),
+    body_drag: wp.array(dtype=float),
+    tie_first: wp.array(dtype=wp.int32),
+    tie_point: wp.array(dtype=wp.vec3),
+    tie_stiffness: wp.array(dtype=float),
+    tie_damping: wp.array(dtype=float),
+    # in
+    roots: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_rate: wp.array(dtype=float),
+    tree_air: wp.array(dtype=wp.vec3),
+    tie_anchor: wp.array(dtype=wp.vec3),
+    body_load: wp.array(dtype=wp.spatial_vector),
+    body_wrench: wp.array(dtype=wp.spatial_vector),
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
+    body_acceleration: wp.array(dtype=wp.spatial_vector),
+    joint_q: wp.array(dtype=wp.quat),
+    # out
+    later_q_out: wp.array(dtype=wp.transform),
+    later_qd_out: wp.array(dtype=wp.spatial_vector),
+    joint_x_out: wp.array(dtype=wp.vec3),
+    joint_xd_out: wp.array(dtype=wp.vec3),
+    joint_qd_out: wp.array(dtype=wp.vec3),
+):
+    """Give one floating component the momentum and the path of its centre of mass that outer forces leave it."""
+    root = roots[wp.tid()]
+    tree = body_tree[root]
+    if not tree_rate[tree] <= bound:
+        return
+    last = tree_first[tree] + tree_moving[tree]
+
+    # before the tick, about the root and against it: momentum, and what acted on it since
+    here = wp.transform_get_translation(body_q[root])
+    pace = wp.spatial_top(body_qd[root])
+    mass = float(0.0)
+    lean = wp.vec3()  # mass times centre of mass
+    linear = wp.vec3()
+    angular = wp.vec3()
+    force = wp.vec3()
+    moment = wp.vec3()
+    for k in range(root, last):
+        if body_root[k] == root:
+            pose = body_q[k]
+            omega = wp.spatial_bottom(body_qd[k])
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            com = rotation * body_com[k]
+            arm = wp.transform_get_translation(pose) - here
+            momentum = body_mass[k] * (wp.spatial_top(body_qd[k]) - pace + wp.cross(omega, com))
+            given = body_load[k] + body_wrench[k]
+            given += held(
+                k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_first, tie_point, tie_anchor,
+                tie_stiffness, tie_damping, pose, body_qd[k], body_acceleration[k],
+            )  # fmt: skip
+            mass += body_mass[k]
+            lean += body_mass[k] * (arm + com)
+            linear += momentum
+            angular += wp.cross(arm + com, momentum) + tensor(rotation, body_inertia[k], body_product[k]) * omega
+            force += wp.spatial_top(given)
+            moment += wp.cross(arm, wp.spatial_top(given)) + wp.spatial_bottom(given)
+    com = lean / mass
+    goal = linear + dt * (force + mass * gravity)
+    spin = angular - wp.cross(com, linear) + dt * (moment - wp.cross(com, force))
+    path = com + dt * (pace + 0.5 / mass * (linear + goal))
+
+    # after it: the same sums with the joints as they are now, and the inertia of all that, locked
+    moved = joint_x_out[root] - here
+    lean = wp.vec3()
+    linear = wp.vec3()
+    angular = wp.vec3()
+    locked = wp.mat33()
+    for k in range(root, last):
+        if body_root[k] == root:
+            above = wp.transform(wp.vec3(), wp.quat_identity())
+            motion = wp.spatial_vector()
+            if k > root:
+                above = later_q_out[body_parent[k]]
+                motion = later_qd_out[body_parent[k]]
+            turning = wp.spatial_bottom(motion)
+            axes = wp.transform_get_rotation(above) * body_rest[k]
+            lever = wp.quat_rotate(wp.transform_get_rotation(above), body_offset[k])
+            arm = wp.transform_get_translation(above) + lever
+            turned_by = axes * joint_q[k]
+            omega = turning + wp.quat_rotate(axes, joint_qd_out[k])
+            velocity = wp.spatial_top(motion) + wp.cross(turning, lever)
+            later_q_out[k] = wp.transform(arm, turned_by)
+            later_qd_out[k] = wp.spatial_vector(velocity, omega)
+            rotation = wp.quat_to_matrix(turned_by)
+            com_k = rotation * body_com[k]
+            inertia = tensor(rotation, body_inertia[k], body_product[k])
+            momentum = body_mass[k] * (velocity + wp.cross(omega, com_k))
+            lean += body_mass[k] * (arm + com_k)
+            linear += momentum
+            angular += wp.cross(arm + com_k, momentum) + inertia * omega
+            locked += inertia + at_lever(body_mass[k], arm + com_k)
+    com = lean / mass
+    turn = wp.inverse(locked - at_lever(mass, com)) * (spin - angular + wp.cross(com, linear))
+    joint_qd_out[root] = joint_qd_out[root] + turn
+    joint_xd_out[root] = pace + (goal - linear) / mass - wp.cross(turn, com)
+    joint_x_out[root] = joint_x_out[root] + (path - moved - com)
 
 
 @wp.kernel
 def joint_wrench(
     # model
+    dt: float,
     gravity: wp.vec3,
     tree_first: wp.array(dtype=wp.int32),
-    tree_size: wp.array(dtype=wp.int32),
+    tree_moving: wp.array(dtype=wp.int32),
     body_tree: wp.array(dtype=wp.int32),
     body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
     body_mass: wp.array(dtype=float),
     body_com: wp.array(dtype=wp.vec3),
     body_inertia: wp.array(dtype=wp.vec3),
+    body_product: wp.array(dtype=wp.vec3),
+    body_drag: wp.array(dtype=float),
+    tie_first: wp.array(dtype=wp.int32),
+    tie_point: wp.array(dtype=wp.vec3),
+    tie_stiffness: wp.array(dtype=float),
+    tie_damping: wp.array(dtype=float),
     # in
     bodies: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_air: wp.array(dtype=wp.vec3),
+    tie_anchor: wp.array(dtype=wp.vec3),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
     body_acceleration: wp.array(dtype=wp.spatial_vector),
@@ -519,20 +833,27 @@ def joint_wrench(
     at = wp.transform_get_translation(body_q[body])
     force = wp.vec3()
     moment = wp.vec3()
-    for k in range(body, tree_first[tree] + tree_size[tree]):
+    last = tree_first[tree] + tree_moving[tree]
+    if body_parent[body] < 0 and body_root[body] >= 0:
+        last = body  # nothing holds what has been cut off
+    for k in range(body, last):
         up = int(k)
         while up > body:
             up = body_parent[up]
         if up == body:
             pose = body_q[k]
             rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-            inertia = turned(rotation, body_inertia[k])
+            inertia = tensor(rotation, body_inertia[k], body_product[k])
             com = rotation * body_com[k]
             omega = wp.spatial_bottom(body_qd[k])
             alpha = wp.spatial_bottom(body_acceleration[k])
             a = wp.spatial_top(body_acceleration[k]) + wp.cross(alpha, com) + wp.cross(omega, wp.cross(omega, com))
             own = body_mass[k] * (a - gravity)
             given = body_load[k] + body_wrench[k]
+            given += held(
+                k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_first, tie_point, tie_anchor,
+                tie_stiffness, tie_damping, pose, body_qd[k], body_acceleration[k],
+            )  # fmt: skip
             arm = wp.transform_get_translation(pose) - at
             force += own - wp.spatial_top(given)
             moment += wp.cross(arm + com, own) + inertia * alpha + wp.cross(omega, inertia * omega)

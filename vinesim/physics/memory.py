@@ -52,7 +52,8 @@ class Memory:
         self.apart = self.device.is_cuda if apart is None else apart
         self.arrays: dict[str, wp.array] = {}
         """What kernels work on."""
-        self._host: dict[str, np.ndarray] = {}
+        self.host: dict[str, np.ndarray] = {}
+        """What NumPy works on."""
 
     def within_reach(self, data: np.ndarray) -> np.ndarray:
         """``data`` itself if the device can reach it, a copy that it can reach otherwise: use that from now on."""
@@ -68,7 +69,7 @@ class Memory:
         if self.device.is_cpu and not self.apart:
             self.reach(name, data, dtype)
         else:
-            self.arrays[name] = wp.array(data, dtype=dtype, device=self.device)
+            self.arrays[name], self.host[name] = wp.array(data, dtype=dtype, device=self.device), data
 
     def reach(self, name: str, data: np.ndarray, dtype: type) -> None:
         """An array that kernels read and write where it is; with a GPU it must come from :meth:`within_reach`."""
@@ -79,12 +80,12 @@ class Memory:
         else:
             shape = data.shape if dtype in (float, wp.int32, wp.bool) else data.shape[:1]
             shared = wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
-        self.arrays[name], self._host[name] = shared, data
+        self.arrays[name], self.host[name] = shared, data
 
     def rows(self, name: str, data: np.ndarray, dtype: type) -> None:
-        """An array of floats with a row for each body, written by both sides: see :meth:`carrier`."""
+        """An array with a row of four-byte numbers for each body, written by both sides: see :meth:`carrier`."""
         if self.apart:
-            self.arrays[name], self._host[name] = wp.array(data, dtype=dtype, device=self.device), data
+            self.arrays[name], self.host[name] = wp.array(data, dtype=dtype, device=self.device), data
         else:
             self.reach(name, data, dtype)
 
@@ -101,7 +102,7 @@ class Memory:
             return lambda count: None
         launches = []
         for name in names:
-            data = self._host[name]
+            data = self.host[name]
             width = data[0].size if len(data) else 1
             pair = [self._numbers(data.ctypes.data, data.size), self._numbers(self.arrays[name].ptr, data.size)]
             if back:
@@ -116,9 +117,16 @@ class Memory:
 
         return all_of
 
+    def upload(self, names: list[str]) -> None:
+        """Copy whole arrays to the device."""
+        if self.apart:
+            for name in names:
+                count = self.host[name].size
+                wp.copy(self._numbers(self.arrays[name].ptr, count), self._numbers(self.host[name].ctypes.data, count))
+
     def _numbers(self, address: int, count: int) -> wp.array:
-        """So many floats at an address that the device can reach."""
-        return wp.array(ptr=address, shape=(count,), dtype=float, device=self.device)
+        """So many four-byte numbers at an address that the device can reach."""
+        return wp.array(ptr=address, shape=(count,), dtype=wp.int32, device=self.device)
 
     def wait(self) -> None:
         """Until the device has done all that was asked of it."""

@@ -3,6 +3,10 @@
 One tick of the plants alone is ``free()`` then ``commit()``. Whoever solves contacts stands in between: it reads
 ``state.body_q`` and ``velocity_free``, asks ``response()`` of the bodies it touches, and commits the wrenches it found.
 
+A tree with berry clusters is *coarse* (each bunch one compound, its clusters riding on it) until ``refine()`` lets them
+move and ``coarsen()`` fuses them again. ``cut()`` makes a body the floating root of what grows on it. All three are
+called between ticks, after ``commit()`` and before the next ``free()``.
+
 The scheme (:mod:`vinesim.kernels.plant`) damps as if every joint's beta (damping / stiffness) were larger by
 ``(2 phi - 1) dt``, so the solver takes that off what the model asks, down to nothing: what is asked is what is seen.
 """
@@ -13,6 +17,7 @@ import functools
 import math
 import weakref
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -36,6 +41,7 @@ LIMIT = 50.0
 
 BOUND = 5000.0
 """[rad/s] A tree of which a joint would turn faster than this is not integrated: see :mod:`vinesim.physics.guard`."""
+
 
 FEW = 100
 """[tree] For fewer awake trees a thread, handing ``free()`` to other threads costs more than it saves."""
@@ -100,8 +106,20 @@ class Plants:
         """Velocity of each body of an awake tree at the end of the tick if nothing touches it [body, 6]."""
         self.acceleration = np.zeros((bodies, 6), np.float32)
         """Acceleration over the last tick [body, 6] m/s^2, rad/s^2, world axes."""
-        self.body_mass = model.body_mass.copy()
-        self.body_inertia = model.body_inertia.copy()
+        self.tree_air = np.zeros((trees, 3), np.float32)
+        """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.wind`."""
+        self.tie_anchor = model.tie_anchor.copy()
+        """Where ties are held [tie, 3] m, in the world; move them as you like."""
+        self.tie_stiffness, self.tie_damping = model.tie_stiffness.copy(), model.tie_damping.copy()
+        """N/m, N s/m [tie]; a tie of zero is undone."""
+        self.body_mass, self.body_com = model.body_mass.copy(), model.body_com.copy()
+        self.body_inertia, self.body_drag = model.body_inertia.copy(), model.body_drag.copy()
+        """What moves now, in the model's units: the body of a bunch is its compound while the tree is coarse, its head
+        while it is fine; a picked bunch is a stub."""
+        self.body_product = np.zeros((bodies, 3), np.float32)
+        """Entries yz, zx, xy of the inertia in the body's axes [body, 3] kg m^2: a compound is not symmetric."""
+        self.joint_stiffness, self.joint_damping = model.joint_stiffness.copy(), model.joint_damping.copy()
+        """The model's, but none where a body has been cut off."""
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``free()`` [tree]."""
         self._onset = np.zeros(trees, np.int32)
@@ -109,12 +127,21 @@ class Plants:
         self.tick = 0
         """Commits so far."""
         self._wrench = np.zeros((bodies, 6), np.float32)
+        self._impulse = np.zeros((bodies, 6), np.float32)
+        self._joint_xd_free, self._joint_qd_free = np.zeros((bodies, 3), np.float32), np.zeros((bodies, 3), np.float32)
         self._pushed = np.zeros(0, np.int32)
         self._stepping = np.zeros(trees, np.int32)
         self._subset = np.zeros(trees, np.int32)
         self._stepped = np.zeros(0, np.int32)
         self._capacity = 0
-        self._memory, self.threads = memory, threads
+        # as the kernels see the trees: a cut body has no parent and no lever, a coarse tree no clusters
+        self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
+        self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
+        self._moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
+        self._tie_first = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
+        self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
+        self.memory, self.threads = memory, threads
+        """Where arrays live, for NumPy and for kernels."""
         for owner in (self, state):
             for name, value in vars(owner).items():
                 if isinstance(value, np.ndarray):
@@ -124,9 +151,18 @@ class Plants:
             weakref.finalize(self, self._crew.close)
         self._share_ends = [0] * (threads + 1)
         self._graph: wp.Graph | None = None
-        self._graph_count = -1
+        self._graph_of = (-1, -1)
         self._record(tension)
         self._pack()
+        self._loosen(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
+        clustered = np.flatnonzero(model.bunch_clusters > 0)
+        tree = model.body_tree[model.bunch_body[clustered]]
+        order = np.argsort(tree, kind="stable")
+        self._fruit, self._fruit_tree = clustered[order], tree[order]
+        """Bunches that have clusters, by tree."""
+        self._head_mass, self._head_inertia = model.bunch_head_mass.copy(), model.bunch_head_inertia.copy()
+        self._fuse(self._fruit[~state.tree_fine[self._fruit_tree]])
+        self._part(self._fruit[state.tree_fine[self._fruit_tree]])
 
     # who is awake
 
@@ -149,6 +185,7 @@ class Plants:
             return
         bodies = self.bodies_of(trees)
         self.state.joint_qd[bodies] = 0.0
+        self.state.joint_xd[bodies] = 0.0
         self.velocity_free[bodies] = 0.0
         self.acceleration[bodies] = 0.0
         self.tree_rate[trees] = 0.0
@@ -159,19 +196,180 @@ class Plants:
 
     def bodies_of(self, trees: np.ndarray) -> np.ndarray:
         """All bodies of some trees, tree by tree [k]."""
-        first, size = self.model.tree_first[trees], self.model.tree_size[trees]
-        end = np.cumsum(size)
-        return np.repeat(first - (end - size), size) + np.arange(end[-1] if len(end) else 0)
+        return _spans(self.model.tree_first[trees], self.model.tree_size[trees])
+
+    # coarse and fine
+
+    def refine(self, trees: np.ndarray | int) -> None:
+        """Let the clusters of these trees' bunches move, from where they ride and as fast as what they ride on.
+
+        Pose, velocity and momentum go on. Nothing happens to trees that are fine or have no clusters; none wakes.
+        """
+        trees = self._with_clusters(trees, fine=False)
+        if len(trees) == 0:
+            return
+        self._part(self._fruit_of(trees))
+        self.state.tree_fine[trees] = True
+        self._moving[trees] = self.model.tree_size[trees]
+        self.state.joint_qd[self._clusters_of(trees)] = 0.0
+        self.kinematics(trees)
+
+    def coarsen(self, trees: np.ndarray | int) -> None:
+        """Freeze the clusters of these trees' bunches where they are: each bunch becomes one compound.
+
+        Nothing changes its pose. The clusters' motion against their bunch ends in a plastic impact, which every joint
+        of the tree takes part in: momentum is conserved, kinetic energy never grows. Acting within no time it leaves
+        the springs aside.
+        """
+        trees = self._with_clusters(trees, fine=True)
+        if len(trees) == 0:
+            return
+        bunches, riding, state = self._fruit_of(trees), self._clusters_of(trees), self.state
+        impulse = self._fuse(bunches)
+        state.tree_fine[trees] = False
+        self._moving[trees] = self.model.tree_core[trees]
+        state.joint_qd[riding] = 0.0
+        self.velocity_free[riding] = 0.0
+        self.acceleration[riding] = 0.0
+        if impulse.any():
+            self.kinematics(trees)
+            bodies = self.model.bunch_body[bunches]
+            axes = state.body_q[bodies, 3:].astype(float)
+            self._impulse[bodies, :3] = frames.rotate(axes, impulse[:, :3])
+            self._impulse[bodies, 3:] = frames.rotate(axes, impulse[:, 3:])
+            self._subset[: len(trees)] = trees
+            self._renew()
+            self._carry_in_kick(len(trees))
+            self._loose_joints(len(trees))
+            self._kick(len(trees))
+            self._carry_out_kick(len(trees))
+            self.memory.wait()
+            self._impulse[bodies] = 0.0
+            moving = _spans(self.model.tree_first[trees], self.model.tree_core[trees])
+            state.joint_qd[moving] = self._joint_qd_free[moving]
+            roots = moving[state.body_cut[moving]]
+            state.joint_xd[roots] = self._joint_xd_free[roots]
+        self.kinematics(trees)
+
+    def _with_clusters(self, trees: np.ndarray | int, *, fine: bool) -> np.ndarray:
+        """Those of some trees that have clusters and are fine or not [k], sorted."""
+        trees = np.unique(np.atleast_1d(trees))
+        return trees[
+            (self.state.tree_fine[trees] == fine) & (self.model.tree_core[trees] < self.model.tree_size[trees])
+        ]
+
+    def _clusters_of(self, trees: np.ndarray) -> np.ndarray:
+        """The clusters of some trees [k]."""
+        core = self.model.tree_core[trees]
+        return _spans(self.model.tree_first[trees] + core, self.model.tree_size[trees] - core)
+
+    def _fruit_of(self, trees: np.ndarray) -> np.ndarray:
+        """The bunches of some trees that have clusters [k]."""
+        start, end = (np.searchsorted(self._fruit_tree, trees, side=side) for side in ("left", "right"))
+        return self._fruit[_spans(start, end - start)]
+
+    def _part(self, bunches: np.ndarray) -> None:
+        """Leave to each bunch's body its head only."""
+        bodies = self.model.bunch_body[bunches]
+        self.body_mass[bodies] = self._head_mass[bunches]
+        self.body_com[bodies] = self.model.bunch_head_com[bunches]
+        self.body_inertia[bodies] = self._head_inertia[bunches]
+        self.body_product[bodies] = 0.0
+        self._renewed = True
+
+    def _fuse(self, bunches: np.ndarray) -> np.ndarray:
+        """Make each bunch's body a compound of head and clusters as they are.
+
+        Returns the momentum of the clusters' motion against it [bunch, 6]: N s, and N m s about its origin, its axes.
+        """
+        model, state = self.model, self.state
+        n, bodies = len(bunches), model.bunch_body[bunches]
+        most = int(model.bunch_clusters[bunches].max(initial=0))
+        here, speed = np.zeros((n, most + 1, 7)), np.zeros((n, most + 1, 6))  # in the bunch's frame; the head first
+        here[..., 6] = 1.0
+        mass = np.zeros((n, most + 1))
+        com, inertia = np.zeros((n, most + 1, 3)), np.zeros((n, most + 1, 3))
+        mass[:, 0], com[:, 0], inertia[:, 0] = (
+            self._head_mass[bunches], model.bunch_head_com[bunches], self._head_inertia[bunches]
+        )  # fmt: skip
+        for number in range(most):  # over the clusters of one bunch, a handful
+            has = np.flatnonzero(model.bunch_clusters[bunches] > number)
+            body = model.bunch_cluster[bunches[has]] + number
+            parent = model.body_parent[body]
+            above = np.where(parent == bodies[has], 0, parent - model.bunch_cluster[bunches[has]] + 1)
+            base, motion = here[has, above], speed[has, above]
+            frame = frames.compose(base, frames.pose(model.body_offset[body].astype(float), model.body_rest[body]))
+            turn = frames.rotate(frame[:, 3:], state.joint_qd[body].astype(float))
+            here[has, number + 1, :3] = frame[:, :3]
+            here[has, number + 1, 3:] = frames.multiply(frame[:, 3:], state.joint_q[body].astype(float))
+            speed[has, number + 1, :3] = motion[:, :3] + np.cross(motion[:, 3:], frame[:, :3] - base[:, :3])
+            speed[has, number + 1, 3:] = motion[:, 3:] + turn
+            mass[has, number + 1] = self.body_mass[body]
+            com[has, number + 1], inertia[has, number + 1] = self.body_com[body], self.body_inertia[body]
+        axes = frames.matrix(here[..., 3:])
+        tensor = np.einsum("...ij,...j,...kj->...ik", axes, inertia, axes)
+        arm = np.einsum("...ij,...j->...i", axes, com)
+        linear = mass[..., None] * (speed[..., :3] + np.cross(speed[..., 3:], arm))
+        arm += here[..., :3]
+        angular = np.cross(arm, linear) + np.einsum("...ij,...j->...i", tensor, speed[..., 3:])
+        whole = mass.sum(1)
+        center = (mass[..., None] * arm).sum(1) / whole[:, None]
+        arm -= center[:, None]
+        tensor += mass[..., None, None] * (
+            (arm * arm).sum(-1)[..., None, None] * np.eye(3) - arm[..., :, None] * arm[..., None, :]
+        )
+        tensor = tensor.sum(1)
+        self.body_mass[bodies], self.body_com[bodies] = whole, center
+        self.body_inertia[bodies] = np.diagonal(tensor, axis1=1, axis2=2)
+        self.body_product[bodies] = tensor[:, [1, 2, 0], [2, 0, 1]]
+        self._renewed = True
+        return np.concatenate([linear.sum(1), angular.sum(1)], -1)
+
+    # cutting
+
+    def cut(self, body: int) -> None:
+        """Cut a body off its parent: it and what grows on it fall, from where they are and as fast as they are.
+
+        Its tree wakes; the rest of it goes on as before. Numbers never change.
+        """
+        model, state, body = self.model, self.state, int(body)
+        if not 0 <= body < len(model.body_mass):
+            raise ValueError(f"body {body} cannot be cut off: there are {len(model.body_mass)}, counted from 0")
+        tree = int(model.body_tree[body])
+        if state.body_cut[body]:
+            raise ValueError(f"body {body} of tree {tree} has been cut off already")
+        if body - model.tree_first[tree] >= model.tree_core[tree]:
+            raise ValueError(f"body {body} of tree {tree} is a berry cluster; cut off its bunch")
+        self.kinematics(tree)
+        state.joint_x[body], state.joint_q[body] = state.body_q[body, :3], state.body_q[body, 3:]
+        state.joint_xd[body], state.joint_qd[body] = state.body_qd[body, :3], state.body_qd[body, 3:]
+        state.body_cut[body] = True
+        self._loosen(self.bodies_of(np.array([tree])))
+        self.wake(tree)
+
+    def _loosen(self, bodies: np.ndarray) -> None:
+        """Take over which of the bodies of some whole trees have been cut off."""
+        cut = bodies[self.state.body_cut[bodies]]
+        self._parent[cut] = -1
+        self._offset[cut], self._rest[cut] = 0.0, frames.IDENTITY
+        self.joint_stiffness[cut], self.joint_damping[cut] = 0.0, 0.0
+        up = bodies
+        while ((above := self._parent[up]) >= 0).any():
+            up = np.where(above >= 0, above, up)
+        self._root[bodies] = np.where(self.state.body_cut[up], up, -1)
+        self._roots = np.flatnonzero(self.state.body_cut).astype(np.int32)
+        self._renewed = True
 
     # one tick
 
     def free(self) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the tick and solve the motion without contacts."""
         self._choose()
+        self._renew()
         self._carry_in(len(self._stepped))
         self._all(self._free, FEW)
         self._carry_out_free(len(self._stepped))
-        self._memory.wait()
+        self.memory.wait()
 
     def response(self, bodies: np.ndarray) -> np.ndarray:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
@@ -188,7 +386,7 @@ class Plants:
         self._asked[:n] = bodies
         self._asked[n] = -1
         self._respond(n)
-        self._memory.wait()
+        self.memory.wait()
         y = self._response[:n, :, :n].reshape(6 * n, 6 * n)
         return (0.5 * (y + y.T)).reshape(n, 6, n, 6)
 
@@ -215,9 +413,19 @@ class Plants:
         elif changed:
             self._carry_wrench(len(self._stepped))
         self._all(self._integrate, FEW_MOVES)
+        self._conserve(self._afloat())
         self._carry_out_commit(len(self._stepped))
-        self._memory.wait()
+        self.memory.wait()
         self.tick += 1
+
+    def _afloat(self) -> int:
+        """List the floating roots that this tick moves; how many there are."""
+        if len(self._roots) == 0:
+            return 0
+        tree = self.model.body_tree[self._roots]
+        roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._stepped)]
+        self._floating[: len(roots)] = roots
+        return len(roots)
 
     def advance(self, ticks: int) -> None:
         """Many ticks of the awake trees with nothing in between: no contacts, no sleep, no guard.
@@ -228,27 +436,29 @@ class Plants:
         ``bound``).
         """
         self._choose()
+        floating = self._afloat()
         if len(self._pushed) and ticks > 0:  # the next prediction still knows the last contacts
-            self._together(1)
+            self._together(1, floating)
             self._wrench[self._pushed] = 0.0
             self._pushed = np.zeros(0, np.int32)
             self._carry_wrench(len(self._stepped))
-            self._together(ticks - 1)
+            self._together(ticks - 1, floating)
         else:
-            self._together(ticks)
+            self._together(ticks, floating)
         self.tick += ticks
 
     def upload(self) -> None:
         """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
         self._choose()
+        self._renew()
         self._carry_in(len(self._stepped))
-        self._memory.wait()
+        self.memory.wait()
 
     def download(self) -> None:
         """Bring the host's arrays of the awake trees up to the device's copies, as ``free()`` and ``commit()`` do."""
         self._carry_out_free(len(self._stepped))
         self._carry_out_commit(len(self._stepped))
-        self._memory.wait()
+        self.memory.wait()
 
     def brace(self, trees: np.ndarray) -> None:
         """Use phi = 1 in the next ``ONSET`` ticks of trees about to be touched (``commit()`` sees to new touches)."""
@@ -258,10 +468,11 @@ class Plants:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""
         trees = self._list if trees is None else np.atleast_1d(trees)
         self._subset[: len(trees)] = trees
+        self._renew()
         self._carry_in_place(len(trees))
         self._place(len(trees))
         self._carry_out_place(len(trees))
-        self._memory.wait()
+        self.memory.wait()
 
     def pull(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
@@ -278,6 +489,7 @@ class Plants:
         turn = frames.log(frames.multiply(frames.conjugate(here), there))
         self.state.joint_q[bodies] = frames.normalize(frames.multiply(here, frames.exp(blend * turn)))
         self.state.joint_qd[bodies] = rates
+        self.state.joint_qd[bodies.start + self._moving[tree] : bodies.stop] = 0.0  # what rides does not turn
 
     # what one may ask
 
@@ -286,17 +498,19 @@ class Plants:
 
         Of the last tick, and only for bodies of trees that were awake in it. At rest it carries what hangs below.
         """
-        n, device = len(bodies), self._memory.device
+        n, device = len(bodies), self.memory.device
         out = wp.zeros(n, dtype=wp.spatial_vector, device=device)
         asked = wp.array(np.asarray(bodies, np.int32), dtype=wp.int32, device=device)
         if n:
-            m = self._memory.arrays
+            m = self.memory.arrays
             wp.launch(
                 plant.joint_wrench,
                 n,
                 inputs=[
-                    wp.vec3(GRAVITY), m["tree_first"], m["tree_size"], m["body_tree"], m["body_parent"], m["body_mass"],
-                    m["body_com"], m["body_inertia"], asked, m["body_q"], m["body_qd"], m["acceleration"],
+                    self.dt, wp.vec3(GRAVITY), m["tree_first"], m["tree_moving"], m["body_tree"], m["body_parent"],
+                    m["body_root"], m["body_mass"], m["body_com"], m["body_inertia"], m["body_product"],
+                    m["body_drag"], m["tie_first"], m["tie_point"], m["tie_stiffness"], m["tie_damping"], asked,
+                    m["phi_used"], m["tree_air"], m["tie_anchor"], m["body_q"], m["body_qd"], m["acceleration"],
                     m["body_load"], m["wrench"],
                 ],
                 outputs=[out],
@@ -310,11 +524,23 @@ class Plants:
         return math.pi * frequency * (2.0 * phi - 1.0) * self.dt
 
     def reweigh(self, body: int, mass: float) -> None:
-        """Give one body another mass [kg] (a picked bunch, a pruned leaf); its inertia scales along."""
+        """Give one body another mass [kg] (a picked bunch, a pruned leaf); its inertia scales along.
+
+        A bunch with clusters is meant as a whole, fine or coarse: head and clusters keep their shares.
+        """
         if not mass > 0.0:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
-        self.body_inertia[body] *= mass / self.body_mass[body]
-        self.body_mass[body] = mass
+        fruit = self._fruit[self.model.bunch_body[self._fruit] == body]
+        parts = _spans(self.model.bunch_cluster[fruit], self.model.bunch_clusters[fruit])
+        whole = self.body_mass[body] if len(fruit) == 0 else self._head_mass[fruit].sum() + self.body_mass[parts].sum()
+        share = mass / float(whole)
+        self._head_mass[fruit] *= share
+        self._head_inertia[fruit] *= share
+        parts = np.append(parts, body)
+        self.body_mass[parts] *= share
+        self.body_inertia[parts] *= share
+        self.body_product[parts] *= share
+        self._renewed = True
 
     # memory and launches
 
@@ -327,6 +553,13 @@ class Plants:
         if len(self._stepped) == 0 or (self._stepped[np.minimum(at, len(self._stepped) - 1)] != trees).any():
             late = next(i for i, tree in enumerate(trees) if tree not in self._stepped)
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before free()")
+        riding = bodies - self.model.tree_first[trees] >= self._moving[trees]
+        if riding.any():
+            late = int(np.argmax(riding))
+            raise ValueError(
+                f"body {bodies[late]} is touched, but tree {trees[late]} is coarse and the body rides on its bunch: "
+                "touch the bunch, or refine the tree before free()"
+            )
 
     def _choose(self) -> None:
         """The awake trees are the ones that this tick steps; deal them out to the threads."""
@@ -345,110 +578,151 @@ class Plants:
         else:
             self._crew.share(self._shares[launch])
 
-    def _together(self, ticks: int) -> None:
+    def _together(self, ticks: int, floating: int) -> None:
         """Predict and move, so many times, without coming back in between."""
         count, ends = len(self._stepped), self._share_ends
         if count == 0:
             return
-        if not self._memory.device.is_cpu:
-            if count != self._graph_count:
-                with wp.ScopedCapture(self._memory.device) as capture:
-                    self._free(count)
-                    self._integrate(count)
-                self._graph, self._graph_count = capture.graph, count
+        if not self.memory.device.is_cpu:
+            if self._graph_of != (count, floating):
+                with wp.ScopedCapture(self.memory.device) as capture:
+                    self._tick(1, count, floating)
+                self._graph, self._graph_of = capture.graph, (count, floating)
             for _ in range(ticks):
                 wp.capture_launch(self._graph)
-            self._memory.wait()
-        elif self._crew is None or count < self.threads:
-            _run(self._free, self._integrate, ticks, count)
+            self.memory.wait()
+        elif self._crew is None or count < self.threads or floating:
+            self._tick(ticks, count, floating)
         else:
-            self._crew.share(
-                [
-                    functools.partial(_run, self._free, self._integrate, ticks, ends[i + 1] - ends[i], ends[i], i)
-                    for i in range(self.threads)
-                ]
-            )
+            share = [(ends[i + 1] - ends[i], ends[i], i) for i in range(self.threads)]
+            self._crew.share([functools.partial(_run, self._free, self._integrate, ticks, *part) for part in share])
+
+    def _tick(self, ticks: int, count: int, floating: int) -> None:
+        for _ in range(ticks):
+            self._free(count)
+            self._integrate(count)
+            self._conserve(floating)
+
+    def _renew(self) -> None:
+        """Tell a device's copies of what seldom changes: who grows on whom, masses, springs."""
+        if self._renewed:
+            self.memory.upload(self._seldom)
+            self._renewed = False
 
     def _record(self, tension: bool) -> None:
         """Bind every kernel to the arrays once.
 
-        Arrays of the model are constants. Of the others, floats with a row for each body are what a GPU keeps a copy
-        of (see :mod:`vinesim.physics.memory`); they are carried to it before every ``free()`` unless ``made`` there.
+        Arrays of the model are constants. What has a row for each body (``body_``, ``joint_`` and those named below)
+        a GPU keeps a copy of, see :mod:`vinesim.physics.memory`: carried to it before every ``free()``, or ``seldom``
+        (set ``_renewed`` after a change), or ``made`` there. All else it reads where it is.
         """
-        model, state, memory = self.model, self.state, self._memory
+        model, state, memory = self.model, self.state, self.memory
         kinds = {
-            wp.int32: {"tree_first": model.tree_first, "tree_size": model.tree_size, "body_tree": model.body_tree,
-                       "body_parent": model.body_parent, "stepping": self._stepping, "subset": self._subset,
-                       "onset": self._onset},
-            float: {"body_mass": self.body_mass, "tree_phi": self.phi, "phi_used": self.phi_used,
+            wp.int32: {"tree_first": model.tree_first, "tree_size": model.tree_size, "tree_moving": self._moving,
+                       "body_tree": model.body_tree, "body_parent": self._parent, "body_root": self._root,
+                       "tie_first": self._tie_first, "stepping": self._stepping, "subset": self._subset,
+                       "onset": self._onset, "floating": self._floating},
+            float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": self.tie_stiffness,
+                    "tie_damping": self.tie_damping, "tree_phi": self.phi, "phi_used": self.phi_used,
                     "tree_rate": self.tree_rate},
             wp.bool: {"tree_awake": state.tree_awake},
-            wp.vec3: {"body_offset": model.body_offset, "body_com": model.body_com, "body_inertia": self.body_inertia,
-                      "joint_stiffness": model.joint_stiffness,
-                      "joint_damping": model.joint_damping, "joint_qd": state.joint_qd},
-            wp.quat: {"body_rest": model.body_rest, "joint_q": state.joint_q},
+            wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
+                      "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
+                      "joint_damping": self.joint_damping, "tie_point": model.tie_point,
+                      "tie_anchor": self.tie_anchor, "tree_air": self.tree_air, "joint_x": state.joint_x,
+                      "joint_xd": state.joint_xd, "joint_qd": state.joint_qd, "joint_xd_free": self._joint_xd_free,
+                      "joint_qd_free": self._joint_qd_free},
+            wp.quat: {"body_rest": self._rest, "joint_q": state.joint_q},
             wp.transform: {"tree_pose": model.tree_pose, "body_q": state.body_q},
             wp.spatial_vector: {"body_qd": state.body_qd, "body_load": self.body_load, "wrench": self._wrench,
-                                "acceleration": self.acceleration, "velocity_free": self.velocity_free},
+                                "impulse": self._impulse, "acceleration": self.acceleration,
+                                "velocity_free": self.velocity_free},
         }  # fmt: skip
-        made = ("body_q", "body_qd", "velocity_free", "acceleration", "wrench")
-        given = []
-        constants = {id(value) for value in vars(model).values()}
-        bodies = len(model.body_mass)
+        made = ("body_q", "body_qd", "joint_xd_free", "joint_qd_free", "acceleration", "velocity_free", "wrench",
+                "impulse")  # fmt: skip
+        often = ("body_load", "joint_x", "joint_xd", "joint_q", "joint_qd")
+        self._seldom: list[str] = []
+        self._renewed = False
+        constants = {id(value) for value in vars(model).values()} | {id(self._tie_first)}
         for dtype, arrays in kinds.items():
             for name, data in arrays.items():
                 if id(data) in constants:
                     memory.constant(name, data, dtype)
-                elif data.dtype == np.float32 and len(data) == bodies and not name.startswith("tree"):
+                elif name.startswith(("body_", "joint_")) or name in made:
                     memory.rows(name, data, dtype)
-                    given += [name] if name not in made else []
+                    self._seldom += [name] if name not in made + often else []
                 else:
                     memory.reach(name, data, dtype)
         scratch = {
-            wp.vec3: ("lever", "drawn", "Du", "joint_qd_free"),
+            wp.vec3: ("lever", "drawn", "Du"),
             wp.quat: ("axes",),
-            wp.mat33: ("J", "H", "M", "D", "DJ", "DH"),
-            wp.spatial_vector: ("bias", "spread"),
+            wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "lift"),
+            wp.transform: ("later_q",),
+            wp.spatial_vector: ("bias", "spread", "added", "later_qd", "locked_acceleration", "locked_velocity"),
         }
         for dtype, names in scratch.items():
             for name in names:
-                memory.scratch(name, bodies, dtype)
+                memory.scratch(name, len(model.body_mass), dtype)
+        memory.scratch("locked_phi", len(model.tree_first), float)
         a, largest = memory.arrays, int(model.tree_size.max(initial=1))
 
-        def record(kernel: wp.Kernel, *inputs: object, **options: object) -> Callable[..., None]:
+        def record(kernel: wp.Kernel, *inputs: object, **options: Any) -> Callable[..., None]:
             given = [a[value] if isinstance(value, str) else value for value in inputs]
             return bind(kernel, given, [], device=str(memory.device), **options)
 
         def carrier(trees: str, *names: str, back: bool = False) -> Callable[[int], None]:
             return memory.carrier(names, trees, largest, back=back)
 
-        self._carry_in = carrier("stepping", *given)
+        self._carry_in = carrier("stepping", *often)
         self._carry_out_free = carrier("stepping", "body_q", "body_qd", "velocity_free", back=True)
         self._carry_wrench = carrier("stepping", "wrench")
-        self._carry_out_commit = carrier("stepping", "joint_q", "joint_qd", "acceleration", back=True)
-        self._carry_in_place = carrier("subset", "joint_q", "joint_qd")
+        self._carry_out_commit = carrier(
+            "stepping", "joint_x", "joint_xd", "joint_q", "joint_qd", "acceleration", back=True
+        )
+        self._carry_in_place = carrier("subset", "joint_x", "joint_xd", "joint_q", "joint_qd")
         self._carry_out_place = carrier("subset", "body_q", "body_qd", back=True)
+        self._carry_in_kick = carrier("subset", *often, "impulse")
+        self._carry_out_kick = carrier("subset", "joint_xd_free", "joint_qd_free", back=True)
 
         gravity, dt = wp.vec3(GRAVITY), self.dt
-        tree, joint = ("tree_first", "tree_size"), ("body_parent", "body_offset", "body_rest")
-        factors = ("axes", "lever", "D", "DJ", "DH")
+        tree, joint = ("tree_first", "tree_moving"), ("body_parent", "body_root", "body_offset", "body_rest")
+        body = ("body_mass", "body_com", "body_inertia", "body_product", "body_drag")
+        tie = ("tie_first", "tie_point", "tie_stiffness", "tie_damping")
+        where = ("joint_x", "joint_xd", "joint_q", "joint_qd")
+        factors = ("axes", "lever", "D", "DJ", "DH", "lift")
+        freed = ("joint_xd_free", "joint_qd_free")
         dealt = {"over": "trees", "shares": self.threads}
+
+        def free(dt: float, trees: str, wrench: str, phi: str, acceleration: str, velocity: str) -> Callable:
+            return record(
+                plant.free, dt, self.brisk, float(tension), gravity, *tree, "tree_pose", *joint, *body,
+                "joint_stiffness", "joint_damping", *tie, trees, "tree_phi", "onset", "tree_air", "tie_anchor",
+                "body_load", wrench, *where, "body_q", "body_qd", phi, "axes", "lever", "J", "H", "M", "bias", "drawn",
+                "D", "DJ", "DH", "Du", "lift", acceleration, *freed, velocity, **dealt,
+            )  # fmt: skip
+
+        def push(dt: float, wrench: str, acceleration: str) -> Callable:
+            return record(
+                plant.push, dt, *tree, "body_parent", "body_root", "subset", wrench, *factors, "spread", "added", "Du",
+                acceleration, *freed,
+            )  # fmt: skip
+
         self._place = record(
-            plant.place, *tree, "tree_pose", *joint, "subset", "joint_q", "joint_qd", "body_q", "body_qd"
+            plant.place, "tree_first", "tree_size", "tree_pose", *joint, "subset", *where, "body_q", "body_qd"
         )
-        self._free = record(
-            plant.free, dt, self.brisk, float(tension), gravity, *tree, "tree_pose", *joint, "body_mass", "body_com",
-            "body_inertia", "joint_stiffness", "joint_damping", "stepping", "tree_phi", "onset", "body_load", "wrench",
-            "joint_q", "joint_qd", "body_q", "body_qd", "phi_used", "axes", "lever", "J", "H", "M", "bias", "drawn",
-            "D", "DJ", "DH", "Du", "acceleration", "joint_qd_free", "velocity_free", **dealt,
-        )  # fmt: skip
-        self._push = record(
-            plant.push, dt, *tree, "body_parent", "subset", "wrench", *factors, "spread", "Du", "acceleration",
-            "joint_qd_free",
-        )  # fmt: skip
+        self._free = free(dt, "stepping", "wrench", "phi_used", "acceleration", "velocity_free")
+        self._push = push(dt, "wrench", "acceleration")
+        # an impact: within no time springs do nothing, and wrenches are impulses
+        self._loose_joints = free(0.0, "subset", "impulse", "locked_phi", "locked_acceleration", "locked_velocity")
+        self._kick = push(1.0, "impulse", "locked_acceleration")
         self._integrate = record(
-            plant.integrate, dt, self.limit, self.bound, *tree, "stepping", "tree_awake", "phi_used", "joint_qd_free",
-            "joint_q", "joint_qd", "tree_rate", "onset", "joint_q", "joint_qd", **dealt,
+            plant.integrate, dt, self.limit, self.bound, *tree, "body_parent", "body_root", "stepping", "tree_awake",
+            "phi_used", *where, *freed, "tree_rate", "onset", *where, **dealt,
+        )  # fmt: skip
+        self._conserve = record(
+            plant.conserve, dt, self.bound, gravity, *tree, "body_tree", *joint, *body, *tie, "floating", "phi_used",
+            "tree_rate", "tree_air", "tie_anchor", "body_load", "wrench", "body_q", "body_qd", "acceleration",
+            "joint_q", "later_q", "later_qd", "joint_x", "joint_xd", "joint_qd",
         )  # fmt: skip
         self._bind = record
         ends = self._share_ends
@@ -462,7 +736,7 @@ class Plants:
 
     def _record_response(self, capacity: int) -> None:
         """Room for the responses of ``capacity`` bodies at once."""
-        self._capacity, memory = capacity, self._memory
+        self._capacity, memory = capacity, self.memory
         self._asked = memory.within_reach(np.full(capacity + 1, -1, np.int32))
         self._response = memory.within_reach(np.zeros((capacity, 6, capacity, 6), np.float32))
         stride = int(self.model.tree_size.max())
@@ -471,7 +745,7 @@ class Plants:
         memory.reach("response", self._response, float)
         self._respond = self._bind(
             plant.response, "tree_first", "body_tree", "body_parent", stride, "asked", "lever", "D", "DJ", "DH",
-            *columns, "response",
+            "lift", *columns, "response",
         )  # fmt: skip
 
 
@@ -482,6 +756,12 @@ def _run(
     for _ in range(ticks):
         free(count, first, share)
         integrate(count, first, share)
+
+
+def _spans(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The numbers ``first[i] ... first[i] + count[i] - 1``, one span after the other."""
+    end = np.cumsum(count)
+    return np.repeat(first - (end - count), count) + np.arange(end[-1] if len(end) else 0)
 
 
 def check(model: Model, state: State) -> None:
@@ -519,3 +799,66 @@ def check(model: Model, state: State) -> None:
     )
     for what, q in (("rest rotation", model.body_rest), ("joint rotation", state.joint_q)):
         refuse(abs(np.linalg.norm(q, axis=-1) - 1.0) > 1e-3, what, q, "give a unit quaternion xyzw")
+    refuse(~(model.body_drag >= 0.0), "drag area [m^2]", model.body_drag, "air holds back: use 0 or more")
+    _check_clusters(model)
+    _check_ties(model)
+
+
+def _check_clusters(model: Model) -> None:
+    """Clusters are all that stands behind a tree's core, each run on one bunch."""
+    core, size = model.tree_core, model.tree_size
+    if (bad := (core < 1) | (core > size)).any():
+        tree = int(np.argmax(bad))
+        raise ValueError(f"tree {tree}: tree_core {core[tree]} of {size[tree]} bodies; give 1 to tree_size (all)")
+    riding = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree] >= core[model.body_tree]
+    owner = np.full(len(model.body_mass), -1)
+    for bunch in np.flatnonzero(model.bunch_clusters > 0).tolist():
+        first, count, body = model.bunch_cluster[bunch], model.bunch_clusters[bunch], model.bunch_body[bunch]
+        parts = np.arange(first, first + count)
+        where = f"bunch {bunch}: clusters {first} to {first + count - 1}"
+        if first < 0 or first + count > len(owner) or not riding[parts].all():
+            raise ValueError(f"{where} are not behind the core of a tree; put clusters last and set tree_core")
+        if (owner[parts] >= 0).any():
+            raise ValueError(f"{where} are also bunch {owner[parts].max()}'s; give each bunch its own")
+        owner[parts] = bunch
+        parent = model.body_parent[parts]
+        if (bad := (parent != body) & ((parent < first) | (parent >= first + count))).any():
+            part = int(np.argmax(bad))
+            raise ValueError(
+                f"bunch {bunch}: cluster {parts[part]} hangs on body {parent[part]}; hang it on the bunch, body "
+                f"{body}, or on another of its clusters"
+            )
+        if not model.bunch_head_mass[bunch] > 0.0 or not (model.bunch_head_inertia[bunch] > 0.0).all():
+            raise ValueError(
+                f"bunch {bunch}: its head has mass {model.bunch_head_mass[bunch]} kg, moments "
+                f"{model.bunch_head_inertia[bunch].tolist()}; give positive ones"
+            )
+        whole = model.bunch_head_mass[bunch] + model.body_mass[parts].sum()
+        if abs(whole - model.body_mass[body]) > 1e-3 * whole:
+            raise ValueError(
+                f"bunch {bunch}: head and clusters weigh {whole:g} kg, its body {model.body_mass[body]:g} kg; "
+                "body_mass is the whole bunch's"
+            )
+    if (bad := riding & (owner < 0)).any():
+        body = int(np.argmax(bad))
+        raise ValueError(
+            f"body {body} of tree {model.body_tree[body]} is behind its core, but no bunch's cluster; list it in "
+            "bunch_cluster or raise tree_core"
+        )
+
+
+def _check_ties(model: Model) -> None:
+    """Ties are sorted, on bodies that are there and always move, and pull back."""
+    body, count = model.tie_body, len(model.body_mass)
+
+    def refuse(bad: np.ndarray, what: str) -> None:
+        if bad.any():
+            tie = int(np.argmax(bad))
+            raise ValueError(f"tie {tie} on body {body[tie]}: {what}")
+
+    refuse((body < 0) | (body >= count), f"there are {count} bodies, counted from 0")
+    refuse(np.append(False, body[1:] < body[:-1]), "it stands behind a tie of a later body; sort ties by body")
+    tree = model.body_tree[body]
+    refuse(body - model.tree_first[tree] >= model.tree_core[tree], "a berry cluster cannot be tied; tie its bunch")
+    refuse(~(model.tie_stiffness >= 0.0), "stiffness below 0 N/m; a spring pulls back: use 0 or more")
+    refuse(~(model.tie_damping >= 0.0), "damping below 0 N s/m; a damper takes energy: use 0 or more")

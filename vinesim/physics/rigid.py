@@ -11,6 +11,7 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import mujoco
@@ -32,6 +33,18 @@ FOLLOW_GIVE = 0.05
 """The same for the copy of a remote robot: how far ahead of the copy the pull starts [m or rad]."""
 TRACK_TIME = 0.05
 """Ratio of the base servo's damping to its stiffness [s]."""
+WAITING = 12
+"""Free bodies that wait asleep for bunches to come. Every compilation makes so many; when all are taken, the next bunch
+has to wait for one, some ten milliseconds.
+"""
+LUMPS = 12
+"""Shapes that a waiting body has room for."""
+ROLLING = 0.004
+"""[m] Arm of the rolling resistance of a bunch: GUESSED, half the distance between two berries that it lies on is 10 mm
+and gives way. Without it a bunch of round shapes rolls on for ever.
+"""
+PARKED = -100.0
+"""[m] Where waiting bodies sleep: under the ground, where nothing is."""
 
 # collision bits: what stands, what lies about, and one bit for each robot, so that a robot never meets itself
 _GROUND, _FIXED, _BOX, _FIRST_ROBOT, _LAST_BIT = 1 << 0, 1 << 1, 1 << 2, 3, 30
@@ -73,18 +86,31 @@ class _Robot:
     bodies: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True)
 class Loose:
-    """A bunch that hangs on no vine: its weight and its spheres, in the frame that it had as a plant's body."""
+    """A bunch that hangs on no vine: its weight and its round shapes, in the frame that it had as a plant's body."""
 
     mass: float
     com: np.ndarray
     inertia: np.ndarray
     """[3] kg m^2 about the centre of mass."""
-    center: np.ndarray
-    """[sphere, 3] m"""
+    start: np.ndarray
+    """[shape, 3] m; a capsule reaches from here to ``end``, a sphere has both in one place."""
+    end: np.ndarray
     radius: np.ndarray
-    """[sphere] m"""
+    """[shape] m"""
+
+    @functools.cached_property
+    def shapes(self) -> tuple[Shape, ...]:
+        """Spheres and capsules, in the bunch's frame."""
+        axis, middle = self.end - self.start, 0.5 * (self.start + self.end)
+        half, rgba = 0.5 * np.linalg.norm(axis, axis=-1), (0.25, 0.05, 0.3, 1.0)
+        turn = frames.multiply(frames.aligned(axis), _Z_TO_X)
+        return tuple(
+            Shape("capsule", (float(r), float(h)), frames.pose(p, q), rgba) if h > 0.0
+            else Shape("sphere", (float(r),), frames.pose(p), rgba)
+            for r, h, p, q in zip(self.radius, half, middle, turn, strict=True)
+        )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,6 +148,8 @@ class Rigid:
         self.dt = dt
         self._robots: dict[str, _Robot] = {}
         self._bunches: dict[int, Loose] = {}
+        self._waiting = 0
+        self._slot: dict[int, int] = {}
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
         self.faults = 0
@@ -202,23 +230,36 @@ class Rigid:
         """Take a bunch over from its vine: ``pose`` [7] and ``velocity`` [6] (of its origin, angular; world axes)."""
         if bunch in self._bunches:
             raise ValueError(f"bunch {bunch} is loose already")
-        self._bunches[bunch] = body
-        self._compile()
+        alone = _alone(body)
+        taken = set(self._slot.values())
+        slot = next((i for i in range(self._waiting) if i not in taken), self._waiting)
+        self._bunches[bunch], self._slot[bunch] = body, slot
+        if slot == self._waiting:
+            self._compile()
+        else:
+            self._embody(bunch, alone)
+            self._list()
         self.place_bunch(bunch, pose, velocity)
 
     def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put a loose bunch somewhere: ``pose`` [7], ``velocity`` [6] in world axes."""
-        joint, pose = self.data.joint(f"bunch/{bunch}"), np.asarray(pose, float)
+        joint, pose = self.data.joint(f"loose/{self._slot[bunch]}"), np.asarray(pose, float)
         turn = frames.normalize(pose[3:])
         joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(turn)])
         joint.qvel[:3] = velocity[:3]
         joint.qvel[3:] = frames.rotate(frames.conjugate(turn), np.asarray(velocity[3:], float))
+        self._rouse(self._slot[bunch])
         self._fresh = False
 
     def remove_bunch(self, bunch: int) -> None:
-        """Take a loose bunch out of the world."""
-        del self._bunches[bunch]
+        """Take a loose bunch out of the world; its body waits for the next one (the world is compiled anew)."""
+        del self._bunches[bunch], self._slot[bunch]
         self._compile()
+
+    def bunch_pose(self, bunch: int) -> np.ndarray:
+        """World pose [7] of a loose bunch."""
+        qpos = self.data.joint(f"loose/{self._slot[bunch]}").qpos
+        return np.concatenate([qpos[:3], frames.from_wxyz(qpos[3:])])
 
     # ------------------------------------------------------------------ what they are asked to do
 
@@ -467,9 +508,9 @@ class Rigid:
         spec = _scene(self.model, self.dt)
         for robot in self._robots.values():
             _attach(spec, robot)
-        for bunch, body in self._bunches.items():
-            _drop(spec, bunch, body)
-        spec.option.noslip_iterations = 3 if self._bunches else 0  # without it a bunch creeps through the fingers
+        self._waiting = max(self._slot.values(), default=-1) + 1 + WAITING
+        for slot in range(self._waiting):
+            _wait(spec, slot)
         world = spec.compile()
         data = mujoco.MjData(world)
         contact = np.zeros(world.nv)
@@ -480,11 +521,55 @@ class Rigid:
         self._blocks: dict[bytes, _Block] = {}
         self._sound = data.qpos.copy()
         self._fresh = False
-        self.generation += 1
+        for slot in range(self._waiting):
+            self._untouch(slot)
+        for bunch, body in self._bunches.items():
+            self._embody(bunch, _alone(body))
+            self._rouse(self._slot[bunch])
         for robot in self._robots.values():
             self._locate(robot)
+        self._list()
+
+    def _list(self) -> None:
+        """List anew what is here; whoever keeps views of it takes notice of the new ``generation``."""
+        self.generation += 1
+        # without it a bunch creeps through the fingers
+        self.world.opt.noslip_iterations = 3 if self._bunches else 0
         self._links, self._link_body = self._list_links()
         self.geoms = self._list_geoms()
+
+    def _embody(self, bunch: int, alone: mujoco.MjModel) -> None:
+        """Give the waiting body of a bunch its weight and shapes, with all constants that MuJoCo derives from them.
+
+        ``mj_setConst`` would derive some of them, but neither bounding volumes nor the bits by which whole bodies are
+        sorted out; so the bunch is compiled in a world of its own and what was derived there is copied.
+        """
+        m, body = self.world, self.world.body(f"loose/{self._slot[bunch]}").id
+        for name in _OF_BODY:
+            getattr(m, name)[body] = getattr(alone, name)[1]
+        geoms = slice(m.body_geomadr[body], m.body_geomadr[body] + LUMPS)
+        for name in _OF_GEOM:
+            getattr(m, name)[geoms] = getattr(alone, name)
+        spare = slice(geoms.start + len(self._bunches[bunch].radius), geoms.stop)
+        m.geom_contype[spare] = m.geom_conaffinity[spare] = 0
+        dofs = slice(m.body_dofadr[body], m.body_dofadr[body] + 6)
+        for name in ("dof_M0", "dof_invweight0", "dof_length"):
+            getattr(m, name)[dofs] = getattr(alone, name)
+        volumes = slice(m.body_bvhadr[body], m.body_bvhadr[body] + alone.body_bvhnum[1])
+        for name in ("bvh_aabb", "bvh_child", "bvh_depth"):
+            getattr(m, name)[volumes] = getattr(alone, name)
+        m.bvh_nodeid[volumes] = np.where(alone.bvh_nodeid >= 0, alone.bvh_nodeid + geoms.start, -1)
+
+    def _rouse(self, slot: int) -> None:
+        """Wake a body: MuJoCo does when the two arrays that it keeps of sleep disagree."""
+        self.data.tree_awake[self.world.body_treeid[self.world.body(f"loose/{slot}").id]] = 1
+
+    def _untouch(self, slot: int) -> None:
+        """Let nothing touch a waiting body."""
+        m = self.world
+        body = m.body(f"loose/{slot}").id
+        geoms = slice(m.body_geomadr[body], m.body_geomadr[body] + LUMPS)
+        m.body_contype[body] = m.body_conaffinity[body] = m.geom_contype[geoms] = m.geom_conaffinity[geoms] = 0
 
     def _locate(self, robot: _Robot) -> None:
         m, name = self.world, robot.spec.name
@@ -510,10 +595,8 @@ class Rigid:
                     links.append(Link(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                     bodies.append(robot.bodies[link])
         for bunch, loose in self._bunches.items():
-            spheres = zip(loose.radius, loose.center, strict=True)
-            shapes = tuple(Shape("sphere", (float(r),), frames.pose(at), (0.25, 0.05, 0.3, 1.0)) for r, at in spheres)
-            links.append(Link(f"bunch/{bunch}", Organ.BUNCH, bunch, shapes))
-            bodies.append(self.world.body(f"bunch/{bunch}").id)
+            links.append(Link(f"bunch/{bunch}", Organ.BUNCH, bunch, loose.shapes))
+            bodies.append(self.world.body(f"loose/{self._slot[bunch]}").id)
         return tuple(links), np.array(bodies, int)
 
     def _list_geoms(self) -> Geoms:
@@ -521,7 +604,7 @@ class Rigid:
         owner = {m.body(f"box/{i}").id: ("box/" + str(i), "box") for i in range(len(self.model.box_size))}
         for name, robot in self._robots.items():
             owner.update({body: (name, link) for link, body in robot.bodies.items()})
-        owner.update({m.body(f"bunch/{i}").id: (f"bunch/{i}", "bunch") for i in self._bunches})
+        owner.update({m.body(f"loose/{slot}").id: (f"bunch/{i}", "bunch") for i, slot in self._slot.items()})
         ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] in owner and m.geom_contype[g]], int)
         last = np.full(m.nbody, -1)
         for body in range(1, m.nbody):
@@ -677,16 +760,50 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
         _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 
 
-def _drop(spec: mujoco.MjSpec, bunch: int, loose: Loose) -> None:
-    """A bunch as a free body of spheres, hard enough not to creep out of a gripper."""
+def _wait(spec: mujoco.MjSpec, slot: int) -> None:
+    """A free body that waits for a bunch: asleep, touched by nothing, its numbers of no meaning yet."""
     body = spec.worldbody.add_body(
-        name=f"bunch/{bunch}", mass=loose.mass, ipos=loose.com, inertia=loose.inertia, explicitinertial=True
-    )
-    body.add_freejoint(name=f"bunch/{bunch}")
-    for center, radius in zip(loose.center, loose.radius, strict=True):
+        name=f"loose/{slot}", pos=_place_of(slot)[:3], mass=0.5, ipos=[0.05, 0.0, 0.0], inertia=[1e-3, 1e-3, 1e-3],
+        explicitinertial=True, sleep=mujoco.mjtSleepPolicy.mjSLEEP_INIT,
+    )  # fmt: skip
+    body.add_freejoint(name=f"loose/{slot}")
+    for _ in range(LUMPS):
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[float(radius), 0, 0], pos=center, mass=0.0, contype=_BOX,
-            conaffinity=_ALL, friction=[FRICTION, 0.005, 0.0001], priority=1, solimp=[0.99, 0.999, 0.001, 0.5, 2],
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0.05, 0.0, 0.0], mass=0.0, contype=_BOX,
+            conaffinity=_ALL,
+        )  # fmt: skip  # MuJoCo makes no bounding volumes for what nothing touches: that comes after compiling
+
+
+def _place_of(slot: int) -> np.ndarray:
+    """Where a body waits: position and quaternion (w first) [7]."""
+    return np.array([float(slot), 0.0, PARKED, 1.0, 0.0, 0.0, 0.0])
+
+
+def _alone(loose: Loose) -> mujoco.MjModel:
+    """A bunch in a world of its own."""
+    spec = mujoco.MjSpec()
+    _drop(spec, loose)
+    return spec.compile()
+
+
+def _drop(spec: mujoco.MjSpec, loose: Loose) -> None:
+    """A bunch as a free body of round shapes, hard enough not to creep out of a gripper."""
+    if not 0 < len(loose.radius) <= LUMPS:
+        raise ValueError(f"a bunch of {len(loose.radius)} shapes; a loose one has 1 to {LUMPS}")
+    body = spec.worldbody.add_body(mass=loose.mass, ipos=loose.com, inertia=loose.inertia, explicitinertial=True)
+    body.add_freejoint()
+    for start, end, radius in zip(loose.start, loose.end, loose.radius, strict=True):
+        kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
+        if (start != end).any():
+            kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
+        body.add_geom(
+            type=kind, size=[float(radius), 0, 0], mass=0.0, contype=_BOX, conaffinity=_ALL, condim=6,
+            friction=[FRICTION, 0.005, ROLLING], priority=1, solimp=[0.99, 0.999, 0.001, 0.5, 2], **place,
+        )  # fmt: skip
+    for _ in range(LUMPS - len(loose.radius)):
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=loose.start[0], mass=0.0, contype=_BOX,
+            conaffinity=_ALL,
         )  # fmt: skip
 
 
@@ -710,6 +827,15 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
     )  # fmt: skip
 
 
+_Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
+_OF_BODY = (
+    "body_mass", "body_ipos", "body_iquat", "body_inertia", "body_subtreemass", "body_sameframe", "body_invweight0",
+    "body_contype", "body_conaffinity",
+)  # fmt: skip
+_OF_GEOM = (
+    "geom_type", "geom_contype", "geom_conaffinity", "geom_condim", "geom_priority", "geom_size", "geom_pos",
+    "geom_quat", "geom_aabb", "geom_rbound", "geom_sameframe", "geom_friction", "geom_solimp", "geom_solref",
+)  # fmt: skip
 _OF_DOFS = ("qvel", "qacc", "qacc_warmstart", "qfrc_applied", "qfrc_gravcomp", "qfrc_actuator")
 
 

@@ -1,10 +1,10 @@
 """Gradients through time: how a loss on the motion of trees depends on their springs, dampers, masses and first state.
 
 The kernels are those that :class:`vinesim.physics.plants.Plants` launches, compiled once more with their adjoints; here
-each tick has arrays of its own, so that the way back finds what the way there left. Memory is bounded by checkpoints: the
-first run keeps only joints, every ``checkpoint`` ticks; on the way back each segment is run once more before its adjoint
-is, for one more run's time. A loss is yours, in NumPy, PyTorch or by hand: :meth:`Rollout.run` gives poses and
-velocities, :meth:`Rollout.gradient` takes the loss's derivative by them. docs/gradients.md shows it at work.
+each tick has arrays of its own, so that the way back finds what the way there left. Checkpoints bound the memory: a run
+keeps only joints, every ``checkpoint`` ticks; on the way back each segment is run once more before its adjoint is. The
+loss is yours, in NumPy, PyTorch or by hand: :meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient`
+takes the loss's derivatives by them. docs/gradients.md shows it at work.
 
 The gradient is of the scheme as it steps, so it is exact where the scheme is smooth. It is not at the tick in which a
 joint passes ``brisk`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme itself
@@ -21,8 +21,8 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import plant
-from vinesim.physics.memory import device_of
-from vinesim.physics.plants import BOUND, BRISK, LIMIT, check
+from vinesim.physics.memory import Memory, device_of
+from vinesim.physics.plants import BOUND, BRISK, LIMIT, Plants
 from vinesim.world.grow import GRAVITY
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -33,7 +33,7 @@ _FREE, _INTEGRATE, _PLACE = (
 )
 _STILL = ("body_load", "body_wrench", "tree_onset")
 """Inputs that are zero unless given."""
-_PARAMETERS = ("joint_stiffness", "joint_damping", "body_mass", "body_inertia", "body_load")
+_PARAMETERS = ("joint_stiffness", "joint_damping", "body_mass", "body_inertia", "body_product", "body_load")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -44,6 +44,8 @@ class Track:
     """[tick + 1, watched, 7] world poses: m, xyzw."""
     body_qd: np.ndarray
     """[tick + 1, watched, 6] velocity of the origin [m/s] and angular velocity [rad/s], world axes."""
+    phi: np.ndarray
+    """[tick, tree] the phi that each tick was stepped with: 1 while a joint turns faster than ``brisk``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -74,7 +76,8 @@ class Rollout:
     Args:
         model: constants; what is not given to :meth:`run` is taken from here. It is not written.
         ticks: how many.
-        watch: bodies [k] whose motion the loss looks at; all unless given.
+        watch: bodies [k] whose motion the loss looks at; all that move unless given.
+        fine: let the berry clusters of bunches move.
         dt: tick [s].
         phi: see :class:`vinesim.physics.plants.Plants`; likewise ``brisk``, ``limit``, ``bound`` and ``tension``.
         checkpoint: ticks between two states that the first run keeps. Memory is about 1.2 kB for each body and tick of
@@ -88,6 +91,7 @@ class Rollout:
         ticks: int,
         *,
         watch: np.ndarray | None = None,
+        fine: bool = False,
         dt: float = 0.01,
         phi: float = 0.55,
         checkpoint: int = 50,
@@ -102,10 +106,18 @@ class Rollout:
                 f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, dt above 0, "
                 "phi from 0.5 to 1"
             )
-        self.state = State.at_rest(model)
-        check(model, self.state)
         self.model, self.ticks, self.dt, self.bound, self.device = model, ticks, dt, bound, device_of(device)
-        self.watch = np.arange(len(model.body_mass)) if watch is None else np.asarray(watch)
+        self.state = State.at_rest(model)
+        plants = Plants(model, self.state, memory=Memory("cpu"))  # what the kernels are given there they are given here
+        if fine:
+            plants.refine(np.arange(len(model.tree_first)))
+        self._host = plants.memory.host
+        moving = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
+        moving = moving < self._host["tree_moving"][model.body_tree]
+        self.watch = np.flatnonzero(moving) if watch is None else np.asarray(watch)
+        if not moving[self.watch].all():
+            body = int(self.watch[~moving[self.watch]][0])
+            raise ValueError(f"body {body} is a berry cluster that rides on its bunch: watch that, or give fine=True")
         self._slots = min(checkpoint, ticks)
         trees = len(model.tree_first)
         self._given = {
@@ -147,9 +159,10 @@ class Rollout:
             joint_qd: [body, 3] rad/s joint rates at the start; at rest unless given.
         """
         model = self.model
-        mass = model.body_mass if mass is None else self._sound("mass", mass, model.body_mass.shape, 1e-30)
+        mass = self._host["body_mass"] if mass is None else self._sound("mass", mass, model.body_mass.shape, 1e-9)
         self._set("body_mass", mass)
-        self._set("body_inertia", model.body_inertia * (mass / model.body_mass)[:, None])
+        for name in ("body_inertia", "body_product"):
+            self._set(name, self._host[name] * (mass / self._host["body_mass"])[:, None])
         for name, value, default, least in (
             ("joint_stiffness", stiffness, model.joint_stiffness, 0.0),
             ("joint_damping", damping, model.joint_damping, 0.0),
@@ -163,17 +176,19 @@ class Rollout:
             start["joint_qd"] = self._sound("joint_qd", joint_qd, start["joint_qd"].shape)
         poses = np.empty((self.ticks + 1, len(self.watch), 7), np.float32)
         motions = np.empty((self.ticks + 1, len(self.watch), 6), np.float32)
+        phi = np.empty((self.ticks, len(model.tree_first)), np.float32)
         self._checkpoints = [start]
         for segment, first, count in self._segments():
             self._replay(segment, count)
             rows = slice(first, first + count)
             poses[rows] = self._stacks["body_q"].numpy()[:count, self.watch]
             motions[rows] = self._stacks["body_qd"].numpy()[:count, self.watch]
+            phi[rows] = self._stacks["tree_phi"].numpy()[:count]
             self._checkpoints.append({name: self._stacks[name].numpy()[count].copy() for name in self._states})
             self._refuse(first, self._stacks["tree_rate"].numpy()[:count])
         poses[-1] = self._last[0].numpy()[self.watch]
         motions[-1] = self._last[1].numpy()[self.watch]
-        return Track(poses, motions)
+        return Track(poses, motions, phi)
 
     # and back
 
@@ -209,14 +224,14 @@ class Rollout:
                 prediction[1].launch()
             carried = {name: self._stacks[name].grad.numpy()[0].copy() for name in self._states}
         by = {name: self._arrays[name].grad.numpy().astype(float) for name in _PARAMETERS}
-        model = self.model
         start = self._checkpoints[0]["joint_q"].astype(float)
         axes = np.concatenate([0.5 * np.eye(3), np.zeros((3, 1))], -1)  # d exp(v) / dv at v = 0
         turned = frames.multiply(axes, start[:, None])  # [body, 3, 4]
+        along = sum((by[name] * self._host[name]).sum(-1) for name in ("body_inertia", "body_product"))
         return Gradient(
             stiffness=by["joint_stiffness"],
             damping=by["joint_damping"],
-            mass=by["body_mass"] + (by["body_inertia"] * model.body_inertia).sum(-1) / model.body_mass,
+            mass=by["body_mass"] + along / self._host["body_mass"],
             load=by["body_load"],
             turn=(turned * carried["joint_q"][:, None]).sum(-1),
             joint_qd=carried["joint_qd"].astype(float),
@@ -245,7 +260,7 @@ class Rollout:
         return wp.launch(kernel, **common), wp.launch(kernel, adj_inputs=adjoints, adjoint=True, **common)
 
     def _argument(self, kernel: wp.Kernel, arg: Any, slot: int, end: bool) -> Any:
-        """What an argument of this name is in one tick: constants are found in the model, states in :class:`State`."""
+        """What an argument of this name is in one tick; what no tick changes is among the plants' arrays."""
         name, written = arg.label.removesuffix("_out"), arg.label.endswith("_out")
         if name in self._given:
             return self._given[name]
@@ -269,14 +284,7 @@ class Rollout:
     def _input(self, name: str, dtype: Any) -> wp.array:
         if name in _STILL:
             return self._zeros(name, dtype)
-        for owner in (self.model, self.state):
-            if hasattr(owner, name):
-                return wp.array(
-                    getattr(owner, name), dtype=dtype, device=self.device, requires_grad=name in _PARAMETERS
-                )
-        raise KeyError(
-            f"a kernel of plants has an argument {name!r} that rollouts do not know; add it to _STILL or here"
-        )
+        return wp.array(self._host[name], dtype=dtype, device=self.device, requires_grad=name in _PARAMETERS)
 
     def _zeros(self, name: str, dtype: Any, slots: int = 0) -> wp.array:
         count = len(self.model.tree_first) if name.startswith("tree_") else len(self.model.body_mass)
@@ -314,7 +322,8 @@ class Rollout:
         bad = np.argwhere(~(np.isfinite(value) & (value >= least)))
         if len(bad):
             at = tuple(bad[0].tolist())
-            raise ValueError(f"{what}{list(at)} is {value[at]}; give finite numbers" + (", 0 or more" * (least == 0.0)))
+            floor = f", {least} or more" * bool(np.isfinite(least))
+            raise ValueError(f"{what}{list(at)} is {value[at]}; give finite numbers{floor}")
         return value
 
     def _refuse(self, first: int, rate: np.ndarray) -> None:

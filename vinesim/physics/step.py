@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim.physics.guard import Guard
-from vinesim.physics.picking import Picking
+from vinesim.physics.parting import Blade, Partings
 from vinesim.physics.plants import Plants
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.sleep import Sleep
 from vinesim.physics.touching import Touching
 from vinesim.world.model import Model
 from vinesim.world.state import State
-from vinesim.world.values import Contact, RobotSpec, View
+from vinesim.world.values import Contact, Parting, RobotSpec, View
 
 
 class Physics:
@@ -26,17 +26,18 @@ class Physics:
     def __init__(
         self, model: Model, *, dt: float = 0.01, device: str = "cpu", threads: int = 1, picking: bool = True
     ) -> None:
-        """``dt`` [s]; ``device`` and ``threads``: see :class:`Plants`; ``picking``: bunches part when pulled too hard."""
+        """``dt`` [s]; ``device``, ``threads``: see :class:`Plants`; ``picking``: bunches part when pulled too hard."""
         self.model, self.dt = model, dt
         self.state = State.at_rest(model)
         self.plants = Plants(model, self.state, dt=dt, device=device, threads=threads)
         self.rigid = Rigid(model, dt=dt)
         self.touching = Touching(model, self.plants, self.rigid)
-        self.picking = Picking(self.plants, self.rigid, self.touching)
+        self.parting = Partings(self.plants, self.rigid, self.touching)
+        self._picking = picking
         self.sleep = Sleep(self.plants)
         self.guard = Guard(self.plants)
-        self.picked: tuple[int, ...] = ()
-        """Bunches that were pulled off their vines in the last tick."""
+        self.partings: tuple[Parting, ...] = ()
+        """What left its plant in the last tick, or by command before it; sorted by body."""
         self.tick = 0
         self._body_q: np.ndarray | None = None
         self._fresh = True
@@ -48,7 +49,7 @@ class Physics:
             ("plants: move, pushed by them", self._commit),
             ("rigid: move, pushed by them", self._finish),
             ("guard: stop what went wrong", self._guard),
-            *([("picking: part what was pulled too hard", self._pick)] if picking else []),
+            ("parting: let go what was pulled, bent or cut off", self._part),
             ("sleep: rest what nobody touches or reaches", self._sleep),
         )
 
@@ -103,13 +104,29 @@ class Physics:
         self.rigid.add_robot(spec)
 
     def remove_robot(self, name: str) -> None:
-        """See :meth:`Rigid.remove_robot`."""
+        """See :meth:`Rigid.remove_robot`; its blades go with it."""
         self.rigid.remove_robot(name)
+        self.parting.blades = [blade for blade in self.parting.blades if blade.actor != name]
 
     def pick(self, bunch: int) -> None:
-        """Cut a bunch off its vine; see :meth:`Picking.pick`."""
-        self.picking.pick(bunch)
+        """Take a bunch off its vine, between ticks; see :meth:`Partings.pick`."""
+        self.parting.pick(bunch)
         self._body_q = None
+
+    def cut(self, body: int) -> None:
+        """Cut a piece of wood off its vine, between ticks; see :meth:`Partings.cut`."""
+        self.parting.cut(body)
+        self._body_q = None
+
+    def blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
+        """Give a robot's link a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
+
+        x runs along the blades, y from one to the other. :meth:`Blade.close` cuts what passes through the mouth.
+        """
+        self.rigid.link_pose(actor, link)  # says in words if there is no such link
+        blade = Blade(actor, link, np.asarray(pose, float), np.asarray(half, float))
+        self.parting.blades.append(blade)
+        return blade
 
     # ------------------------------------------------------------------ stages that only hand over
 
@@ -124,8 +141,10 @@ class Physics:
     def _guard(self) -> None:
         self.guard.check()
 
-    def _pick(self) -> None:
-        self.picked = self.picking.update()
+    def _part(self) -> None:
+        self.partings = self.parting.update(strain=self._picking)
+        if self.partings:
+            self._body_q = None
 
     def _sleep(self) -> None:
         self.sleep.update(self.touching.near)

@@ -156,6 +156,7 @@ class Touching:
         if len(awake) and len(self._geoms.id):
             self._bound(awake)
             self._meet(len(awake))
+            self._brace(awake)
         if self.count:
             self._press()
         else:
@@ -211,6 +212,17 @@ class Touching:
         self.count = len(hits)
         self._hits[: len(hits)] = hits
         self._contact_shape[: len(hits)] = self._hit_shape.ravel()[hits]
+
+    def _brace(self, awake: np.ndarray) -> None:
+        """Step trees that are about to take a blow with phi = 1 from this tick on.
+
+        The trapezoidal rule moves a body by the mean of its velocities before and after: what is hit from rest would
+        give way only half as far as it must, overlap, and be thrown out again.
+        """
+        struck = awake[self._onset[: len(awake)]]
+        if len(struck) and (self.plants.phi_used[struck] < 1.0).any():
+            self.plants.brace(struck)
+            self.plants.free()
 
     # ------------------------------------------------------------------ with what force
 
@@ -278,7 +290,9 @@ class Touching:
         self._trees = np.zeros(trees, np.int32)
         self._tree_low, self._tree_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
         self._near = np.zeros(trees, np.bool_)
-        self._start, self._end = np.zeros((shapes, 3), np.float32), np.zeros((shapes, 3), np.float32)
+        for name in ("start", "end", "start_ahead", "end_ahead"):
+            setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
+        self._bend = np.zeros((len(self.model.body_mass), 6), np.float32)
         self._shape_speed = np.zeros(shapes, np.float32)
         for name in ("hits", "contact_shape", "contact_body", "contact_column", "geom", "known_shape", "known_geom"):
             setattr(self, "_" + name, np.zeros(n, np.int32))
@@ -304,7 +318,8 @@ class Touching:
         self._close = np.zeros((trees, len(self._geoms.id)), np.int32)
         self._missed = np.zeros(trees, np.int32)
         self._hit_shape, self._hit_geom = np.zeros((trees, SLOTS), np.int32), np.zeros((trees, SLOTS), np.int32)
-        self._hit_gap = np.zeros((trees, SLOTS))
+        self._onset = np.zeros(trees, np.bool_)
+        self._hit_gap, self._hit_room = np.zeros((trees, SLOTS)), np.zeros((trees, SLOTS))
         self._hit_normal, self._hit_point = np.zeros((trees, SLOTS, 3)), np.zeros((trees, SLOTS, 3))
         self._record()
 
@@ -319,7 +334,8 @@ class Touching:
             for k, name in enumerate(_names(old)[i] for i in self._known_geom[: self._known_count[0]]):
                 self._known_geom[k] = at.get(name, -1)
         count = len(g.id)
-        self._geom_middle, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
+        self._geom_middle, self._geom_velocity = np.zeros((count, 3)), np.zeros((count, 3))
+        self._geom_spin, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
         self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
         self._rigid_rows = np.zeros((3 * self.capacity, self.rigid.world.nv))
         self._dof_free = np.zeros(self.rigid.world.nv)
@@ -363,27 +379,31 @@ class Touching:
         s_tree, s_body, s_bunch = (shared(x, wp.int32) for x in (s.tree, s.body, s.bunch))
         s_radius, s_speed = shared(s.radius, float), shared(self._shape_speed, float)
         s_at = [shared(x, wp.vec3) for x in (self._start, self._end)]
+        s_ahead = [shared(x, wp.vec3) for x in (self._start_ahead, self._end_ahead)]
+        m_first, m_size, m_parent = (
+            shared(x, wp.int32) for x in (self.model.tree_first, self.model.tree_size, self.model.body_parent)
+        )
         xpos, com = shared(mj["xpos"], wp.vec3d), shared(mj["com"], wp.vec3d)
         xmat = shared(mj["xmat"].reshape(-1, 3, 3), wp.mat33d)
         cvel, cdof = shared(mj["cvel"], wp.float64), shared(mj["cdof"], wp.float64)
         body_q, body_qd = shared(state.body_q, wp.transform), shared(state.body_qd, wp.spatial_vector)
         body_qd_free = shared(self.plants.velocity_free, wp.spatial_vector)
         attached = shared(state.bunch_attached, wp.bool)
-        moving, speed = vectors("geom_middle")[0], doubles("geom_speed")[0]
+        moving, speed = vectors("geom_middle", "geom_velocity", "geom_spin"), doubles("geom_speed")[0]
         dt, k, c = self.dt, self.stiffness, self.damping
         softness = 1.0 / (dt * (k * dt + c))
 
         self._bound_geoms = bind(
             kernels.bound_geoms,
             [dt, g_id, g_body, g_root, g_center, g_half, xpos, xmat, cvel, com],
-            [moving, speed, *g_box],
+            [*moving, speed, *g_box],
         )
         self._bound_actors = bind(kernels.bound_actors, [STIR, a_first, a_lies, speed, *g_box], a_box)
         self._bound_trees = bind(
             kernels.bound_trees,
-            [dt, s_tree, s_body, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius, *ints("trees"), body_q,
-             body_qd],
-            [*s_at, s_speed, *t_box],
+            [dt, m_first, m_size, m_parent, s_tree, s_body, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius,
+             *ints("trees"), body_q, body_qd, shared(state.body_cut, wp.bool)],
+            [shared(self._bend, wp.spatial_vector), *s_at, *s_ahead, s_speed, *t_box],
         )  # fmt: skip
         told = shared(self.told, wp.bool)
         a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
@@ -393,15 +413,15 @@ class Touching:
         hit = [shared(x, wp.int32) for x in (self._hit_shape, self._hit_geom)]
         hit += [
             shared(self._hit_gap, wp.float64),
+            shared(self._hit_room, wp.float64),
             shared(self._hit_normal, wp.vec3d),
             shared(self._hit_point, wp.vec3d),
         ]
         self._meeting = bind(
             kernels.meet,
-            [dt, SLOTS, s_tree, s_bunch, s_radius, g_id, g_kind, g_size, g_center, g_radius, g_copy, told, attached,
-             *ints("trees"),
-             *t_box, *s_at, s_speed, xpos, xmat, moving, speed, *g_box],
-            [*ints("close"), *hit, *ints("missed")],
+            [dt, SLOTS, s_tree, s_body, s_bunch, s_radius, g_id, g_kind, g_size, g_radius, g_copy, told, attached,
+             *ints("trees"), *t_box, body_q, body_qd, *s_at, *s_ahead, s_speed, xmat, *moving, speed, *g_box],
+            [*ints("close"), *hit, shared(self._onset, wp.bool), *ints("missed")],
         )  # fmt: skip
         flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_geom"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]

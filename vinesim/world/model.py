@@ -148,6 +148,21 @@ class Model(Arrays):
             body_q[here] = frames.compose(base, joint[here])
         return body_q
 
+    def bunch_of(self) -> np.ndarray:
+        """Which bunch a body belongs to [body]: its own body, its clusters and its peduncle; -1 for all others."""
+        owner = np.full(len(self.body_mass), -1, np.int32)
+        owner[self.bunch_body] = bunch = np.arange(len(self.bunch_body), dtype=np.int32)
+        for k in range(int(self.bunch_clusters.max(initial=0))):
+            has = bunch[self.bunch_clusters > k]
+            owner[self.bunch_cluster[has] + k] = has
+        body = self.body_parent[self.bunch_body]
+        while len(body):
+            stalk = (body >= 0) & (self.body_organ[body] == int(Organ.PEDUNCLE))
+            body, bunch = body[stalk], bunch[stalk]
+            owner[body] = bunch
+            body = self.body_parent[body]
+        return owner
+
     def depth(self) -> np.ndarray:
         """Number of bodies between each body and its root [body]."""
         depth = np.zeros(len(self.body_mass), np.int32)

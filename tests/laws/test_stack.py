@@ -1,0 +1,121 @@
+"""Ten loose bunches in a crate and on the ground: they come to rest, weigh what they weigh, and rub as Coulomb says."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from touch_scenes import cane
+
+from vinesim import frames
+from vinesim.physics.rigid import FRICTION
+from vinesim.physics.step import Physics
+from vinesim.world.grow import GRAVITY, assemble
+
+MASSES = 0.4 + 0.03 * np.arange(10)
+CRATE = 2.0
+
+
+def dropped(into_crate: bool) -> Physics:
+    """Ten bunches let fall one after the other, in any attitude: from the crate's rim, or from 15 cm above ground."""
+    trees = [cane((1.5 * i, 20.0, 1.0), bunch=float(mass)) for i, mass in enumerate(MASSES)]
+    box = {"box_pose": [[0.0, 0.0, 0.001, 0, 0, 0, 1]], "box_size": [[0.6, 0.4, 0.3]], "box_mass": [[CRATE]]}
+    physics = Physics(assemble(trees, **box))
+    rng = np.random.default_rng(0)
+    for bunch in range(10):
+        physics.pick(bunch)
+        at = [rng.uniform(-0.15, 0.15), rng.uniform(-0.08, 0.08), 0.4]
+        if not into_crate:
+            at = [2.0 + 0.3 * (bunch % 4), 0.3 * (bunch // 4), 0.15]
+        turn = frames.normalize(rng.normal(size=4))
+        pose = frames.pose(np.array(at), turn)
+        pose[:3] -= frames.rotate(turn, np.array([0.085, 0.0, 0.0]))
+        physics.rigid.place_bunch(bunch, pose, np.zeros(6))
+        for _ in range(40):
+            physics.step()
+    return physics
+
+
+def on_the_ground(physics: Physics) -> tuple[float, float]:
+    """Vertical force [N] of all contacts with the ground, and the deepest contact [m] of any two things."""
+    world, data = physics.rigid.world, physics.rigid.data
+    force, wrench, deepest = 0.0, np.zeros(6), 0.0
+    for c in range(data.ncon):
+        contact = data.contact[c]
+        deepest = min(deepest, float(contact.dist))
+        mujoco.mj_contactForce(world, data, c, wrench)
+        if "ground" in (world.geom(g).name for g in contact.geom):
+            force += abs(float((contact.frame.reshape(3, 3).T @ wrench[:3])[2]))
+    return force, deepest
+
+
+def watch_awake(physics: Physics, ticks: int = 100) -> tuple[float, float]:
+    """Keep everything awake for a second: mean force on the ground and deepest contact."""
+    physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    seen = []
+    for _ in range(ticks):
+        physics.step()
+        seen.append(on_the_ground(physics))
+    force, deep = np.array(seen[ticks // 2 :]).T
+    return float(force.mean()), float(deep.min())
+
+
+def settle(physics: Physics, ticks: int = 300) -> None:
+    for _ in range(ticks):
+        physics.step()
+    asleep = physics.rigid.data.tree_asleep
+    assert (asleep >= 0).all()  # every bunch, and the crate
+
+
+def test_ten_bunches_lie_in_the_crate_and_weigh_what_they_weigh():
+    physics = dropped(into_crate=True)
+    settle(physics)
+    crate = physics.rigid.data.joint("box/0").qpos
+    for bunch in range(10):
+        pose = physics.rigid.bunch_pose(bunch)
+        middle = pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
+        local = frames.rotate(frames.conjugate(frames.from_wxyz(crate[3:])), middle - crate[:3])
+        assert np.abs(local[0]) < 0.3
+        assert np.abs(local[1]) < 0.2
+        assert 0.01 < local[2] < 0.3
+    force, deepest = watch_awake(physics)
+    # parked bodies fall once sleep is off, but touch nothing
+    assert force == pytest.approx(-GRAVITY[2] * (MASSES.sum() + CRATE), rel=0.01)
+    assert deepest > -0.002
+
+
+def test_ten_bunches_come_to_rest_on_the_ground():
+    physics = dropped(into_crate=False)
+    settle(physics)
+    poses = np.array([physics.rigid.bunch_pose(bunch) for bunch in range(10)])
+    assert poses[:, 2].min() > 0.0
+    assert np.abs(poses[:, :2] - [2.45, 0.3]).max() < 1.2
+    force, deepest = watch_awake(physics)
+    assert force == pytest.approx(-GRAVITY[2] * (MASSES.sum() + CRATE), rel=0.01)
+    assert deepest > -0.002
+    after = np.array([physics.rigid.bunch_pose(bunch) for bunch in range(10)])
+    assert np.abs(after[:, :3] - poses[:, :3]).max() < 1e-3
+
+
+@pytest.mark.parametrize(("share", "moves"), [(0.95, False), (1.05, True)])
+def test_a_full_crate_is_pushed_by_mu_m_g(share, moves):
+    """F34: the push that starts a laden crate is the friction coefficient times the weight of all that is in it."""
+    physics = dropped(into_crate=True)
+    settle(physics)
+    box, data = physics.rigid.world.body("box/0").id, physics.rigid.data
+    start = data.joint("box/0").qpos[:3].copy()
+    data.xfrc_applied[box, 0] = -share * FRICTION * GRAVITY[2] * (MASSES.sum() + CRATE)
+    # at the height of the ground, so that it does not tip the crate
+    data.xfrc_applied[box, 4] = -data.xfrc_applied[box, 0] * (data.xipos[box, 2])
+    for _ in range(100):
+        physics.step()
+    went = data.joint("box/0").qpos[0] - start[0]
+    assert went > 0.1 if moves else abs(went) < 2e-3
+
+
+def test_twice_the_same_bits():
+    ends = []
+    for _ in range(2):
+        physics = dropped(into_crate=True)
+        ends.append(physics.rigid.data.qpos.tobytes() + physics.rigid.data.qvel.tobytes())
+    assert ends[0] == ends[1]

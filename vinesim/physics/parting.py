@@ -1,0 +1,210 @@
+"""What leaves its vine: a bunch pulled or bent off its peduncle, or whatever a blade closes on.
+
+A bunch becomes a free body of the rigid world in the same tick, with its pose, velocity and weight; on the tree stay
+its peduncle and a stub of a gram, so the tree's numbering never changes. A cane that is cut falls with all that grows
+on it, its bunches still hanging from it (:meth:`Plants.cut`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.plants import Plants
+from vinesim.physics.rigid import Loose, Rigid
+from vinesim.physics.touching import Touching
+from vinesim.world.ids import Organ
+from vinesim.world.values import Parting
+
+STUB = 1e-3
+"""What stays of a bunch on the tree [kg]."""
+BRISK = 20.0
+"""[m/s^2] Gravity, and what turning adds to the acceleration of a bunch's middle over that of its stalk."""
+PATIENCE = 3
+"""[tick] A peduncle parts when it has been strained too much for so long: one tick's peak is not a pull."""
+
+
+@dataclasses.dataclass(slots=True)
+class Blade:
+    """The mouth of a cutter: a box fixed to a link. When it closes, it cuts the wood that passes through it."""
+
+    actor: str
+    link: str
+    pose: np.ndarray
+    """[7] of the mouth's middle in the link: x along the blades, y from blade to blade, z across their plane."""
+    half: np.ndarray
+    """[3] m, half edges of the mouth; half[1] is the reach: how far to either side wood is caught."""
+    closing: bool = False
+
+    def close(self) -> None:
+        """Shut, and open again: what is in the mouth at the end of the coming tick is cut."""
+        self.closing = True
+
+
+class Partings:
+    """Watches the peduncles of awake trees and the blades that close, and takes off what parts."""
+
+    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching) -> None:
+        self.plants, self.rigid, self.touching = plants, rigid, touching
+        self.blades: list[Blade] = []
+        model = plants.model
+        self._strained = np.zeros(len(model.bunch_body), np.int32)
+        self._bunch_of = model.bunch_of()
+        trees = model.body_tree[model.bunch_body]
+        order = np.argsort(trees, kind="stable")
+        self._bunches = order.astype(np.int32)
+        self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
+        self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
+        self._told: list[Parting] = []
+
+    # ------------------------------------------------------------------ the tick
+
+    def update(self, *, strain: bool = True) -> tuple[Parting, ...]:
+        """After a commit: all that parted since the last call, sorted by body. ``strain`` off: only what is cut."""
+        if strain:
+            self._pull()
+        if any(blade.closing for blade in self.blades):
+            self._close()
+        told, self._told = tuple(sorted(self._told, key=lambda parting: parting.body)), []
+        return told
+
+    def _pull(self) -> None:
+        """Part the bunches whose peduncles have been strained for long enough."""
+        plants, model, touching = self.plants, self.plants.model, self.touching
+        awake = plants.awake
+        count = self._first[awake + 1] - self._first[awake]
+        inner = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        bunches = self._bunches[np.repeat(self._first[awake], count) + inner]
+        bunches = bunches[plants.state.bunch_attached[bunches]]
+        if len(bunches) == 0:
+            return
+        # bounds first: most carry no more than their weight, their inertia and what hands do to them
+        bodies = model.bunch_body[bunches]
+        hands = np.zeros((len(self._strained), 2))
+        touched = self._bunch_of[touching.bodies]
+        on = (touched >= 0) & (model.body_organ[touching.bodies] == int(Organ.BUNCH))
+        wrench = np.abs(touching.wrenches[on])
+        lever = 2.0 * model.bunch_length[touched[on]]
+        push = wrench[:, :3].sum(1)
+        np.add.at(hands, touched[on], np.stack([push, wrench[:, 3:].sum(1) + lever * push], 1))
+        motion, mass = plants.acceleration[bodies], plants.body_mass[bodies]
+        force = hands[bunches, 0] + mass * (np.abs(motion[:, :3]).sum(1) + BRISK)
+        rate = plants.state.body_qd[bodies, 3:]
+        whirl = np.abs(motion[:, 3:]).sum(1) + (rate * rate).sum(1)
+        # weight and inertia act at the centre of mass, within the bunch's length
+        moment = hands[bunches, 1] + (force - hands[bunches, 0] + mass * whirl) * model.bunch_length[bunches]
+        strained = (force > model.bunch_pull[bunches]) | (moment > model.bunch_bend[bunches])
+        carried = np.zeros((len(bunches), 6))
+        if strained.any():
+            carried[strained] = plants.joint_wrench(bodies[strained])
+        pulled = np.linalg.norm(carried[:, :3], axis=1) / model.bunch_pull[bunches]
+        bent = np.linalg.norm(carried[:, 3:], axis=1) / model.bunch_bend[bunches]
+        strained = np.maximum(pulled, bent) > 1.0
+        self._strained[bunches] = np.where(strained, self._strained[bunches] + 1, 0)
+        for i in np.flatnonzero(self._strained[bunches] >= PATIENCE):
+            bunch = int(bunches[i])
+            self._pick(bunch, "pull" if pulled[i] >= bent[i] else "bend", self._toucher(bunch), carried[i])
+
+    def _close(self) -> None:
+        """Cut what lies in the mouths that are closing."""
+        self.plants.kinematics()
+        for blade in self.blades:
+            if blade.closing:
+                blade.closing = False
+                for body in self._in_mouth(blade).tolist():
+                    bunch = int(self._bunch_of[body])
+                    if bunch < 0:
+                        self.cut(body, "blade", blade.actor)
+                    elif self.plants.state.bunch_attached[bunch]:
+                        self.pick(bunch, "blade", blade.actor)
+
+    def _in_mouth(self, blade: Blade) -> np.ndarray:
+        """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the one next to the root."""
+        model, body_q = self.plants.model, self.plants.state.body_q
+        mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
+        far = np.linalg.norm(blade.half)
+        apart = body_q[:, :3] - mouth[:3].astype(np.float32)
+        reach = far + model.body_length
+        near = np.flatnonzero(self._wood & ((apart * apart).sum(1) < reach * reach))
+        start = frames.rotate(frames.conjugate(mouth[3:]), body_q[near, :3] - mouth[:3])
+        along = frames.rotate(frames.multiply(frames.conjugate(mouth[3:]), body_q[near, 3:]), np.array([1.0, 0.0, 0.0]))
+        along = along * model.body_length[near, None]
+        # the part of each axis between the planes of the box, side by side (slab test)
+        along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+        one, other = (-blade.half - start) / along, (blade.half - start) / along
+        enter, leave = np.minimum(one, other).max(1), np.maximum(one, other).min(1)
+        caught = near[(enter <= leave) & (leave >= 0.0) & (enter <= 1.0)]
+        inside = np.zeros(len(self._wood), bool)
+        inside[caught] = True
+        return caught[~self._below(caught, inside)]
+
+    def _below(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
+        """Which of some bodies [k] grow on a marked one [body], with no cut between them."""
+        parent, cut = self.plants.model.body_parent, self.plants.state.body_cut
+        below, at = np.zeros(len(bodies), bool), bodies.copy()
+        while (at >= 0).any():
+            at = np.where((at >= 0) & ~cut[at], parent[at], -1)
+            below |= (at >= 0) & marked[at]
+        return below
+
+    # ------------------------------------------------------------------ one at a time
+
+    def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
+        """Take one bunch off where it hangs; it keeps its pose and velocity. Call it between ticks."""
+        if not 0 <= bunch < len(self._strained):
+            raise ValueError(f"no bunch {bunch}; there are 0 to {len(self._strained) - 1}")
+        if not self.plants.state.bunch_attached[bunch]:
+            raise ValueError(f"bunch {bunch} was picked already")
+        body = self.plants.model.bunch_body[bunch]
+        self._pick(bunch, cause, actor, self.plants.joint_wrench(np.array([body]))[0])
+
+    def _pick(self, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
+        plants, model = self.plants, self.plants.model
+        body = int(model.bunch_body[bunch])
+        tree = int(model.body_tree[body])
+        plants.wake(tree)
+        plants.kinematics(np.array([tree]))
+        shapes = self.touching.shapes
+        of = (shapes.bunch == bunch) & (shapes.body == body)
+        loose = Loose(
+            mass=float(plants.body_mass[body]), com=plants.model.body_com[body].astype(float),
+            inertia=plants.body_inertia[body].astype(float), start=shapes.start[of].astype(float),
+            end=shapes.end[of].astype(float), radius=shapes.radius[of].astype(float),
+        )  # fmt: skip
+        self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], plants.state.body_qd[body])
+        plants.state.bunch_attached[bunch] = False
+        self._strained[bunch] = 0
+        plants.reweigh(body, STUB)
+        self._tell(body, bunch, cause, actor, carried)
+
+    def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
+        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between ticks."""
+        plants = self.plants
+        if not 0 <= body < len(self._wood) or plants.model.body_organ[body] == int(Organ.BUNCH):
+            raise ValueError(f"body {body} is no piece of wood that can be cut")
+        if self._bunch_of[body] >= 0:
+            self.pick(int(self._bunch_of[body]), cause, actor)
+            return
+        if plants.state.body_cut[body]:
+            raise ValueError(f"body {body} was cut already")
+        carried = plants.joint_wrench(np.array([body]))[0]
+        tree = int(plants.model.body_tree[body])
+        plants.wake(tree)
+        plants.kinematics(np.array([tree]))
+        plants.cut(body)
+        self._tell(body, -1, cause, actor, carried)
+
+    def _tell(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
+        tree = int(self.plants.model.body_tree[body])
+        force, moment = carried[:3].astype(float), carried[3:].astype(float)
+        self._told.append(Parting(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
+
+    def _toucher(self, bunch: int) -> str:
+        """Who presses hardest on a bunch, nobody if none does."""
+        pushes: dict[str, float] = {}
+        for contact in self.touching.contacts:
+            if self._bunch_of[contact.body] == bunch:
+                pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
+        return max(sorted(pushes), key=lambda actor: pushes[actor], default="")
