@@ -188,6 +188,7 @@ class Plants:
         self.state.joint_xd[bodies] = 0.0
         self.velocity_free[bodies] = 0.0
         self.acceleration[bodies] = 0.0
+        self._wrench[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._onset[trees] = 0
         self.kinematics(trees)
@@ -217,9 +218,10 @@ class Plants:
     def coarsen(self, trees: np.ndarray | int) -> None:
         """Freeze the clusters of these trees' bunches where they are: each bunch becomes one compound.
 
-        Nothing changes its pose. The clusters' motion against their bunch ends in a plastic impact, which every joint
-        of the tree takes part in: momentum is conserved, kinetic energy never grows. Acting within no time it leaves
-        the springs aside.
+        Nothing changes its pose. The clusters' motion against their bunch ends in a plastic impact that lasts a tick.
+        A bunch keeps its angular momentum about its origin; what its joint must take sets the rest of the tree moving,
+        against springs as in any tick (free of them, a light peduncle would be flung about). A floating tree keeps all
+        momentum. Kinetic energy does not grow, as the scheme counts it: with the rates squared times the metric.
         """
         trees = self._with_clusters(trees, fine=True)
         if len(trees) == 0:
@@ -237,15 +239,23 @@ class Plants:
             axes = state.body_q[bodies, 3:].astype(float)
             self._impulse[bodies, :3] = frames.rotate(axes, impulse[:, :3])
             self._impulse[bodies, 3:] = frames.rotate(axes, impulse[:, 3:])
+            springs = self.joint_stiffness[bodies], self.joint_damping[bodies]
+            self.joint_stiffness[bodies], self.joint_damping[bodies] = 0.0, 0.0
             self._subset[: len(trees)] = trees
+            self._renewed = True
             self._renew()
             self._carry_in_kick(len(trees))
-            self._loose_joints(len(trees))
+            self._solve(len(trees))
+            self.memory.wait()
+            self.joint_stiffness[bodies], self.joint_damping[bodies] = springs
+            self._renewed = True
+            moving = _spans(self.model.tree_first[trees], self.model.tree_core[trees])
+            self._joint_qd_free[moving], self._joint_xd_free[moving] = state.joint_qd[moving], state.joint_xd[moving]
+            self._carry_in_rates(len(trees))
             self._kick(len(trees))
             self._carry_out_kick(len(trees))
             self.memory.wait()
             self._impulse[bodies] = 0.0
-            moving = _spans(self.model.tree_first[trees], self.model.tree_core[trees])
             state.joint_qd[moving] = self._joint_qd_free[moving]
             roots = moving[state.body_cut[moving]]
             state.joint_xd[roots] = self._joint_xd_free[roots]
@@ -638,9 +648,9 @@ class Plants:
                                 "impulse": self._impulse, "acceleration": self.acceleration,
                                 "velocity_free": self.velocity_free},
         }  # fmt: skip
-        made = ("body_q", "body_qd", "joint_xd_free", "joint_qd_free", "acceleration", "velocity_free", "wrench",
+        made = ("body_q", "body_qd", "joint_xd_free", "joint_qd_free", "acceleration", "velocity_free",
                 "impulse")  # fmt: skip
-        often = ("body_load", "joint_x", "joint_xd", "joint_q", "joint_qd")
+        often = ("body_load", "wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
         self._seldom: list[str] = []
         self._renewed = False
         constants = {id(value) for value in vars(model).values()} | {id(self._tie_first)}
@@ -648,7 +658,7 @@ class Plants:
             for name, data in arrays.items():
                 if id(data) in constants:
                     memory.constant(name, data, dtype)
-                elif name.startswith(("body_", "joint_")) or name in made:
+                elif name.startswith(("body_", "joint_")) or name in made + often:
                     memory.rows(name, data, dtype)
                     self._seldom += [name] if name not in made + often else []
                 else:
@@ -658,12 +668,12 @@ class Plants:
             wp.quat: ("axes",),
             wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "lift"),
             wp.transform: ("later_q",),
-            wp.spatial_vector: ("bias", "spread", "added", "later_qd", "locked_acceleration", "locked_velocity"),
+            wp.spatial_vector: ("bias", "spread", "added", "earlier", "later_qd", "idle_acceleration", "idle_velocity"),
         }
         for dtype, names in scratch.items():
             for name in names:
                 memory.scratch(name, len(model.body_mass), dtype)
-        memory.scratch("locked_phi", len(model.tree_first), float)
+        memory.scratch("idle_phi", len(model.tree_first), float)
         a, largest = memory.arrays, int(model.tree_size.max(initial=1))
 
         def record(kernel: wp.Kernel, *inputs: object, **options: Any) -> Callable[..., None]:
@@ -682,6 +692,7 @@ class Plants:
         self._carry_in_place = carrier("subset", "joint_x", "joint_xd", "joint_q", "joint_qd")
         self._carry_out_place = carrier("subset", "body_q", "body_qd", back=True)
         self._carry_in_kick = carrier("subset", *often, "impulse")
+        self._carry_in_rates = carrier("subset", "joint_xd_free", "joint_qd_free")
         self._carry_out_kick = carrier("subset", "joint_xd_free", "joint_qd_free", back=True)
 
         gravity, dt = wp.vec3(GRAVITY), self.dt
@@ -693,12 +704,12 @@ class Plants:
         freed = ("joint_xd_free", "joint_qd_free")
         dealt = {"over": "trees", "shares": self.threads}
 
-        def free(dt: float, trees: str, wrench: str, phi: str, acceleration: str, velocity: str) -> Callable:
+        def free(brisk: float, tension: float, trees: str, phi: str, acceleration: str, velocity: str) -> Callable:
             return record(
-                plant.free, dt, self.brisk, float(tension), gravity, *tree, "tree_pose", *joint, *body,
-                "joint_stiffness", "joint_damping", *tie, trees, "tree_phi", "onset", "tree_air", "tie_anchor",
-                "body_load", wrench, *where, "body_q", "body_qd", phi, "axes", "lever", "J", "H", "M", "bias", "drawn",
-                "D", "DJ", "DH", "Du", "lift", acceleration, *freed, velocity, **dealt,
+                plant.free, dt, brisk, tension, gravity, *tree, "tree_pose", *joint, *body, "joint_stiffness",
+                "joint_damping", *tie, trees, "tree_phi", "onset", "tree_air", "tie_anchor", "body_load", "wrench",
+                *where, "body_q", "body_qd", phi, "axes", "lever", "J", "H", "M", "bias", "drawn", "D", "DJ", "DH",
+                "Du", "lift", acceleration, *freed, velocity, **dealt,
             )  # fmt: skip
 
         def push(dt: float, wrench: str, acceleration: str) -> Callable:
@@ -710,19 +721,19 @@ class Plants:
         self._place = record(
             plant.place, "tree_first", "tree_size", "tree_pose", *joint, "subset", *where, "body_q", "body_qd"
         )
-        self._free = free(dt, "stepping", "wrench", "phi_used", "acceleration", "velocity_free")
+        self._free = free(self.brisk, float(tension), "stepping", "phi_used", "acceleration", "velocity_free")
         self._push = push(dt, "wrench", "acceleration")
-        # an impact: within no time springs do nothing, and wrenches are impulses
-        self._loose_joints = free(0.0, "subset", "impulse", "locked_phi", "locked_acceleration", "locked_velocity")
-        self._kick = push(1.0, "impulse", "locked_acceleration")
+        # an impact: factors of inertia and springs alone, and wrenches that are impulses
+        self._solve = free(math.inf, 0.0, "subset", "idle_phi", "idle_acceleration", "idle_velocity")
+        self._kick = push(1.0, "impulse", "idle_acceleration")
         self._integrate = record(
             plant.integrate, dt, self.limit, self.bound, *tree, "body_parent", "body_root", "stepping", "tree_awake",
             "phi_used", *where, *freed, "tree_rate", "onset", *where, **dealt,
         )  # fmt: skip
         self._conserve = record(
-            plant.conserve, dt, self.bound, gravity, *tree, "body_tree", *joint, *body, *tie, "floating", "phi_used",
-            "tree_rate", "tree_air", "tie_anchor", "body_load", "wrench", "body_q", "body_qd", "acceleration",
-            "joint_q", "later_q", "later_qd", "joint_x", "joint_xd", "joint_qd",
+            plant.conserve, dt, self.limit, self.bound, gravity, *tree, "body_tree", *joint, *body, *tie, "floating",
+            "phi_used", "tree_rate", "tree_air", "tie_anchor", "body_load", "wrench", "body_q", "body_qd",
+            "acceleration", "lever", "earlier", "later_q", "later_qd", *where,
         )  # fmt: skip
         self._bind = record
         ends = self._share_ends
