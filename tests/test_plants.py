@@ -625,11 +625,12 @@ def test_shares_hold_like_numbers_of_bodies() -> None:
 
 
 def test_threads_end_with_their_plants() -> None:
-    before = threading.active_count()
+    gc.collect()
+    before = set(threading.enumerate())
     model = canes(1)
     plants = Plants(model, State.at_rest(model), threads=3)
-    assert threading.active_count() == before + 2
-    crew = [t for t in threading.enumerate() if t.name.startswith("crew")]
+    crew = set(threading.enumerate()) - before
+    assert len(crew) == 2
     del plants
     gc.collect()
     for thread in crew:

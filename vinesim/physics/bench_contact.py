@@ -67,7 +67,7 @@ def _beside(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -
 
 
 def _command(rigid: Rigid, robots: list[RobotSpec], tick: int) -> None:
-    """The bar goes up and down by a centimetre, 4 cm above its start; hands close and lift by 2 cm and move as slowly."""
+    """The bar, 4 cm above its start, and the hands, closed and lifted by 2 cm, go up and down by a centimetre."""
     wave = 0.01 * np.sin(0.06 * tick)
     for robot in robots:
         if len(robot.drives) == 1:

@@ -67,21 +67,22 @@ def _inertial(mass: float) -> str:
 
 def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0") -> str:
     return (
-        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/>'
-        f'<axis xyz="{axis}"/><limit lower="-2" upper="2" effort="1000" velocity="5"/></joint>'
+        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{origin}"/><axis xyz="{axis}"/><limit lower="-2" upper="2" effort="1000" velocity="5"/></joint>'
     )
 
 
 def hand(name: str, at: np.ndarray) -> RobotSpec:
-    """Two flat fingers open by 17 cm about a point; drives: lift, and one for each finger (target 0.05: a firm grasp)."""
-    finger = "<collision><geometry><box size='0.07 0.02 0.04'/></geometry></collision>"
+    """Two flat fingers open by 17 cm about a point; drives: lift, and one for each finger (0.05 is a firm grasp)."""
+    finger = "<collision><geometry><box size='0.02 0.04 0.07'/></geometry></collision>"
     urdf = (
-        f'<robot name="hand"><link name="base_footprint">{_inertial(50.0)}</link><link name="palm">{_inertial(4.0)}</link>'
+        f'<robot name="hand"><link name="base_footprint">{_inertial(50.0)}</link>'
+        f'<link name="palm">{_inertial(4.0)}</link>'
         f'<link name="left">{_inertial(0.1)}{finger}</link><link name="right">{_inertial(0.1)}{finger}</link>'
         f"{_slide('lift', 'base_footprint', 'palm', '0 0 1')}"
         f"{_slide('close_left', 'palm', 'left', '-1 0 0', '0.085 0 0')}"
         f"{_slide('close_right', 'palm', 'right', '1 0 0', '-0.085 0 0')}</robot>"
-    ).replace("0.07 0.02 0.04", "0.02 0.04 0.07")
+    )
     drives = (
         Drive("lift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
         Drive("close_left", 4000.0, 80.0, 40.0, 5.0, -1.0, 1.0),

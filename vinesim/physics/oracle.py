@@ -1,4 +1,4 @@
-"""The same plants, or the same whole scene, as a MuJoCo model: the peer that tests and benchmarks hold our solver against.
+"""The same plants, or the whole scene, in MuJoCo: the peer that tests and benchmarks hold our solver against.
 
 MuJoCo's ball joint has one stiffness for all axes, so each joint takes its first bending stiffness; for an exact
 comparison build trees whose springs are isotropic.
