@@ -55,6 +55,17 @@ def test_bad_urdf(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_no_such_device():
+    refused(vinesim("client", "--device", "abacus"), 3, "abacus", "cpu, cuda")
+    refused(vinesim("client", "--device", "cuda:0", "--threads", "2"), *threads_or_no_gpu())
+
+
+def threads_or_no_gpu():
+    import warp as wp
+
+    return (2, "--threads 2") if wp.get_cuda_device_count() else (3, "'cuda:0'", "no NVIDIA GPU", "use cpu")
+
+
 def test_server_gone():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     refused(vinesim("client", "--connect", endpoint, "--seconds", "1", "--no-ros"), 4, endpoint, "vinesim server")

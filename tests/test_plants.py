@@ -1,10 +1,16 @@
 from __future__ import annotations
 
+import gc
+import itertools
+import threading
+
 import numpy as np
 import pytest
+import warp as wp
 from clustered import clustered, momenta, moving
 
 from vinesim import frames
+from vinesim.physics.memory import Memory, NoDevice
 from vinesim.physics.plants import ONSET, Plants
 from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.model import Model
@@ -526,3 +532,128 @@ def test_wrong_clusters_are_refused_in_words(change: dict[str, float], says: str
         getattr(model, name)[1] = value
     with pytest.raises(ValueError, match=says):
         Plants(model, state)
+
+
+def grove(rng: np.random.Generator, count: int = 7) -> Model:
+    """Trees of unlike size: the shares of threads and the rows of a device's copies are uneven."""
+    trees = []
+    for i in range(count):
+        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
+        rod = tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), int(rng.integers(2, 9)))
+        tree.rod(rod[1], 0.3, (0.003, 0.002), Wood(5e9, 800.0, 0.01), 3, rest=frames.exp(np.array([0.0, 0.4, 0.9])))
+        tree.settle()
+        trees.append(tree)
+    return assemble(trees)
+
+
+def eventful(**options: object) -> tuple[list[bytes], np.ndarray]:
+    """Trees are pushed, loaded, woken, reweighed, pulled, cut and put to rest: what was told, and a response."""
+    rng = np.random.default_rng(5)
+    model = grove(rng)
+    plants = Plants(model, State.at_rest(model), **options)
+    state, first = plants.state, model.tree_first
+    plants.wake(np.array([0, 2, 3, 5, 6]))
+    state.joint_qd[:] = rng.normal(size=state.joint_qd.shape)
+    plants.body_load[first[2]] = [0.0, 0.3, 0.0, 0.0, 0.0, 0.0]
+    told = []
+    for tick in range(12):
+        if tick == 4:
+            plants.wake(1)
+            plants.reweigh(int(first[3]) + 1, 0.2)
+        if tick == 9:
+            plants.cut(int(first[6]) + 1)
+        if tick == 7:
+            plants.rest(5)
+            plants.pull(0, model.joint_settled[model.bodies_of(0)], np.zeros((model.tree_size[0], 3)), 0.5)
+        plants.free()
+        told += [x.tobytes() for x in (state.body_q, state.body_qd, plants.velocity_free, plants.phi_used)]
+        if 3 <= tick < 6:
+            bodies = np.array([first[0] + 1, first[6] + 2])
+            response = plants.response(bodies)
+            plants.commit(bodies, rng.normal(size=(2, 6)))
+            told += [plants.joint_wrench(bodies).tobytes()]
+        else:
+            plants.commit()
+        told += [x.tobytes() for x in (state.joint_q, state.joint_qd, plants.acceleration, plants.tree_rate)]
+    plants.upload()
+    plants.advance(5)
+    plants.download()
+    plants.kinematics()
+    told += [x.tobytes() for x in (state.joint_q, state.joint_qd, state.joint_x, state.body_q, plants.acceleration)]
+    return told, response
+
+
+def test_threads_and_copies_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vinesim.physics.plants.FEW", 0)
+    monkeypatch.setattr("vinesim.physics.plants.FEW_MOVES", 0)
+    alone, response = eventful()
+    for options in ({"threads": 2}, {"threads": 3}, {"memory": Memory("cpu", apart=True)}):
+        told, seen = eventful(**options)
+        assert told == alone, options
+        np.testing.assert_array_equal(seen, response)
+
+
+def test_advance_is_free_and_commit_many_times() -> None:
+    runs = []
+    for together in (False, True):
+        model = grove(np.random.default_rng(2))
+        plants = Plants(model, State.at_rest(model), threads=2)
+        plants.wake(np.arange(6))
+        plants.state.joint_qd[:, 1] = 0.5
+        step(plants)
+        plants.free()
+        plants.commit(np.array([3]), np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]))
+        if together:
+            plants.upload()
+            plants.advance(30)
+            plants.download()
+        else:
+            step(plants, 30)
+        runs.append((plants.tick, plants.state.joint_q.tobytes(), plants.velocity_free.tobytes()))
+    assert runs[0] == runs[1]
+
+
+def test_shares_hold_like_numbers_of_bodies() -> None:
+    model = grove(np.random.default_rng(3), 40)
+    plants = Plants(model, State.at_rest(model), threads=3)
+    plants.wake(np.arange(1, 40))
+    plants.free()
+    ends, trees = plants._share_ends, np.arange(1, 40)
+    assert (ends[0], ends[-1]) == (0, 39)
+    shares = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(ends)]
+    assert max(shares) - min(shares) <= 2 * model.tree_size.max()
+
+
+def test_threads_end_with_their_plants() -> None:
+    gc.collect()
+    before = set(threading.enumerate())
+    model = canes(1)
+    plants = Plants(model, State.at_rest(model), threads=3)
+    crew = set(threading.enumerate()) - before
+    assert len(crew) == 2
+    del plants
+    gc.collect()
+    for thread in crew:
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def test_devices_that_are_not_there_are_refused_in_words() -> None:
+    model = canes(1)
+    with pytest.raises(NoDevice, match="device 'tpu': give cpu, cuda or cuda:N"):
+        Plants(model, State.at_rest(model), device="tpu")
+    with pytest.raises(ValueError, match="0 threads on cpu"):
+        Plants(model, State.at_rest(model), threads=0)
+    if wp.get_cuda_device_count() == 0:
+        with pytest.raises(NoDevice, match=r"'cuda': Warp sees no NVIDIA GPU here .* use cpu") as refused:
+            Plants(model, State.at_rest(model), device="cuda")
+        assert refused.value.exit_code == 3
+
+
+@pytest.mark.skipif(wp.get_cuda_device_count() == 0, reason="needs an NVIDIA GPU; benchmarks/gpu.py holds one to this")
+def test_a_gpu_agrees_with_the_cpu() -> None:
+    cpu, near = eventful()
+    gpu, far = eventful(device="cuda")
+    np.testing.assert_allclose(far, near, rtol=1e-3, atol=1e-3 * abs(near).max())
+    for a, b in zip(cpu, gpu, strict=True):
+        np.testing.assert_allclose(np.frombuffer(b, np.float32), np.frombuffer(a, np.float32), atol=2e-2, rtol=1e-2)

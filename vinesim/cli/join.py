@@ -28,8 +28,8 @@ class WrongUse(ValueError):
 def run(
     *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int,
     place: tuple[float, float, float] | None,
-    back: float, namespace: str, ros: bool, push: int | None, watch: int | None, near: float, seconds: float | None,
-    out: pathlib.Path | None, status: str, sensor_hz: float | None,
+    back: float, namespace: str, ros: bool, push: int | None, watch: int | None, near: float, device: str,
+    threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
@@ -37,6 +37,12 @@ def run(
         raise WrongUse(f"role {role!r} {built}; give --role robot")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
+
+    from vinesim.physics.memory import device_of
+
+    device_of(device)  # refused before anything is built
+    if threads > 1 and device != "cpu":
+        raise WrongUse(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
     # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
     sys.setswitchinterval(SWITCH)
@@ -82,7 +88,7 @@ def run(
                 namespace=namespace, ros=ros, keep_pictures=out is not None, sensor_hz=sensor_hz,
             )
         )  # fmt: skip
-        client = Client(plan, model, description, bus, name=name, pose=start, near=near)
+        client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device, threads=threads)
         senses.attach(client)
         pace = Pace(client.physics.dt)
         watched = watch if watch is not None else push

@@ -57,10 +57,13 @@ class Client:
         pose: np.ndarray,
         near: float = interest.NEAR,
         device: str = "cpu",
+        threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, device=device, picking=False)  # the network does not carry it yet
+        self.physics = Physics(
+            model, device=device, threads=threads, picking=False
+        )  # the network does not carry it yet
         self.robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         hello = Hello(
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=scene.name,

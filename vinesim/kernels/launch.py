@@ -1,39 +1,135 @@
-"""A kernel bound to its arrays once, launched many times a second.
+"""A kernel bound to its arrays once, launched many times a second; and a crew of threads that share one launch.
 
 Warp packs a kernel's arguments anew at every CPU launch, recorded or not: 10 us for twenty arguments, more than most of
-our kernels run. :func:`bind` packs them once and then only calls the compiled function: 1 us.
+our kernels run. :func:`bind` packs them once and then only calls the compiled function: 1 us. That call gives the
+interpreter lock away, so Python threads can run a kernel side by side on parts of its list: see :class:`Crew`.
 """
 
 import ctypes
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 
 import warp as wp
 
+BLOCK = 32
+"""CUDA threads a block. One thread is one tree and runs long: small blocks spread few trees over all multiprocessors."""
 
-def bind(kernel: wp.Kernel, inputs: list, outputs: list) -> Callable[[int], None]:
-    """A function that launches ``kernel`` on the CPU with so many threads, on the arrays named here.
 
-    The arrays must stay alive and where they are; the function keeps Warp's handles of them.
+def bind(
+    kernel: wp.Kernel,
+    inputs: list,
+    outputs: list,
+    *,
+    device: str = "cpu",
+    over: str = "",
+    shares: int = 1,
+    block: int = BLOCK,
+) -> Callable[..., None]:
+    """A function that launches ``kernel`` with so many threads, on the arrays named here.
+
+    The arrays must stay alive and where they are; the function keeps Warp's handles of them. With ``over``, the name of
+    the list argument of which thread i takes entry i, the CPU function also takes ``first``, the entry of its first
+    thread, and ``share``, a number below ``shares`` that no other thread uses meanwhile. ``block`` is for CUDA.
     """
-    command = wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
+    commands = [
+        wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=device, record_cmd=True, block_dim=block)
+        for _ in range(shares)
+    ]
+    at = kernel.arg_indices[over] if over else -1
+    if not wp.get_device(device).is_cpu:
+        return _recorded(commands, inputs, -1)
     try:
-        forward, bounds, values = command.hooks.forward, command.params[0], command.params[1:]
-        fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, values, strict=True)]
-        packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
-        shape, at_bounds, at_packed = bounds.shape, ctypes.byref(bounds), ctypes.byref(packed)
+        calls = []
+        for command in commands:
+            bounds, values = command.params[0], command.params[1:]
+            fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, values, strict=True)]
+            packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
+            dealt = getattr(packed, over) if over else None
+            calls.append((bounds, bounds.shape, dealt, ctypes.byref(bounds), ctypes.byref(packed)))
+        forward = commands[0].hooks.forward
+        start, step = (dealt.data, inputs[at].strides[0]) if over else (0, 0)
     except (AttributeError, TypeError, ValueError):  # another Warp: its own way, at its own speed
+        return _recorded(commands, inputs, at)
 
-        def relaunch(threads: int) -> None:
-            if threads:
-                command.set_dim(threads)
-                command.launch()
-
-        return relaunch
-
-    def launch(threads: int) -> None:
+    def launch(threads: int, first: int = 0, share: int = 0) -> None:
         if threads:
+            bounds, shape, dealt, at_bounds, at_packed = calls[share]
+            if dealt is not None:
+                dealt.data = start + first * step
             shape[0] = bounds.size = threads
             forward(at_bounds, at_packed)
 
-    launch.keeps = (command, inputs, outputs)  # type: ignore[attr-defined]
+    launch.keeps = (commands, inputs, outputs)  # type: ignore[attr-defined]
     return launch
+
+
+def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> Callable[..., None]:
+    """Warp's own replay: what CUDA uses, and what can be captured into a graph."""
+
+    def launch(threads: int, first: int = 0, share: int = 0) -> None:
+        if threads:
+            if at >= 0:
+                commands[share].set_param_at_index(at, inputs[at][first:])
+            commands[share].set_dim(threads)
+            commands[share].launch()
+
+    return launch
+
+
+class Crew:
+    """Threads that wait for work and do it together with whoever brings it.
+
+    A hand-over costs 10 to 30 us: worth it for work of 100 us and more.
+    """
+
+    def __init__(self, size: int) -> None:
+        """``size``: how many work at once, the caller of :meth:`share` included."""
+        self.size = size
+        self._work: list[Callable[[], None] | None] = [None] * size
+        self._failed: list[BaseException] = []
+        self._start = [threading.Lock() for _ in range(size)]
+        self._done = [threading.Lock() for _ in range(size)]
+        for i in range(1, size):
+            self._start[i].acquire()
+            self._done[i].acquire()
+            loop = (self._work, self._failed, self._start[i], self._done[i], i)
+            threading.Thread(target=_wait_and_work, args=loop, name=f"crew {i}", daemon=True).start()
+
+    def share(self, works: Sequence[Callable[[], None]]) -> None:
+        """Do all of ``works`` [at most ``size``] at once and return when all are done."""
+        for i in range(1, len(works)):
+            self._work[i] = works[i]
+            self._start[i].release()
+        try:
+            works[0]()
+        finally:
+            for i in range(1, len(works)):
+                self._done[i].acquire()
+        if self._failed:
+            raise self._failed.pop()
+
+    def close(self) -> None:
+        """Send the threads home."""
+        for i in range(1, self.size):
+            self._work[i] = None
+            self._start[i].release()
+
+
+def _wait_and_work(
+    work: list[Callable[[], None] | None],
+    failed: list[BaseException],
+    start: threading.Lock,
+    done: threading.Lock,
+    i: int,
+) -> None:
+    while True:
+        start.acquire()
+        mine, work[i] = work[i], None
+        if mine is None:
+            return
+        try:
+            mine()
+        except BaseException as error:  # the one who brought the work hears of it
+            failed.append(error)
+        del mine  # hold on to nobody's arrays while waiting
+        done.release()

@@ -128,6 +128,37 @@ def blown(area: float, wind: wp.vec3):
     return 0.5 * AIR * area * wp.length(wind)
 
 
+@wp.func
+def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int):
+    """Fastest of some joint rates [rad/s]; NaN enters, and stays. (A function, since an adjoint does not repeat the
+    loops of its kernel before it goes back, but calls functions.)
+    """
+    most = float(0.0)
+    for k in range(first, first + size):
+        rate = wp.length(rates[k])
+        if rate > most or rate != rate:
+            most = rate
+    return most
+
+
+@wp.func
+def fleeing(
+    speeds: wp.array(dtype=wp.vec3),
+    body_parent: wp.array(dtype=wp.int32),
+    body_root: wp.array(dtype=wp.int32),
+    first: int,
+    size: int,
+):
+    """Fastest of the floating roots [m/s]; NaN enters, and stays."""
+    most = float(0.0)
+    for k in range(first, first + size):
+        if body_parent[k] < 0 and body_root[k] >= 0:
+            speed = wp.length(speeds[k])
+            if speed > most or speed != speed:
+                most = speed
+    return most
+
+
 @wp.kernel
 def place(
     # model
@@ -234,11 +265,8 @@ def free(
     size = tree_moving[tree]
 
     # outward: poses and velocities at the start of the tick, each body's own inertia and bias
-    fastest = float(0.0)
-    for k in range(first, first + size):
-        fastest = wp.max(fastest, wp.length_sq(joint_qd[k]))
     phi = tree_phi[tree]
-    if fastest > brisk * brisk or tree_onset[tree] > 0:
+    if fastest(joint_qd, first, size) > brisk or tree_onset[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
     ahead = tension * (1.0 - phi) * dt
@@ -582,25 +610,19 @@ def integrate(
     if not tree_awake[tree]:
         return
     first = tree_first[tree]
-    last = first + tree_moving[tree]
-    fastest = float(0.0)
-    falling = float(0.0)
-    for k in range(first, last):
-        square = wp.length_sq(joint_qd_free[k])
-        if square > fastest or square != square:  # NaN enters, and stays
-            fastest = square
-        if body_parent[k] < 0 and body_root[k] >= 0:
-            falling = wp.max(falling, wp.length_sq(joint_xd_free[k]))
-    tree_rate_out[tree] = wp.sqrt(fastest + falling)
+    size = tree_moving[tree]
+    turning = fastest(joint_qd_free, first, size)
+    most = wp.length(wp.vec2(turning, fleeing(joint_xd_free, body_parent, body_root, first, size)))
+    tree_rate_out[tree] = most
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
-    sound = fastest + falling <= bound * bound
+    sound = most <= bound
     phi = tree_phi[tree]
     # a tree beyond limit is slowed as a whole and well below it: holding back single joints would feed energy into the
     # others, and a loaded cane would thrash at the limit for ever
     slower = float(1.0)
-    if fastest > limit * limit:
-        slower = 0.5 * limit / wp.sqrt(fastest)
-    for k in range(first, last):
+    if turning > limit:
+        slower = 0.5 * limit / turning
+    for k in range(first, first + size):
         floats = body_parent[k] < 0 and body_root[k] >= 0
         if sound:
             rate = slower * joint_qd_free[k]
@@ -614,8 +636,10 @@ def integrate(
             joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q[k])
         else:
             joint_qd_out[k] = wp.vec3()
+            joint_q_out[k] = joint_q[k]
             if floats:
                 joint_xd_out[k] = wp.vec3()
+                joint_x_out[k] = joint_x[k]
 
 
 @wp.func

@@ -13,15 +13,19 @@ The scheme (:mod:`vinesim.kernels.plant`) damps as if every joint's beta (dampin
 
 from __future__ import annotations
 
+import functools
 import math
+import weakref
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import plant
-from vinesim.kernels.launch import bind
+from vinesim.kernels.launch import Crew, bind
+from vinesim.physics.memory import Memory
 from vinesim.world.grow import GRAVITY
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -39,6 +43,13 @@ BOUND = 5000.0
 """[rad/s] A tree of which a joint would turn faster than this is not integrated: see :mod:`vinesim.physics.guard`."""
 
 
+FEW = 100
+"""[tree] For fewer awake trees a thread, handing ``free()`` to other threads costs more than it saves."""
+
+FEW_MOVES = 1000
+"""[tree] The same for the move at the end of ``commit()``, which is twelve times as short."""
+
+
 class Plants:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
@@ -50,12 +61,15 @@ class Plants:
         state: its arrays are read and written in place.
         dt: tick [s].
         phi: 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
-        device: ``"cpu"``; the views need memory that both sides see.
+        device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
+            them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
+        threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
         brisk: [rad/s] see :data:`BRISK`.
         limit: [rad/s] see :data:`LIMIT`.
         bound: [rad/s] see :data:`BOUND`.
         tension: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without it a heavy
             bunch on a soft peduncle gains energy every tick; off only to compare with solvers that do without.
+        memory: where arrays live, instead of what ``device`` says.
     """
 
     def __init__(
@@ -66,13 +80,16 @@ class Plants:
         dt: float = 0.01,
         phi: float = 0.55,
         device: str = "cpu",
+        threads: int = 1,
         brisk: float = BRISK,
         limit: float = LIMIT,
         bound: float = BOUND,
         tension: bool = True,
+        memory: Memory | None = None,
     ) -> None:
-        if device != "cpu":
-            raise ValueError(f"device {device!r}: plants share memory with NumPy; use 'cpu'")
+        memory = Memory(device) if memory is None else memory
+        if threads < 1 or (threads > 1 and not memory.device.is_cpu):
+            raise ValueError(f"{threads} threads on {device}: 1 or more on cpu; a GPU needs none, leave threads at 1")
         if not dt > 0.0 or not 0.5 <= phi <= 1.0:
             raise ValueError(f"dt {dt} s, phi {phi}: need dt above 0 and phi from 0.5 to 1")
         check(model, state)
@@ -123,6 +140,18 @@ class Plants:
         self._moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
         self._tie_first = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
         self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
+        self.memory, self.threads = memory, threads
+        """Where arrays live, for NumPy and for kernels."""
+        for owner in (self, state):
+            for name, value in vars(owner).items():
+                if isinstance(value, np.ndarray):
+                    setattr(owner, name, memory.within_reach(value))
+        self._crew = Crew(threads) if threads > 1 else None
+        if self._crew is not None:
+            weakref.finalize(self, self._crew.close)
+        self._share_ends = [0] * (threads + 1)
+        self._graph: wp.Graph | None = None
+        self._graph_of = (-1, -1)
         self._record(tension)
         self._pack()
         self._loosen(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -213,11 +242,19 @@ class Plants:
             springs = self.joint_stiffness[bodies], self.joint_damping[bodies]
             self.joint_stiffness[bodies], self.joint_damping[bodies] = 0.0, 0.0
             self._subset[: len(trees)] = trees
+            self._renewed = True
+            self._renew()
+            self._carry_in_kick(len(trees))
             self._solve(len(trees))
+            self.memory.wait()
             self.joint_stiffness[bodies], self.joint_damping[bodies] = springs
+            self._renewed = True
             moving = _spans(self.model.tree_first[trees], self.model.tree_core[trees])
             self._joint_qd_free[moving], self._joint_xd_free[moving] = state.joint_qd[moving], state.joint_xd[moving]
+            self._carry_in_rates(len(trees))
             self._kick(len(trees))
+            self._carry_out_kick(len(trees))
+            self.memory.wait()
             self._impulse[bodies] = 0.0
             state.joint_qd[moving] = self._joint_qd_free[moving]
             roots = moving[state.body_cut[moving]]
@@ -248,6 +285,7 @@ class Plants:
         self.body_com[bodies] = self.model.bunch_head_com[bunches]
         self.body_inertia[bodies] = self._head_inertia[bunches]
         self.body_product[bodies] = 0.0
+        self._renewed = True
 
     def _fuse(self, bunches: np.ndarray) -> np.ndarray:
         """Make each bunch's body a compound of head and clusters as they are.
@@ -294,6 +332,7 @@ class Plants:
         self.body_mass[bodies], self.body_com[bodies] = whole, center
         self.body_inertia[bodies] = np.diagonal(tensor, axis1=1, axis2=2)
         self.body_product[bodies] = tensor[:, [1, 2, 0], [2, 0, 1]]
+        self._renewed = True
         return np.concatenate([linear.sum(1), angular.sum(1)], -1)
 
     # cutting
@@ -329,14 +368,18 @@ class Plants:
             up = np.where(above >= 0, above, up)
         self._root[bodies] = np.where(self.state.body_cut[up], up, -1)
         self._roots = np.flatnonzero(self.state.body_cut).astype(np.int32)
+        self._renewed = True
 
     # one tick
 
     def free(self) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the tick and solve the motion without contacts."""
-        self._stepped = self._list
-        self._stepping[: len(self._list)] = self._list
-        self._free(len(self._list))
+        self._choose()
+        self._renew()
+        self._carry_in(len(self._stepped))
+        self._all(self._free, FEW)
+        self._carry_out_free(len(self._stepped))
+        self.memory.wait()
 
     def response(self, bodies: np.ndarray) -> np.ndarray:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
@@ -353,6 +396,7 @@ class Plants:
         self._asked[:n] = bodies
         self._asked[n] = -1
         self._respond(n)
+        self.memory.wait()
         y = self._response[:n, :, :n].reshape(6 * n, 6 * n)
         return (0.5 * (y + y.T)).reshape(n, 6, n, 6)
 
@@ -361,6 +405,7 @@ class Plants:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
+        changed = len(self._pushed) > 0
         self._wrench[self._pushed] = 0.0
         self._pushed = np.zeros(0, np.int32)
         if bodies is not None and len(bodies):
@@ -370,17 +415,60 @@ class Plants:
             self._pushed = bodies.astype(np.int32)
             touched = np.unique(self.model.body_tree[bodies])
             self._subset[: len(touched)] = touched
+            self._carry_wrench(len(self._stepped))
             self._push(len(touched))
             begun = touched[self._touched[touched] < self.tick - 1]
             self._onset[begun] = ONSET + 1  # integrating counts this tick
             self._touched[touched] = self.tick
-        self._integrate(len(self._stepped))
-        if len(self._roots):
-            tree = self.model.body_tree[self._roots]
-            roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._stepped)]
-            self._floating[: len(roots)] = roots
-            self._conserve(len(roots))
+        elif changed:
+            self._carry_wrench(len(self._stepped))
+        self._all(self._integrate, FEW_MOVES)
+        self._conserve(self._afloat())
+        self._carry_out_commit(len(self._stepped))
+        self.memory.wait()
         self.tick += 1
+
+    def _afloat(self) -> int:
+        """List the floating roots that this tick moves; how many there are."""
+        if len(self._roots) == 0:
+            return 0
+        tree = self.model.body_tree[self._roots]
+        roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._stepped)]
+        self._floating[: len(roots)] = roots
+        return len(roots)
+
+    def advance(self, ticks: int) -> None:
+        """Many ticks of the awake trees with nothing in between: no contacts, no sleep, no guard.
+
+        Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
+        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free`` and
+        ``acceleration`` are of the last tick; a tree that went wrong stays where it was (``tree_rate`` is NaN or above
+        ``bound``).
+        """
+        self._choose()
+        floating = self._afloat()
+        if len(self._pushed) and ticks > 0:  # the next prediction still knows the last contacts
+            self._together(1, floating)
+            self._wrench[self._pushed] = 0.0
+            self._pushed = np.zeros(0, np.int32)
+            self._carry_wrench(len(self._stepped))
+            self._together(ticks - 1, floating)
+        else:
+            self._together(ticks, floating)
+        self.tick += ticks
+
+    def upload(self) -> None:
+        """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
+        self._choose()
+        self._renew()
+        self._carry_in(len(self._stepped))
+        self.memory.wait()
+
+    def download(self) -> None:
+        """Bring the host's arrays of the awake trees up to the device's copies, as ``free()`` and ``commit()`` do."""
+        self._carry_out_free(len(self._stepped))
+        self._carry_out_commit(len(self._stepped))
+        self.memory.wait()
 
     def brace(self, trees: np.ndarray) -> None:
         """Use phi = 1 in the next ``ONSET`` ticks of trees about to be touched (``commit()`` sees to new touches)."""
@@ -390,7 +478,11 @@ class Plants:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""
         trees = self._list if trees is None else np.atleast_1d(trees)
         self._subset[: len(trees)] = trees
+        self._renew()
+        self._carry_in_place(len(trees))
         self._place(len(trees))
+        self._carry_out_place(len(trees))
+        self.memory.wait()
 
     def pull(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
@@ -416,11 +508,11 @@ class Plants:
 
         Of the last tick, and only for bodies of trees that were awake in it. At rest it carries what hangs below.
         """
-        n = len(bodies)
-        out = wp.zeros(n, dtype=wp.spatial_vector, device="cpu")
-        asked = wp.array(np.asarray(bodies, np.int32), dtype=wp.int32, device="cpu")
+        n, device = len(bodies), self.memory.device
+        out = wp.zeros(n, dtype=wp.spatial_vector, device=device)
+        asked = wp.array(np.asarray(bodies, np.int32), dtype=wp.int32, device=device)
         if n:
-            m = self._arrays
+            m = self.memory.arrays
             wp.launch(
                 plant.joint_wrench,
                 n,
@@ -432,7 +524,7 @@ class Plants:
                     m["body_load"], m["wrench"],
                 ],
                 outputs=[out],
-                device="cpu",
+                device=device,
             )  # fmt: skip
         return out.numpy()
 
@@ -458,6 +550,7 @@ class Plants:
         self.body_mass[parts] *= share
         self.body_inertia[parts] *= share
         self.body_product[parts] *= share
+        self._renewed = True
 
     # memory and launches
 
@@ -478,9 +571,62 @@ class Plants:
                 "touch the bunch, or refine the tree before free()"
             )
 
+    def _choose(self) -> None:
+        """The awake trees are the ones that this tick steps; deal them out to the threads."""
+        if self._stepped is self._list:
+            return
+        self._stepped = trees = self._list
+        self._stepping[: len(trees)] = trees
+        bodies = np.cumsum(self.model.tree_size[trees])
+        parts = np.arange(self.threads + 1) * (int(bodies[-1]) if len(trees) else 0) // self.threads
+        self._share_ends[:] = np.searchsorted(bodies, parts, side="right").tolist()
+
+    def _all(self, launch: Callable[..., None], few: int) -> None:
+        """Launch over the trees that this tick steps, on all threads if there are ``few`` for each."""
+        if self._crew is None or len(self._stepped) < few * self.threads:
+            launch(len(self._stepped))
+        else:
+            self._crew.share(self._shares[launch])
+
+    def _together(self, ticks: int, floating: int) -> None:
+        """Predict and move, so many times, without coming back in between."""
+        count, ends = len(self._stepped), self._share_ends
+        if count == 0:
+            return
+        if not self.memory.device.is_cpu:
+            if self._graph_of != (count, floating):
+                with wp.ScopedCapture(self.memory.device) as capture:
+                    self._tick(1, count, floating)
+                self._graph, self._graph_of = capture.graph, (count, floating)
+            for _ in range(ticks):
+                wp.capture_launch(self._graph)
+            self.memory.wait()
+        elif self._crew is None or count < self.threads or floating:
+            self._tick(ticks, count, floating)
+        else:
+            share = [(ends[i + 1] - ends[i], ends[i], i) for i in range(self.threads)]
+            self._crew.share([functools.partial(_run, self._free, self._integrate, ticks, *part) for part in share])
+
+    def _tick(self, ticks: int, count: int, floating: int) -> None:
+        for _ in range(ticks):
+            self._free(count)
+            self._integrate(count)
+            self._conserve(floating)
+
+    def _renew(self) -> None:
+        """Tell a device's copies of what seldom changes: who grows on whom, masses, springs."""
+        if self._renewed:
+            self.memory.upload(self._seldom)
+            self._renewed = False
+
     def _record(self, tension: bool) -> None:
-        """Bind every kernel to the arrays once."""
-        model, state = self.model, self.state
+        """Bind every kernel to the arrays once.
+
+        Arrays of the model are constants. What has a row for each body (``body_``, ``joint_`` and those named below)
+        a GPU keeps a copy of, see :mod:`vinesim.physics.memory`: carried to it before every ``free()``, or ``seldom``
+        (set ``_renewed`` after a change), or ``made`` there. All else it reads where it is.
+        """
+        model, state, memory = self.model, self.state, self.memory
         kinds = {
             wp.int32: {"tree_first": model.tree_first, "tree_size": model.tree_size, "tree_moving": self._moving,
                        "body_tree": model.body_tree, "body_parent": self._parent, "body_root": self._root,
@@ -502,15 +648,21 @@ class Plants:
                                 "impulse": self._impulse, "acceleration": self.acceleration,
                                 "velocity_free": self.velocity_free},
         }  # fmt: skip
-        self._arrays = a = {
-            name: wp.array(data, dtype=dtype, device="cpu", copy=False)
-            for dtype, arrays in kinds.items()
-            for name, data in arrays.items()
-        }
-        for arrays in kinds.values():
+        made = ("body_q", "body_qd", "joint_xd_free", "joint_qd_free", "acceleration", "velocity_free",
+                "impulse")  # fmt: skip
+        often = ("body_load", "wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
+        self._seldom: list[str] = []
+        self._renewed = False
+        constants = {id(value) for value in vars(model).values()} | {id(self._tie_first)}
+        for dtype, arrays in kinds.items():
             for name, data in arrays.items():
-                if data.size and a[name].ptr != data.ctypes.data:
-                    raise ValueError(f"{name} cannot be shared with Warp; give a C-contiguous array of its own")
+                if id(data) in constants:
+                    memory.constant(name, data, dtype)
+                elif name.startswith(("body_", "joint_")) or name in made + often:
+                    memory.rows(name, data, dtype)
+                    self._seldom += [name] if name not in made + often else []
+                else:
+                    memory.reach(name, data, dtype)
         scratch = {
             wp.vec3: ("lever", "drawn", "Du"),
             wp.quat: ("axes",),
@@ -519,11 +671,29 @@ class Plants:
             wp.spatial_vector: ("bias", "spread", "added", "earlier", "later_qd", "idle_acceleration", "idle_velocity"),
         }
         for dtype, names in scratch.items():
-            a |= {name: wp.empty(len(model.body_mass), dtype=dtype, device="cpu") for name in names}
-        a["idle_phi"] = wp.empty(len(model.tree_first), dtype=float, device="cpu")
+            for name in names:
+                memory.scratch(name, len(model.body_mass), dtype)
+        memory.scratch("idle_phi", len(model.tree_first), float)
+        a, largest = memory.arrays, int(model.tree_size.max(initial=1))
 
-        def record(kernel: wp.Kernel, *inputs: object) -> Callable[[int], None]:
-            return bind(kernel, [a[value] if isinstance(value, str) else value for value in inputs], [])
+        def record(kernel: wp.Kernel, *inputs: object, **options: Any) -> Callable[..., None]:
+            given = [a[value] if isinstance(value, str) else value for value in inputs]
+            return bind(kernel, given, [], device=str(memory.device), **options)
+
+        def carrier(trees: str, *names: str, back: bool = False) -> Callable[[int], None]:
+            return memory.carrier(names, trees, largest, back=back)
+
+        self._carry_in = carrier("stepping", *often)
+        self._carry_out_free = carrier("stepping", "body_q", "body_qd", "velocity_free", back=True)
+        self._carry_wrench = carrier("stepping", "wrench")
+        self._carry_out_commit = carrier(
+            "stepping", "joint_x", "joint_xd", "joint_q", "joint_qd", "acceleration", back=True
+        )
+        self._carry_in_place = carrier("subset", "joint_x", "joint_xd", "joint_q", "joint_qd")
+        self._carry_out_place = carrier("subset", "body_q", "body_qd", back=True)
+        self._carry_in_kick = carrier("subset", *often, "impulse")
+        self._carry_in_rates = carrier("subset", "joint_xd_free", "joint_qd_free")
+        self._carry_out_kick = carrier("subset", "joint_xd_free", "joint_qd_free", back=True)
 
         gravity, dt = wp.vec3(GRAVITY), self.dt
         tree, joint = ("tree_first", "tree_moving"), ("body_parent", "body_root", "body_offset", "body_rest")
@@ -532,13 +702,14 @@ class Plants:
         where = ("joint_x", "joint_xd", "joint_q", "joint_qd")
         factors = ("axes", "lever", "D", "DJ", "DH", "lift")
         freed = ("joint_xd_free", "joint_qd_free")
+        dealt = {"over": "trees", "shares": self.threads}
 
         def free(brisk: float, tension: float, trees: str, phi: str, acceleration: str, velocity: str) -> Callable:
             return record(
                 plant.free, dt, brisk, tension, gravity, *tree, "tree_pose", *joint, *body, "joint_stiffness",
                 "joint_damping", *tie, trees, "tree_phi", "onset", "tree_air", "tie_anchor", "body_load", "wrench",
                 *where, "body_q", "body_qd", phi, "axes", "lever", "J", "H", "M", "bias", "drawn", "D", "DJ", "DH",
-                "Du", "lift", acceleration, *freed, velocity,
+                "Du", "lift", acceleration, *freed, velocity, **dealt,
             )  # fmt: skip
 
         def push(dt: float, wrench: str, acceleration: str) -> Callable:
@@ -557,7 +728,7 @@ class Plants:
         self._kick = push(1.0, "impulse", "idle_acceleration")
         self._integrate = record(
             plant.integrate, dt, self.limit, self.bound, *tree, "body_parent", "body_root", "stepping", "tree_awake",
-            "phi_used", *where, *freed, "tree_rate", "onset", *where,
+            "phi_used", *where, *freed, "tree_rate", "onset", *where, **dealt,
         )  # fmt: skip
         self._conserve = record(
             plant.conserve, dt, self.limit, self.bound, gravity, *tree, "body_tree", *joint, *body, *tie, "floating",
@@ -565,20 +736,37 @@ class Plants:
             "acceleration", "lever", "earlier", "later_q", "later_qd", *where,
         )  # fmt: skip
         self._bind = record
+        ends = self._share_ends
+
+        def part(launch: Callable[..., None], i: int) -> Callable[[], None]:
+            return lambda: launch(ends[i + 1] - ends[i], ends[i], i)
+
+        self._shares = {
+            launch: [part(launch, i) for i in range(self.threads)] for launch in (self._free, self._integrate)
+        }
 
     def _record_response(self, capacity: int) -> None:
         """Room for the responses of ``capacity`` bodies at once."""
-        self._capacity, a = capacity, self._arrays
-        self._asked = np.full(capacity + 1, -1, np.int32)
-        self._response = np.zeros((capacity, 6, capacity, 6), np.float32)
+        self._capacity, memory = capacity, self.memory
+        self._asked = memory.within_reach(np.full(capacity + 1, -1, np.int32))
+        self._response = memory.within_reach(np.zeros((capacity, 6, capacity, 6), np.float32))
         stride = int(self.model.tree_size.max())
-        columns = [wp.empty(capacity * stride, dtype=wp.mat33, device="cpu") for _ in range(4)]
-        a["asked"] = wp.array(self._asked, dtype=wp.int32, device="cpu", copy=False)
-        a["response"] = wp.array(self._response, dtype=float, device="cpu", copy=False)
+        columns = [wp.empty(capacity * stride, dtype=wp.mat33, device=memory.device) for _ in range(4)]
+        memory.reach("asked", self._asked, wp.int32)
+        memory.reach("response", self._response, float)
         self._respond = self._bind(
             plant.response, "tree_first", "body_tree", "body_parent", stride, "asked", "lever", "D", "DJ", "DH",
             "lift", *columns, "response",
         )  # fmt: skip
+
+
+def _run(
+    free: Callable[..., None], integrate: Callable[..., None], ticks: int, count: int, first: int = 0, share: int = 0
+) -> None:
+    """Many ticks of some of the listed trees, on one thread."""
+    for _ in range(ticks):
+        free(count, first, share)
+        integrate(count, first, share)
 
 
 def _spans(first: np.ndarray, count: np.ndarray) -> np.ndarray:

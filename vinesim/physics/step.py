@@ -24,11 +24,13 @@ class Physics:
     One thread owns it. What others may read leaves it as :class:`View` and other frozen values.
     """
 
-    def __init__(self, model: Model, *, dt: float = 0.01, device: str = "cpu", picking: bool = True) -> None:
-        """``dt`` [s]; ``device`` for the plants; ``picking``: bunches part from their vines when pulled too hard."""
+    def __init__(
+        self, model: Model, *, dt: float = 0.01, device: str = "cpu", threads: int = 1, picking: bool = True
+    ) -> None:
+        """``dt`` [s]; ``device``, ``threads``: see :class:`Plants`; ``picking``: bunches part when pulled too hard."""
         self.model, self.dt = model, dt
         self.state = State.at_rest(model)
-        self.plants = Plants(model, self.state, dt=dt, device=device)
+        self.plants = Plants(model, self.state, dt=dt, device=device, threads=threads)
         self.rigid = Rigid(model, dt=dt)
         self.touching = Touching(model, self.plants, self.rigid)
         self.parting = Partings(self.plants, self.rigid, self.touching)
