@@ -22,6 +22,15 @@ CAPSULE = wp.constant(3)
 ELLIPSOID = wp.constant(4)
 CYLINDER = wp.constant(5)
 
+# what is counted in one tick: awake trees, hits, hits without room, trees that are struck, plant bodies in contact,
+# and whether constraints of MuJoCo's own bind what is touched
+TREES = wp.constant(0)
+HITS = wp.constant(1)
+MISSED = wp.constant(2)
+STRUCK = wp.constant(3)
+BODIES = wp.constant(4)
+BOUND = wp.constant(5)
+
 SKIN = wp.constant(wp.float64(0.002))
 """Contacts are seen from this gap on [m], and from as far as the two can come together in one tick."""
 
@@ -636,7 +645,7 @@ def meet_branches(
     tree_fine: wp.array(dtype=wp.bool),
     bunch_attached: wp.array(dtype=wp.bool),
     order: wp.array(dtype=wp.int32),
-    count: wp.array(dtype=wp.int32),
+    tally: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_low: wp.array(dtype=wp.vec3),
     tree_high: wp.array(dtype=wp.vec3),
@@ -664,7 +673,7 @@ def meet_branches(
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     found = found_out[i]
-    for ahead_of in range(place, count[0]):
+    for ahead_of in range(place, tally[TREES]):
         other = trees[order[ahead_of]]
         if tree_low[other][0] > tree_high[tree][0]:
             break
@@ -733,6 +742,87 @@ def meet_branches(
 
 
 @wp.kernel
+def gather(
+    # model
+    slots: int,
+    # in
+    found: wp.array(dtype=wp.int32),
+    onset: wp.array(dtype=wp.bool),
+    # out
+    hits_out: wp.array(dtype=wp.int32),
+    tally_out: wp.array(dtype=wp.int32),
+):
+    """List the hits of all trees one after the other (one thread does all); of too many only count the rest."""
+    trees = tally_out[TREES]
+    count = int(0)  # noqa: RUF046
+    missed = int(0)  # noqa: RUF046
+    struck = int(0)  # noqa: RUF046
+    for i in range(trees):
+        kept = wp.min(found[i], slots)
+        missed = missed + found[i] - kept
+        if onset[i]:
+            struck = struck + 1
+        for k in range(kept):
+            if count < hits_out.shape[0]:
+                hits_out[count] = i * slots + k
+            count = count + 1
+    tally_out[HITS] = count
+    tally_out[MISSED] = missed
+    tally_out[STRUCK] = struck
+
+
+@wp.kernel
+def index(
+    # model
+    shape_body: wp.array(dtype=wp.int32),
+    # in
+    hits: wp.array(dtype=wp.int32),
+    hit_shape: wp.array(dtype=wp.int32),
+    hit_other: wp.array(dtype=wp.int32),
+    # out
+    tally_out: wp.array(dtype=wp.int32),
+    bodies_out: wp.array(dtype=wp.int32),
+    shape_out: wp.array(dtype=wp.int32),
+    body_out: wp.array(dtype=wp.int32),
+    place_out: wp.array(dtype=wp.int32),
+    other_body_out: wp.array(dtype=wp.int32),
+    other_place_out: wp.array(dtype=wp.int32),
+):
+    """Number the plant bodies that take part in contacts, sorted, each once (one thread does all)."""
+    contacts = tally_out[HITS]
+    count = int(0)  # noqa: RUF046
+    for c in range(contacts):
+        shape = hit_shape[hits[c]]
+        other = hit_other[hits[c]]
+        shape_out[c] = shape
+        body_out[c] = shape_body[shape]
+        other_body_out[c] = -1
+        if other < 0:
+            other_body_out[c] = shape_body[-1 - other]
+        for side in range(2):
+            body = body_out[c]
+            if side == 1:
+                body = other_body_out[c]
+            at = int(count)
+            while at > 0 and bodies_out[at - 1] >= body:
+                at = at - 1
+            if body >= 0 and (at == count or bodies_out[at] != body):
+                for k in range(count - at):
+                    bodies_out[count - k] = bodies_out[count - k - 1]
+                bodies_out[at] = body
+                count = count + 1
+    for c in range(contacts):
+        place_out[c] = 0
+        other_place_out[c] = 0
+        for k in range(count):
+            if bodies_out[k] == body_out[c]:
+                place_out[c] = k
+            if bodies_out[k] == other_body_out[c]:
+                other_place_out[c] = k
+    tally_out[BODIES] = count
+
+
+@wp.kernel
 def couple(
     # model
     dt: wp.float64,
@@ -752,9 +842,7 @@ def couple(
     hit_point: wp.array(dtype=wp.vec3d),
     contact_shape: wp.array(dtype=wp.int32),
     contact_body: wp.array(dtype=wp.int32),
-    contact_column: wp.array(dtype=wp.int32),
     other_body: wp.array(dtype=wp.int32),
-    other_column: wp.array(dtype=wp.int32),
     body_q: wp.array(dtype=wp.transform),
     body_qd_free: wp.array(dtype=wp.spatial_vector),
     dof_free: wp.array(dtype=wp.float64),
@@ -778,7 +866,7 @@ def couple(
     offset_out: wp.array(dtype=wp.float64),
     impulse_out: wp.array(dtype=wp.float64),
 ):
-    """Write the three rows of one contact into zeroed Jacobians, with its free approach, stored stretch, first guess."""
+    """Write one contact's three rows of the Jacobians (body and other; zeroed for the rigid), free approach, guess."""
     c = wp.tid()
     zero = wp.float64(0.0)
     h = hits[c]
@@ -817,16 +905,14 @@ def couple(
             axis = t2
         row = 3 * c + r
         turn = wp.cross(lever, axis)
-        column = contact_column[c]
         for k in range(3):
-            plant_rows_out[row, column + k] = axis[k]
-            plant_rows_out[row, column + 3 + k] = turn[k]
+            plant_rows_out[row, k] = axis[k]
+            plant_rows_out[row, 3 + k] = turn[k]
         if g < 0:
             other_turn = wp.cross(other_lever, axis)
-            column = other_column[c]
             for k in range(3):
-                plant_rows_out[row, column + k] = -axis[k]
-                plant_rows_out[row, column + 3 + k] = -other_turn[k]
+                plant_rows_out[row, 6 + k] = -axis[k]
+                plant_rows_out[row, 9 + k] = -other_turn[k]
         dof = last_dof
         carried = zero
         while dof >= 0:
@@ -854,6 +940,118 @@ def couple(
             impulse_out[3 * c + 2] = wp.dot(t2, known_rub[k])
             offset_out[3 * c + 1] = wp.dot(t1, known_anchor[k]) * stiffness / give
             offset_out[3 * c + 2] = wp.dot(t2, known_anchor[k]) * stiffness / give
+
+
+@wp.kernel
+def answer(
+    # model
+    dof_tree: wp.array(dtype=wp.int32),
+    tree_dof: wp.array(dtype=wp.int32),
+    tree_dofs: wp.array(dtype=wp.int32),
+    geom_dof: wp.array(dtype=wp.int32),
+    row_entry: wp.array(dtype=wp.int32),
+    row_entries: wp.array(dtype=wp.int32),
+    entry_dof: wp.array(dtype=wp.int32),
+    # in
+    tally: wp.array(dtype=wp.int32),
+    other: wp.array(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    other_place: wp.array(dtype=wp.int32),
+    plant_rows: wp.array2d(dtype=wp.float64),
+    rigid_rows: wp.array2d(dtype=wp.float64),
+    response: wp.array2d(dtype=float),
+    factor: wp.array(dtype=wp.float64),
+    factor_inverse: wp.array(dtype=wp.float64),
+    plain: wp.array(dtype=wp.float64),
+    plain_inverse: wp.array(dtype=wp.float64),
+    # out
+    plant_answer_out: wp.array2d(dtype=wp.float64),
+    rigid_answer_out: wp.array2d(dtype=wp.float64),
+):
+    """Find how all bodies in contact, and one kinematic tree (if free of constraints), answer one row's impulse."""
+    row = wp.tid()
+    zero = wp.float64(0.0)
+    c = row // 3
+    at = 6 * place[c]
+    over = 6 * other_place[c]
+    branch = other[c] < 0
+    for k in range(6 * tally[BODIES]):
+        moved = zero
+        for j in range(6):
+            moved = moved + plant_rows[row, j] * wp.float64(response[k, at + j])
+        if branch:
+            for j in range(6):
+                moved = moved + plant_rows[row, 6 + j] * wp.float64(response[k, over + j])
+        plant_answer_out[row, k] = moved
+    last = int(-1)  # noqa: RUF046
+    if not branch:
+        last = geom_dof[other[c]]
+    if last >= 0 and tally[BOUND] == 0:
+        tree = dof_tree[last]
+        first = tree_dof[tree]
+        end = first + tree_dofs[tree]
+        for i in range(first, end):
+            rigid_answer_out[row, i] = rigid_rows[row, i]
+        # L^T D L x = b, where MuJoCo keeps it; without anything implicit it leaves M^ unset, which then is M
+        implicit = factor_inverse[last] != zero
+        for k in range(end - first):
+            i = end - 1 - k
+            for e in range(row_entry[i], row_entry[i] + row_entries[i] - 1):
+                scale = plain[e]
+                if implicit:
+                    scale = factor[e]
+                j = entry_dof[e]
+                rigid_answer_out[row, j] = rigid_answer_out[row, j] - scale * rigid_answer_out[row, i]
+        for i in range(first, end):
+            pivot = plain_inverse[i]
+            if implicit:
+                pivot = factor_inverse[i]
+            moved = rigid_answer_out[row, i] * pivot
+            for e in range(row_entry[i], row_entry[i] + row_entries[i] - 1):
+                scale = plain[e]
+                if implicit:
+                    scale = factor[e]
+                moved = moved - scale * rigid_answer_out[row, entry_dof[e]]
+            rigid_answer_out[row, i] = moved
+
+
+@wp.kernel
+def assemble(
+    # model
+    geom_dof: wp.array(dtype=wp.int32),
+    dof_parent: wp.array(dtype=wp.int32),
+    # in
+    tally: wp.array(dtype=wp.int32),
+    other: wp.array(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    other_place: wp.array(dtype=wp.int32),
+    plant_rows: wp.array2d(dtype=wp.float64),
+    rigid_rows: wp.array2d(dtype=wp.float64),
+    plant_answer: wp.array2d(dtype=wp.float64),
+    rigid_answer: wp.array2d(dtype=wp.float64),
+    # out
+    A_out: wp.array2d(dtype=wp.float64),
+):
+    """Write one row of A: how fast the impulses of all contacts part the two bodies of this one along this axis."""
+    row = wp.tid()
+    c = row // 3
+    at = 6 * place[c]
+    over = 6 * other_place[c]
+    last = int(-1)  # noqa: RUF046
+    if other[c] >= 0:
+        last = geom_dof[other[c]]
+    for column in range(3 * tally[HITS]):
+        moved = wp.float64(0.0)
+        for k in range(6):
+            moved = moved + plant_rows[row, k] * plant_answer[column, at + k]
+        if other[c] < 0:
+            for k in range(6):
+                moved = moved + plant_rows[row, 6 + k] * plant_answer[column, over + k]
+        dof = last
+        while dof >= 0:
+            moved = moved + rigid_rows[row, dof] * rigid_answer[column, dof]
+            dof = dof_parent[dof]
+        A_out[row, column] = moved
 
 
 @wp.kernel
@@ -969,3 +1167,31 @@ def remember(
     known_anchor_out[c] = stretch
     if impulse[n] <= wp.float64(0.0):
         known_shape_out[c] = -1
+
+
+@wp.kernel
+def add_up(
+    # model
+    dt: wp.float64,
+    # in
+    tally: wp.array(dtype=wp.int32),
+    other: wp.array(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    other_place: wp.array(dtype=wp.int32),
+    plant_rows: wp.array2d(dtype=wp.float64),
+    impulse: wp.array(dtype=wp.float64),
+    # out
+    wrench_out: wp.array2d(dtype=wp.float64),
+):
+    """Add up the wrenches of all contacts on one plant body."""
+    body = wp.tid()
+    for k in range(6):
+        wrench_out[body, k] = wp.float64(0.0)
+    for row in range(3 * tally[HITS]):
+        force = impulse[row] / dt
+        if place[row // 3] == body:
+            for k in range(6):
+                wrench_out[body, k] = wrench_out[body, k] + force * plant_rows[row, k]
+        if other[row // 3] < 0 and other_place[row // 3] == body:
+            for k in range(6):
+                wrench_out[body, k] = wrench_out[body, k] + force * plant_rows[row, 6 + k]

@@ -95,7 +95,9 @@ class Loose:
     mass: float
     com: np.ndarray
     inertia: np.ndarray
-    """[3] kg m^2 about the centre of mass."""
+    """[3] kg m^2 about the centre of mass: moments xx, yy, zz."""
+    product: np.ndarray
+    """[3] kg m^2: entries yz, zx, xy."""
     start: np.ndarray
     """[shape, 3] m; a capsule reaches from here to ``end``, a sphere has both in one place."""
     end: np.ndarray
@@ -391,6 +393,17 @@ class Rigid:
         if d.nefc and d.nisland:
             label[:-1] = np.where(d.tree_island >= 0, m.ntree + 1 + d.tree_island, label[:-1])
         return label[m.body_treeid[m.geom_bodyid]]
+
+    def bound(self, bodies: np.ndarray) -> bool:
+        """Whether native constraints that are active now bind one of these MuJoCo bodies [k].
+
+        If not, the metric of the tick is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.
+        """
+        m, d = self.world, self.data
+        if d.nefc == 0:
+            return False
+        tree = m.body_treeid[bodies]
+        return d.nisland == 0 or bool((d.tree_island[tree[tree >= 0]] >= 0).any())
 
     def inverse(self, J: np.ndarray) -> np.ndarray:
         """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
@@ -805,7 +818,10 @@ def _drop(spec: mujoco.MjSpec, loose: Loose) -> None:
     """A bunch as a free body of round shapes, hard enough not to creep out of a gripper."""
     if not 0 < len(loose.radius) <= LUMPS:
         raise ValueError(f"a bunch of {len(loose.radius)} shapes; a loose one has 1 to {LUMPS}")
-    body = spec.worldbody.add_body(mass=loose.mass, ipos=loose.com, inertia=loose.inertia, explicitinertial=True)
+    yz, zx, xy = loose.product
+    body = spec.worldbody.add_body(
+        mass=loose.mass, ipos=loose.com, fullinertia=[*loose.inertia, xy, zx, yz], explicitinertial=True
+    )
     body.add_freejoint()
     for start, end, radius in zip(loose.start, loose.end, loose.radius, strict=True):
         kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}

@@ -48,7 +48,7 @@ class Shapes:
     body: np.ndarray
     """[shape]"""
     bunch: np.ndarray
-    """[shape] the bunch it belongs to, -1 for wood."""
+    """[shape] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left is in nobody's way."""
     when: np.ndarray
     """[shape] 0: always there; 1: while its tree is coarse; 2: while it is fine (see ``State.tree_fine``)."""
     start: np.ndarray
@@ -72,6 +72,7 @@ def shapes_of(model: Model) -> Shapes:
         for i, (first, count) in enumerate(zip(model.bunch_cluster, model.bunch_clusters, strict=True))
         for k in range(count)
     }
+    stalk_of = model.bunch_of().tolist()
     lengths, radii = model.body_length.tolist(), model.body_radius.mean(1).tolist()
     for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
         if b in of_body:
@@ -88,7 +89,7 @@ def shapes_of(model: Model) -> Shapes:
             inset = min(thick, half)
             parts.append((b, of_cluster[b], 2, inset, length - inset, thick))
         else:
-            parts.append((b, -1, 0, 0.0, length, thick))
+            parts.append((b, stalk_of[b], 0, 0.0, length, thick))
     body, bunch, when, start, end, radius = (np.array(column) for column in zip(*parts, strict=True))
     along = np.array([1.0, 0.0, 0.0], np.float32)
     return Shapes(
@@ -261,27 +262,26 @@ class Touching:
         """List the contacts of the trees that were just bounded."""
         if trees > self._room:
             self._make_room(2 * trees)
+        self._tally[kernels.TREES] = trees
         self._meeting(trees)
         if self.branches:
             self._order[:trees] = np.argsort(self._tree_low[self._trees[:trees], 0], kind="stable")
-            self._tree_count[0] = trees
             self._meeting_branches(trees)
-        found = self._found[:trees]
-        dropped = int((found - SLOTS).clip(0).sum())
-        hits = np.flatnonzero(self._slot < found[:, None])
-        if len(hits) > self.capacity:
-            dropped += len(hits) - self.capacity
+        self._gathering(1)
+        _, count, missed, _, _, _ = self._tally.tolist()
+        if count > self.capacity:
+            missed += count - self.capacity
+            hits = np.flatnonzero(self._slot < self._found[:trees, None])
             deepest = np.argsort(self._hit_gap.ravel()[hits], kind="stable")[: self.capacity]
-            hits = np.sort(hits[deepest])
-        if dropped:
-            self.dropped += dropped
+            self._hits[:] = np.sort(hits[deepest])
+            self._tally[kernels.HITS] = count = self.capacity
+        if missed:
+            self.dropped += missed
             self.complaint = (
-                f"{dropped} of {len(hits) + dropped} contacts of one tick were left out, the shallowest; there is room "
+                f"{missed} of {count + missed} contacts of one tick were left out, the shallowest; there is room "
                 f"for {self.capacity}, and for {SLOTS} at one tree: raise Touching's capacity or touch less at once"
             )
-        self.count = len(hits)
-        self._hits[: len(hits)] = hits
-        self._contact_shape[: len(hits)] = self._hit_shape.ravel()[hits]
+        self.count = count
 
     def _brace(self, awake: np.ndarray) -> None:
         """Step trees that are about to take a blow with phi = 1 from this tick on.
@@ -289,50 +289,42 @@ class Touching:
         The trapezoidal rule moves a body by the mean of its velocities before and after: what is hit from rest would
         give way only half as far as it must, overlap, and be thrown out again.
         """
-        struck = awake[self._onset[: len(awake)]]
-        if len(struck) and (self.plants.phi_used[struck] < 1.0).any():
-            self.plants.brace(struck)
-            self.plants.free()
+        if self._tally[kernels.STRUCK]:
+            struck = awake[self._onset[: len(awake)]]
+            if (self.plants.phi_used[struck] < 1.0).any():
+                self.plants.brace(struck)
+                self.plants.free()
 
     # ------------------------------------------------------------------ with what force
 
     def _press(self) -> None:
         """Impulses of all contacts at once, and what they do to either side."""
         n, rows = self.count, 3 * self.count
-        shape = self._contact_shape[:n]
-        other = self._hit_other.ravel()[self._hits[:n]]
-        body = self._contact_body[:n] = self.shapes.body[shape]
-        branch = other < 0
-        if branch.any():
-            of_other = self._other_body[:n] = np.where(branch, self.shapes.body[-1 - other], body)
-            bodies = np.union1d(body, of_other)
-            self._contact_column[:n] = 6 * np.searchsorted(bodies, body)
-            self._other_column[:n] = 6 * np.searchsorted(bodies, of_other)
-        else:
-            new = self._new_body[:n]  # they come sorted by body
-            np.not_equal(body[1:], body[:-1], out=new[1:])
-            bodies = body[new]
-            np.multiply(new.cumsum() - 1, 6, out=self._contact_column[:n])
-        columns = 6 * len(bodies)
-        plant_rows, rigid_rows = self._plant_rows[:rows, :columns], self._rigid_rows[:rows]
-        plant_rows[:] = 0.0
+        self._indexing(1)
+        touched = int(self._tally[kernels.BODIES])
+        bodies = self._bodies[:touched]
+        rigid_rows, rigid_answer = self._rigid_rows[:rows], self._rigid_answer[:rows]
         rigid_rows[:] = 0.0
+        rigid_answer[:] = 0.0
         self._dof_free[:] = self.rigid.velocity_free
         self._coupling(n)
 
-        response = self.plants.response(bodies).reshape(columns, columns)
-        A = self._A[:rows, :rows]
-        np.add(plant_rows @ response @ plant_rows.T, rigid_rows @ self.rigid.inverse(rigid_rows), out=A)
+        self._y[: 6 * touched, : 6 * touched] = self.plants.response(bodies).reshape(6 * touched, -1)
+        bound = self._tally[kernels.BOUND] = self.rigid.bound(self._geoms.body[self._other[:n].clip(0)])
+        self._answering(rows)
+        if bound:
+            rigid_answer[:] = self.rigid.inverse(rigid_rows).T
+        self._assembling(rows)
         islands = self._part(n)
         self._relaxing(islands)
         self.sweeps = int(self._sweeps[:islands].max())
 
-        impulse = self._impulse[:rows]
         self._known_count[0] = n
         self._remembering(n)
-        self.bodies = bodies
-        self.wrenches = (impulse @ plant_rows / self.dt).reshape(-1, 6)
-        self.force = impulse @ rigid_rows / -self.dt
+        self._adding(touched)
+        self.bodies = bodies.copy()
+        self.wrenches = self._wrench[:touched].copy()
+        self.force = self._impulse[:rows] @ rigid_rows / -self.dt
         self._values = None
 
     def _part(self, n: int) -> int:
@@ -379,8 +371,8 @@ class Touching:
         blocks = -(-trees // BLOCK)
         self._blocks = np.zeros(blocks, np.int32)
         self._block_low, self._block_high = np.zeros((blocks, 3), np.float32), np.zeros((blocks, 3), np.float32)
-        self._order, self._tree_count = np.zeros(trees, np.int32), np.zeros(1, np.int32)
-        for name in ("hits", "contact_shape", "contact_body", "contact_column", "other", "other_body", "other_column",
+        self._order, self._tally = np.zeros(trees, np.int32), np.zeros(6, np.int32)
+        for name in ("hits", "contact_shape", "contact_body", "place", "other", "other_body", "other_place",
                      "known_shape", "known_other"):  # fmt: skip
             setattr(self, "_" + name, np.zeros(n, np.int32))
         for name in ("gap", "friction", "known_push"):
@@ -390,8 +382,9 @@ class Touching:
         for name in ("free", "offset", "impulse"):
             setattr(self, "_" + name, np.zeros(3 * n))
         self._axes = np.zeros((n, 3, 3))
-        self._new_body = np.ones(n, np.bool_)
-        self._plant_rows, self._A = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3 * n))
+        self._bodies, self._wrench = np.zeros(2 * n + 1, np.int32), np.zeros((2 * n, 6))
+        self._plant_rows, self._A = np.zeros((3 * n, 12)), np.zeros((3 * n, 3 * n))
+        self._y, self._plant_answer = np.zeros((12 * n, 12 * n), np.float32), np.zeros((3 * n, 12 * n))
         self._island_first, self._island_member = np.zeros(n + 1, np.int32), np.zeros(n, np.int32)
         self._sweeps, self._every = np.zeros(n, np.int32), np.arange(n, dtype=np.int32)
         self._known_count = np.zeros(1, np.int32)
@@ -433,10 +426,15 @@ class Touching:
         self._geom_middle, self._geom_velocity = np.zeros((count, 3)), np.zeros((count, 3))
         self._geom_spin, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
         self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-        self._rigid_rows = np.zeros((3 * self.capacity, self.rigid.world.nv))
+        self._rigid_rows, self._rigid_answer = (np.zeros((3 * self.capacity, self.rigid.world.nv)) for _ in range(2))
         self._dof_free = np.zeros(self.rigid.world.nv)
         self._dof_parent = self.rigid.world.dof_parentid
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
+        m = self.rigid.world
+        self._mujoco["sparse"] = (
+            m.dof_treeid, m.tree_dofadr, m.tree_dofnum, m.M_rowadr, m.M_rownnz, m.M_colind
+        )  # fmt: skip
+        self._mujoco["factors"] = (d.qH, d.qHDiagInv, d.qLD, d.qLDiagInv)
         first = [i for i in range(self._movable) if i == 0 or g.actor[i] != g.actor[i - 1]]
         self._actor_first = np.array([*first, self._movable], np.int32)
         self._actor_copy = np.array([g.actor[i] in self.copies for i in first], np.bool_)
@@ -529,20 +527,38 @@ class Touching:
         self._meeting_branches = bind(
             kernels.meet_branches,
             [dt, SLOTS, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, fine, attached,
-             *ints("order", "tree_count", "trees"), *t_box, *now],
+             *ints("order", "tally", "trees"), *t_box, *now],
             [*ints("found"), *hit, onset],
         )  # fmt: skip
         flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_other"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
         axes = shared(self._axes, wp.mat33d)
+        self._gathering = bind(kernels.gather, [SLOTS, *ints("found"), onset], ints("hits", "tally"))
+        self._indexing = bind(
+            kernels.index,
+            [s_body, *ints("hits"), *flat[:2]],
+            ints("tally", "bodies", "contact_shape", "contact_body", "place", "other_body", "other_place"),
+        )
         self._coupling = bind(
             kernels.couple,
             [dt, k, c, FRICTION, g_friction, g_dof, g_root, shared(self._dof_parent, wp.int32), *ints("hits"),
-             *flat[1:], *ints("contact_shape", "contact_body", "contact_column", "other_body", "other_column"), body_q,
+             *flat[1:], *ints("contact_shape", "contact_body", "other_body"), body_q,
              body_qd_free, *doubles("dof_free"), cdof, com, *ints("known_count"), *known],
             [*ints("other"), *doubles("gap", "friction"), *vectors("point"), axes,
              *doubles("plant_rows", "rigid_rows", "free", "offset", "impulse")],
         )  # fmt: skip
+        pairs, rows = ints("tally", "other", "place", "other_place"), doubles("plant_rows", "rigid_rows")
+        answers = doubles("plant_answer", "rigid_answer")
+        self._answering = bind(
+            kernels.answer,
+            [*(shared(x, wp.int32) for x in mj["sparse"][:3]), g_dof, *(shared(x, wp.int32) for x in mj["sparse"][3:]),
+             *pairs, *rows, shared(self._y, float), *(shared(x, wp.float64) for x in mj["factors"])],
+            answers,
+        )  # fmt: skip
+        self._assembling = bind(
+            kernels.assemble, [g_dof, shared(self._dof_parent, wp.int32), *pairs, *rows, *answers], doubles("A")
+        )
+        self._adding = bind(kernels.add_up, [dt, *pairs, rows[0], *doubles("impulse")], doubles("wrench"))
         self._relaxing = bind(
             kernels.relax,
             [softness, SWEEPS, TOLERANCE, *ints("island_first", "island_member"),
