@@ -12,7 +12,9 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
+import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -29,6 +31,7 @@ PER_TREE = 17
 
 
 def cane(side: float) -> Tree:
+    """A horizontal cane with a bunch on its tip."""
     tree = Tree(frames.pose(np.array([0.0, side, 2.0])))
     last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
     tree.add(
@@ -87,7 +90,8 @@ def trajectory(device: str) -> dict[str, np.ndarray]:
     return {"response": kept, "body_q": state.body_q.copy(), "joint_qd": state.joint_qd.copy()}
 
 
-def seconds(work, rounds: int = 5) -> float:
+def seconds(work: Callable[[], None], rounds: int = 5) -> float:
+    """Median of some rounds, the first one left out."""
     work()
     took = []
     for _ in range(rounds):
@@ -98,7 +102,8 @@ def seconds(work, rounds: int = 5) -> float:
 
 
 def say(about: dict, case: str, value: float, unit: str) -> None:
-    print(json.dumps({"bench": "gpu", "case": case, "value": value, "unit": unit} | about), flush=True)
+    sys.stdout.write(json.dumps({"bench": "gpu", "case": case, "value": value, "unit": unit} | about) + "\n")
+    sys.stdout.flush()
 
 
 def main() -> None:
