@@ -81,7 +81,13 @@ def of_load(alpha: float, share: float, **others: float) -> Beam:
 
 
 def elastica(beam: Beam) -> tuple[float, float]:
-    """Where the tip rests, seen from the clamp: (forward, up) [m].
+    """Where the tip rests, seen from the clamp: (forward, up) [m]."""
+    line = elastica_line(beam)
+    return float(line[0, -1]), float(line[1, -1])
+
+
+def elastica_line(beam: Beam) -> np.ndarray:
+    """Where the beam rests, from clamp to tip: (forward, up) [2, point] m.
 
     EI(s) theta' = m, m' = V(s) cos theta, theta(0) = angle, m(L) = 0, with the weight V(s) of all beyond s.
     """
@@ -110,7 +116,7 @@ def elastica(beam: Beam) -> tuple[float, float]:
         )
         assert solution.success, solution.message
         s, y = solution.x, solution.y
-    return float(y[2, -1]), float(y[3, -1])
+    return y[2:]
 
 
 def elastica_by_integrals(alpha: float) -> tuple[float, float]:

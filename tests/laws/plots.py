@@ -1,0 +1,234 @@
+"""``make validation``: draws what the laws compare and writes their figures into docs/validation.md.
+
+Everything comes from the functions that the tests call: ``tests/beams.py`` and the scenes of ``tests/touch_scenes.py``.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import pathlib
+import platform
+
+import beams
+import matplotlib
+import mujoco
+import numpy as np
+import test_contact
+import test_rod_in_space
+import warp as wp
+from touch_scenes import Whole, bunch_scene, grasp, gripper
+
+from vinesim.physics.step import Physics
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+ROOT = pathlib.Path(__file__).parents[2]
+PICTURES = ROOT / "docs" / "pictures"
+PAGE = ROOT / "docs" / "validation.md"
+BEGIN, END = "<!-- laws: written by make validation -->", "<!-- laws end -->"
+INK, GRAPE, LEAF, WOOD, GREY = "#2b2b2b", "#6a2c70", "#4f7942", "#b5651d", "#9a9a9a"
+COLOURS = (GRAPE, LEAF, WOOD, "#2a6f97")
+
+plt.rcParams |= {
+    "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": GREY, "axes.titlesize": 11,
+    "axes.titlelocation": "left", "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK,
+    "legend.frameon": False, "lines.linewidth": 1.6, "savefig.dpi": 130, "axes.grid": True, "grid.color": "#ececec",
+}  # fmt: skip
+
+Table = list[str]
+
+
+def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
+    """Markdown."""
+    return ["| " + " | ".join(cells) + " |" for cells in (head, ("---",) * len(head), *rows)]
+
+
+def save(figure: plt.Figure, name: str) -> None:
+    figure.savefig(PICTURES / f"laws-{name}.png", bbox_inches="tight", facecolor="white")
+    plt.close(figure)
+
+
+def elastica() -> Table:
+    """Canes at rest over alpha: bodies on the elastica, and how far their tips are from it."""
+    figure, (shapes, errors) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(1.15, 1), layout="constrained")
+    loads = (0.5, 1.0, 2.0, 3.5, 6.6, 10.0, 20.0)
+    drawn = [beams.of_load(alpha, 1.0, beta=0.3) for alpha in loads]
+    plants = beams.settle([beam.tree(i) for i, beam in enumerate(drawn)])
+    colours = plt.cm.viridis(np.linspace(0.0, 0.85, len(loads)))
+    for i, (alpha, beam, colour) in enumerate(zip(loads, drawn, colours, strict=True)):
+        line = beams.elastica_line(beam)
+        shapes.plot(*line, color=colour, lw=1.4)
+        joints = plants.state.body_q[plants.model.bodies_of(i)][:, [0, 2]] - np.array([0.0, beams.HEIGHT])
+        shapes.plot(*joints.T, "o", ms=3.2, color=colour)
+        shapes.annotate(f"{alpha:g}", line[:, -1], xytext=(5, -4), textcoords="offset points", fontsize=9)
+    shapes.set(aspect="equal", xlabel="forward [m]", ylabel="up [m]", xlim=(-0.03, 1.12))
+    shapes.set_title("elastica (lines) and 16 bodies (dots) under a tip load, by alpha")
+
+    cases, truth, seen = beams.elastica_sweep()
+    alpha, share, angle = np.array(cases).T
+    straight = np.stack([np.cos(angle), np.sin(angle)], 1)
+    off = 100 * np.linalg.norm(seen - truth, axis=1) / np.linalg.norm(truth - straight, axis=1)
+    kinds = ((0.0, "own weight", LEAF), (0.5, "both", WOOD), (1.0, "tip load", GRAPE))
+    for which, name, colour in kinds:
+        here = share == which
+        errors.plot(alpha[here], off[here], "o", ms=4, alpha=0.75, color=colour, label=name)
+    errors.axhline(0.5, color=INK, lw=1, ls="--")
+    errors.annotate("gate", (0.05, 0.5), xytext=(0, 4), textcoords="offset points", fontsize=9)
+    errors.set(xscale="log", ylim=(0, 0.6), xlabel="alpha = (P + W) L²/EI", ylabel="tip off, % of its travel")
+    errors.set_title(f"{len(cases)} canes clamped at -57 to 57 degrees")
+    errors.legend(loc="lower left")
+    save(figure, "elastica")
+    rows = [(name, f"{off[share == which].max():.2f} %") for which, name, _ in kinds]
+    return table((f"elastica, {len(cases)} canes, alpha 0.05 to 20", "worst tip, share of its travel"), rows)
+
+
+def convergence() -> Table:
+    """Errors over pieces and over time steps, with the slope of two."""
+    figure, (pieces, steps) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    rows = []
+    for (case, errors), colour in zip(beams.errors_over_pieces().items(), COLOURS, strict=True):
+        slope = beams.order([1 / n for n in beams.PIECES], errors)
+        pieces.loglog(beams.PIECES, 1e3 * errors, "o-", color=colour, label=f"{case}: {slope:.2f}")
+        rows.append((case, *(f"{1e3 * e:.3g}" for e in errors), f"{slope:.2f}"))
+    n = np.array(beams.PIECES, float)
+    pieces.loglog(n, 60 * (n / n[0]) ** -2, color=GREY, ls="--", lw=1)
+    pieces.annotate("slope 2", (n[2], 60 * (n[2] / n[0]) ** -2), xytext=(6, 4), textcoords="offset points", fontsize=9)
+    pieces.set(xlabel="bodies of a cane", ylabel="tip off [mm]", xticks=n, xticklabels=beams.PIECES)
+    pieces.minorticks_off()
+    pieces.set_title("resting tip against the elastica: order")
+    pieces.legend(fontsize=9)
+
+    over_dt, dt = beams.errors_over_dt(), 1e3 * np.array(beams.STEPS)
+    slope = beams.order(beams.STEPS, over_dt["frequency"])
+    steps.loglog(dt, 100 * over_dt["frequency"], "o", color=GRAPE, label=f"frequency, % (order {slope:.2f})")
+    steps.loglog(dt, 100 * over_dt["theory"], color=GRAPE, lw=1, ls="--", label="(ω dt)² / 12, the trapezoidal rule's")
+    slope_tip = beams.order(beams.STEPS, over_dt["tip"])
+    steps.loglog(dt, 1e3 * over_dt["tip"], "s-", color=LEAF, label=f"tip after 0.5 s, mm (order {slope_tip:.2f})")
+    steps.set(xlabel="dt [ms]", ylabel="error", xticks=dt, xticklabels=[f"{x:g}" for x in dt])
+    steps.minorticks_off()
+    steps.set_title("a cane of 5 Hz, phi 1/2")
+    steps.legend(fontsize=9)
+    save(figure, "convergence")
+    lines = table(("tip off [mm] with so many bodies", *map(str, beams.PIECES), "order"), rows)
+    head = ("phi 1/2, dt [ms]", *(f"{x:g}" for x in dt), "order")
+    lines += ["", *table(head, [
+        ("frequency off [%]", *(f"{100 * e:.3g}" for e in over_dt["frequency"]), f"{slope:.2f}"),
+        ("tip off after 0.5 s [mm]", *(f"{1e3 * e:.3g}" for e in over_dt["tip"]), f"{slope_tip:.2f}"),
+    ])]  # fmt: skip
+    return lines
+
+
+def damping() -> Table:
+    """Damping ratio asked against seen, at 100 Hz and the shipping phi."""
+    seen, frequency, floor = beams.damping_sweep()
+    asked = np.array(beams.ZETAS)
+    figure, axes = plt.subplots(figsize=(5.4, 4.4), layout="constrained")
+    axes.plot([0, 0.21], [0, 0.21], color=GREY, lw=1, ls="--")
+    axes.fill_between([0, 0.21], [-0.005, 0.205], [0.005, 0.215], color=GREY, alpha=0.18, lw=0, label="gate: 0.005")
+    axes.axhline(floor[0], color=WOOD, lw=1, label=f"floor {floor[0]:.4f} (2.8 Hz, phi 0.55)")
+    axes.plot(asked, seen, "o", color=GRAPE, ms=6, label="seen")
+    axes.set(xlabel="damping ratio asked", ylabel="damping ratio seen", xlim=(0, 0.21), ylim=(0, 0.21), aspect="equal")
+    axes.set_title("first mode of a cane, 100 Hz")
+    axes.legend(loc="upper left")
+    save(figure, "damping")
+    lines = table(
+        ("damping ratio asked", *(f"{z:g}" for z in asked)),
+        [("seen", *(f"{z:.4f}" for z in seen)), ("frequency", *(f"{100 * (f - 1):+.2f} %" for f in frequency))],
+    )
+    f_seen, f_truth = beams.measured_frequencies()
+    off = [f"{100 * (a / b - 1):+.2f} %" for a, b in zip(f_seen, f_truth, strict=True)]
+    return [*lines, "", *table(("frequency at 1 ms", "first", "second", "third"), [("off", *off)])]
+
+
+def grasped() -> Table:
+    """A bunch grasped, lifted, moved, pulled, let go: ours and the same scene wholly in MuJoCo."""
+    model, body, middle = bunch_scene()
+    ours, oracle = Physics(model), Whole(model, gripper(middle))
+    ours.add_robot(gripper(middle))
+    place, force = np.zeros((2, 800, 3)), np.zeros((2, 800))
+    for tick in range(800):
+        target, pull = grasp(0.01 * tick)
+        for rigid in (ours.rigid, oracle.rigid):
+            rigid.command("grip", target)
+            rigid.push("grip", "hand", np.array([0.0, 0.0, pull]))
+        ours.step()
+        oracle.step()
+        place[:, tick] = [test_contact.middle_of(q) for q in (ours.view().body_q[body], oracle.body_q(body))]
+        force[:, tick] = abs(test_contact.force_on(ours, "left")[1]), abs(oracle.force_on("left")[1])
+    time = 0.01 * np.arange(800)
+    figure, (way, press) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
+    for axis, name, colour in ((1, "aside", LEAF), (2, "up", GRAPE)):
+        way.plot(time, 1e3 * (place[1, :, axis] - place[1, 0, axis]), color=colour, lw=3.5, alpha=0.35)
+        way.plot(time, 1e3 * (place[0, :, axis] - place[1, 0, axis]), color=colour, lw=1.2, label=name)
+    way.set_ylabel("bunch [mm]")
+    way.set_title("a bunch grasped, lifted, moved, pulled, let go: vinesim (thin), all in MuJoCo (broad)")
+    way.legend(loc="upper left")
+    press.plot(time, force[1], color=WOOD, lw=3.5, alpha=0.35)
+    press.plot(time, force[0], color=WOOD, lw=1.2)
+    press.set(xlabel="time [s]", ylabel="left finger [N]", ylim=(0, 60))
+    save(figure, "grasp")
+    off = np.linalg.norm(place[0] - place[1], axis=1)[:640].max()
+    held = slice(250, 590)
+    ratio = force[0, held].mean() / force[1, held].mean() - 1
+    return table(("grasp against all in MuJoCo", ""), [
+        ("bunch while held, at worst", f"{1e3 * off:.2f} mm"), ("mean finger force", f"{100 * ratio:+.2f} %")
+    ])  # fmt: skip
+
+
+def energy() -> Table:
+    """Energy of undamped canes over a minute."""
+    figure, axes = plt.subplots(figsize=(7.5, 3.6), layout="constrained")
+    rows = []
+    kicks = {"up and down": (0.0, 0.05, 0.0), "slantwise": (0.0, 0.04, 0.03), "aside": (0.0, 0.0, 0.05)}
+    for (name, kick), colour in zip(kicks.items(), COLOURS, strict=False):
+        seen, fastest = test_rod_in_space.drift(test_rod_in_space.drawn_cane(), np.array(kick))
+        share = 100 * (seen[-100:].mean() / seen[:100].mean() - 1)
+        axes.plot(0.05 * np.arange(len(seen)), 100 * (seen / seen[0] - 1), color=colour, lw=1.2, label=name)
+        rows.append((name, f"{fastest:.2f} rad/s", f"{share:+.2f} %"))
+    axes.axhspan(-1, 1, color=GREY, alpha=0.18, lw=0, label="gate: 1 %")
+    axes.set(xlabel="time [s]", ylabel="energy, % off", ylim=(-4, 2))
+    axes.set_title("undamped cane, phi 1/2, 100 Hz")
+    axes.legend(ncols=4, loc="upper right", fontsize=9)
+    save(figure, "energy")
+    return table(("energy over 60 s, phi 1/2", "fastest body", "drift"), rows)
+
+
+def machine() -> str:
+    """One line: date, processor, versions."""
+    cpu = next(
+        (line.split(":")[1].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")),
+        platform.machine(),
+    )
+    today = datetime.date.today().isoformat()
+    return (
+        f"{today}, {len(os.sched_getaffinity(0))} cores of {cpu}, Python {platform.python_version()}, "
+        f"Warp {wp.__version__}, MuJoCo {mujoco.__version__}"
+    )
+
+
+def _lines(path: str) -> list[str]:
+    file = pathlib.Path(path)
+    return file.read_text().splitlines() if file.exists() else []
+
+
+def main() -> None:
+    """Draw all and put the tables between the markers."""
+    PICTURES.mkdir(exist_ok=True)
+    lines = [f"By `make validation`: {machine()}."]
+    sections = (
+        ("elastica", elastica, "canes at rest over alpha"),
+        ("convergence", convergence, "convergence in bodies and dt"),
+        ("damping", damping, "damping ratio asked against seen"), ("energy", energy, "energy over a minute"),
+        ("grasp", grasped, "a grasp against the same scene in MuJoCo"),
+    )  # fmt: skip
+    for name, draw, text in sections:
+        print(name, flush=True)
+        lines += ["", f"![{text}](pictures/laws-{name}.png)", "", *draw()]
+    before, rest = PAGE.read_text().split(BEGIN)
+    PAGE.write_text("\n".join([before + BEGIN, "", *lines, "", END + rest.split(END)[1]]))
+
+
+if __name__ == "__main__":
+    main()

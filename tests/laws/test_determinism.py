@@ -1,0 +1,99 @@
+"""The same run twice is the same to the bit: plants, contacts, grasp, cut, fall, sleep and waking, a stopped tree."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+
+from vinesim.physics import bench_scenes as scenes
+from vinesim.physics.step import Physics
+from vinesim.world.generate import generate
+from vinesim.world.scene import load
+
+HERE = pathlib.Path(__file__)
+
+
+def digest(physics: Physics, h: hashlib._Hash) -> None:
+    """Everything that the next tick depends on, and what others are told."""
+    state = physics.state
+    for name in state.dims():
+        h.update(np.ascontiguousarray(getattr(state, name)).tobytes())
+    h.update(physics.rigid.data.qpos.tobytes() + physics.rigid.data.qvel.tobytes())
+    for contact in physics.contacts:
+        h.update(repr((contact.actor, contact.link, contact.body)).encode())
+        h.update(contact.force.tobytes() + contact.position.tobytes())
+    h.update(physics.plants.awake.tobytes() + repr([(p.body, p.cause) for p in physics.partings]).encode())
+
+
+def a_day() -> tuple[str, dict[str, int]]:
+    """Hash of three hundred ticks, and how often each thing happened in them."""
+    seen = dict.fromkeys(("contacts", "partings", "woken", "rested", "stopped"), 0)
+    h = hashlib.blake2b(digest_size=16)
+    physics = Physics(scenes.row(5))
+    robots = [scenes.bar("bar", 0, 2), scenes.hand("hand", scenes.bunch_at(2))]
+    for robot in robots:
+        physics.add_robot(robot)
+    physics.sleep.patience = 20
+    for tick in range(300):
+        slowly = min(1.0, tick / 60)
+        physics.rigid.command("bar", np.array([0.06 * slowly if tick < 150 else 0.0]))
+        physics.rigid.command("hand", slowly * np.array([0.05, 0.05, 0.05]) * (tick < 220))
+        if tick == 120:
+            physics.pick(2)  # in the hand
+        if tick == 140:
+            physics.cut(3 * 19 + 8)  # half a cane falls
+        if tick == 160:
+            physics.plants.wake(4)
+            physics.plants.body_load[4 * 19 + 12, 1] = np.nan
+        before = physics.plants.awake
+        physics.step()
+        seen["contacts"] += len(physics.contacts)
+        seen["partings"] += len(physics.partings)
+        seen["woken"] += len(np.setdiff1d(physics.plants.awake, before))
+        seen["rested"] += len(np.setdiff1d(before, physics.plants.awake))
+        seen["stopped"] = int(physics.guard.count.sum())
+        digest(physics, h)
+    return h.hexdigest(), seen
+
+
+def a_vineyard() -> str:
+    """Hash of the demo's vineyard, kicked, for half a second."""
+    model = generate(load("demo"))
+    h = hashlib.blake2b(model.digest().encode(), digest_size=16)
+    physics = Physics(model)
+    physics.plants.wake(np.arange(0, len(model.tree_first), 3))
+    physics.state.joint_qd[:] = np.random.default_rng(5).normal(size=physics.state.joint_qd.shape)
+    for _ in range(50):
+        physics.step()
+        digest(physics, h)
+    return h.hexdigest()
+
+
+def test_two_runs_in_one_process() -> None:
+    first, seen = a_day()
+    assert min(seen.values()) > 0, seen  # everything did happen
+    assert a_day() == (first, seen)
+    assert a_vineyard() == a_vineyard()
+
+
+def test_two_runs_in_two_processes() -> None:
+    """Other hash seeds, other addresses, the same bits."""
+    path = os.pathsep.join([str(HERE.parents[2]), os.environ.get("PYTHONPATH", "")])
+    runs = [
+        subprocess.run(
+            [sys.executable, str(HERE)], capture_output=True, text=True, check=True, timeout=120,
+            env=os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": path},
+        ).stdout.splitlines()[-1]
+        for seed in ("1", "2")
+    ]  # fmt: skip
+    assert runs[0] == runs[1]
+    assert runs[0] == f"{a_day()[0]} {a_vineyard()}"
+
+
+if __name__ == "__main__":
+    print(a_day()[0], a_vineyard())
