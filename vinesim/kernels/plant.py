@@ -298,17 +298,19 @@ def free(
         if area > 0.0:
             wind = tree_air[tree] - velocity - slip
             c = blown(area, wind)
-            J_out[k] += at_lever(dt * c, com)
+            J_out[k] += at_lever(dt * c, com) + reach * taut(com, c * wind)
             H_out[k] += dt * c * wp.skew(com)
             M_out[k] += dt * c * wp.identity(n=3, dtype=float)
-            bias_out[k] += wp.spatial_vector(-c * wind, -c * wp.cross(com, wind))
+            bias_out[k] += wp.spatial_vector(-c * wind, -c * wp.cross(com + ahead * slip, wind))
+            drawn_out[k] += c * wind
         for t in range(tie_first[k], tie_first[k + 1]):
             at = rotation * tie_point[t]
             stretch = wp.transform_get_translation(above) + lever + at - tie_anchor[t]
             tie = tie_stiffness[t]
             damper = remaining(tie_damping[t], tie, phi, dt)
             grip = phi * dt * (phi * dt * tie + damper)
-            hold = tied(tie, damper, stretch, velocity + wp.cross(omega, at), phi, dt)
+            swing = wp.cross(omega, at)
+            hold = tied(tie, damper, stretch, velocity + swing, phi, dt) - grip * wp.cross(omega, swing)
             J_out[k] += at_lever(grip, at)
             H_out[k] += grip * wp.skew(at)
             M_out[k] += grip * wp.identity(n=3, dtype=float)
@@ -590,7 +592,9 @@ def integrate(
         if square > fastest or square != square:  # NaN enters, and stays
             fastest = square
         if body_parent[k] < 0 and body_root[k] >= 0:
-            falling = wp.max(falling, wp.length_sq(joint_xd_free[k]))
+            square = wp.length_sq(joint_xd_free[k]) + 0.0 * wp.length_sq(joint_x[k])
+            if square > falling or square != square:
+                falling = square
     tree_rate_out[tree] = wp.sqrt(fastest + falling)
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
     sound = fastest + falling <= bound * bound
@@ -653,8 +657,9 @@ def held(
         tie = tie_stiffness[t]
         damper = remaining(tie_damping[t], tie, phi, dt)
         grip = phi * dt * (phi * dt * tie + damper)
-        force = tied(tie, damper, stretch, velocity + wp.cross(omega, at), phi, dt)
-        force = force - grip * (a + wp.cross(alpha, at))
+        swing = wp.cross(omega, at)
+        force = tied(tie, damper, stretch, velocity + swing, phi, dt)
+        force = force - grip * (a + wp.cross(alpha, at) + wp.cross(omega, swing))
         wrench += wp.spatial_vector(force, wp.cross(at, force))
     return wrench
 

@@ -53,6 +53,8 @@ class Guard:
         bodies = plants.bodies_of(stopped)
         unsound = bodies[~np.isfinite(state.joint_q[bodies]).all(-1)]  # somebody wrote a bad pose: no good one is left
         state.joint_q[unsound] = plants.model.joint_settled[unsound]
+        lost = bodies[~np.isfinite(state.joint_x[bodies]).all(-1)]
+        state.joint_x[lost] = plants.model.tree_pose[plants.model.body_tree[lost], :3]
         loads = plants.body_load[bodies]
         plants.body_load[bodies] = np.where(np.isfinite(loads), loads, 0.0)
         plants.rest(stopped)
