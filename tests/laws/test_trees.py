@@ -590,7 +590,7 @@ def vine() -> tuple[Tree, list[int]]:
                     length=0.15,
                     stiffness=[1.5] * 3,
                     damping=[0.03] * 3,
-                )  # fmt: skip
+                )
             )
     return tree, bunches
 

@@ -1,10 +1,13 @@
-"""Contacts between plants and rigid bodies: who is close, how contacts couple, which impulses keep them apart.
+"""Contacts of plants with rigid bodies and each other: who is close, how contacts couple, what keeps them apart.
 
 A plant's shape is a segment with a radius (a sphere when both ends agree), a rigid body's is one of MuJoCo's
 primitives. One function gives the distance and direction from a point to a primitive; along a segment that distance
 is convex, so one bisection of its slope finds where the two are closest, for every pair of kinds alike.
 
-Contacts are solved for impulses at the end of the tick, in double precision: normal n (from the rigid body to the
+A contact has a plant's shape on its one side; on the other a rigid shape (its number) or another plant's (-1 - its
+number). What overlaps as drawn, or stands that close, is held apart only from there on.
+
+Contacts are solved for impulses at the end of the tick, in double precision: normal n (from the other side to the
 plant) and two tangents, a Coulomb cone, an implicit spring and damper in each direction, and for friction an *anchor*:
 the stretch that remembers where a sticking contact began.
 """
@@ -13,10 +16,20 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+PLANE = wp.constant(0)
 SPHERE = wp.constant(2)
 CAPSULE = wp.constant(3)
 ELLIPSOID = wp.constant(4)
 CYLINDER = wp.constant(5)
+
+# what is counted in one tick: awake trees, hits, hits without room, trees that are struck, plant bodies in contact,
+# and whether constraints of MuJoCo's own bind what is touched
+TREES = wp.constant(0)
+HITS = wp.constant(1)
+MISSED = wp.constant(2)
+STRUCK = wp.constant(3)
+BODIES = wp.constant(4)
+BOUND = wp.constant(5)
 
 SKIN = wp.constant(wp.float64(0.002))
 """Contacts are seen from this gap on [m], and from as far as the two can come together in one tick."""
@@ -28,6 +41,10 @@ ABRUPT = wp.constant(wp.float64(0.3))
 """[m/s] A contact that closes faster is a blow."""
 
 vec5d = wp.types.vector(length=5, dtype=wp.float64)
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
+
+BLOCK = wp.constant(32)
+"""So many things that do not move share one box, and are sorted out by one comparison."""
 
 BISECTIONS = wp.constant(30)
 FASTEST_EXIT = wp.constant(wp.float64(1.0))
@@ -40,6 +57,8 @@ def distance(kind: int, size: wp.vec3d, p: wp.vec3d):
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     tiny = wp.float64(1.0e-12)
+    if kind == PLANE:
+        return wp.vec4d(zero, zero, one, p[2])
     if kind == SPHERE or kind == CAPSULE:
         q = wp.vec3d(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
         length = wp.length(q)
@@ -145,6 +164,41 @@ def nearest(kind: int, size: wp.vec3d, rotation: wp.mat33d, middle: wp.vec3d, a:
 
 
 @wp.func
+def crossing(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """World normal (0 to 2) and distance (3) from the segment c d to a b, where on a b that is (4), where on c d (5)."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    tiny = wp.float64(1.0e-12)
+    u = b - a
+    v = d - c
+    w = a - c
+    uu = wp.dot(u, u)
+    vv = wp.dot(v, v)
+    uv = wp.dot(u, v)
+    uw = wp.dot(u, w)
+    vw = wp.dot(v, w)
+    s = zero
+    spread = uu * vv - uv * uv
+    if spread > tiny * uu * vv:
+        s = wp.clamp((uv * vw - vv * uw) / spread, zero, one)
+    elif uu > tiny and vv > tiny:  # side by side: the middle of where both run
+        low = wp.clamp(wp.min(-uw, uv - uw) / uu, zero, one)
+        high = wp.clamp(wp.max(-uw, uv - uw) / uu, zero, one)
+        s = wp.float64(0.5) * (low + high)
+    t = zero
+    if vv > tiny:
+        t = wp.clamp((uv * s + vw) / vv, zero, one)
+    if uu > tiny:
+        s = wp.clamp((uv * t - uw) / uu, zero, one)
+    between = w + s * u - t * v
+    length = wp.length(between)
+    n = wp.vec3d(zero, zero, one)
+    if length > tiny:
+        n = between / length
+    return vec6d(n[0], n[1], n[2], length, s, t)
+
+
+@wp.func
 def turn(angle: wp.vec3d, rotation: wp.mat33d):
     """A rotation turned by a small angle, to second order."""
     columns = wp.transpose(rotation)
@@ -217,6 +271,12 @@ def bound_geoms(
 
 
 @wp.func
+def here(when: int, fine: bool):
+    """Whether a shape counts: always (0), while its tree is coarse (1), while it is fine (2)."""
+    return when == 0 or (when == 2) == fine
+
+
+@wp.func
 def ahead(dt: float, pose: wp.transform, motion: wp.spatial_vector, bend: wp.spatial_vector, point: wp.vec3):
     """Where a point of a body will be after a tick, to second order in the tick."""
     arm = point - wp.transform_get_translation(pose)
@@ -232,9 +292,11 @@ def bound_trees(
     dt: float,
     tree_first: wp.array(dtype=wp.int32),
     tree_size: wp.array(dtype=wp.int32),
+    tree_core: wp.array(dtype=wp.int32),
     body_parent: wp.array(dtype=wp.int32),
     tree_shape: wp.array(dtype=wp.int32),
     shape_body: wp.array(dtype=wp.int32),
+    shape_when: wp.array(dtype=wp.int32),
     shape_start: wp.array(dtype=wp.vec3),
     shape_end: wp.array(dtype=wp.vec3),
     shape_radius: wp.array(dtype=float),
@@ -243,6 +305,7 @@ def bound_trees(
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
     body_cut: wp.array(dtype=wp.bool),
+    tree_fine: wp.array(dtype=wp.bool),
     # out
     bend_out: wp.array(dtype=wp.spatial_vector),
     start_out: wp.array(dtype=wp.vec3),
@@ -257,7 +320,11 @@ def bound_trees(
     tree = trees[wp.tid()]
     # bend: the acceleration of a body while all joints turn steadily
     first = tree_first[tree]
-    for k in range(first, first + tree_size[tree]):
+    fine = tree_fine[tree]
+    size = tree_size[tree]
+    if not fine:
+        size = tree_core[tree]
+    for k in range(first, first + size):
         above = body_parent[k]
         bend = wp.spatial_vector()
         if above >= 0 and not body_cut[k]:
@@ -281,9 +348,10 @@ def bound_trees(
         end = wp.transform_point(pose, shape_end[s])
         reach = wp.max(wp.length(shape_start[s]), wp.length(shape_end[s])) + shape_radius[s]
         speed = wp.length(wp.spatial_top(motion)) + reach * wp.length(wp.spatial_bottom(motion))
-        grown = wp.vec3(shape_radius[s] + speed * dt)
-        low = wp.min(low, wp.min(start, end) - grown)
-        high = wp.max(high, wp.max(start, end) + grown)
+        if here(shape_when[s], fine):
+            grown = wp.vec3(shape_radius[s] + speed * dt)
+            low = wp.min(low, wp.min(start, end) - grown)
+            high = wp.max(high, wp.max(start, end) + grown)
         start_out[s] = start
         end_out[s] = end
         start_ahead_out[s] = ahead(dt, pose, motion, bend_out[body], start)
@@ -343,6 +411,8 @@ def reach(
     actor_copy: wp.array(dtype=wp.bool),
     # in
     tree_told: wp.array(dtype=wp.bool),
+    block_low: wp.array(dtype=wp.vec3),
+    block_high: wp.array(dtype=wp.vec3),
     tree_low: wp.array(dtype=wp.vec3),
     tree_high: wp.array(dtype=wp.vec3),
     actor_low: wp.array(dtype=wp.vec3),
@@ -352,18 +422,55 @@ def reach(
     # out
     near_out: wp.array(dtype=wp.bool),
 ):
-    """Say of one tree whether some shape of an actor reaches into its box; a copy counts only at trees told of."""
-    tree = wp.tid()
-    low = tree_low[tree]
-    high = tree_high[tree]
-    near = bool(False)
+    """Mark those trees of one block into whose box a shape of an actor reaches; a copy counts only at trees told of."""
+    block = wp.tid()
     for actor in range(actor_first.shape[0] - 1):
-        counts = tree_told[tree] or not actor_copy[actor]
-        if counts and not apart(low, high, actor_low[actor], actor_high[actor]):
-            for g in range(actor_first[actor], actor_first[actor + 1]):
-                if not apart(low, high, geom_low[g], geom_high[g]):
-                    near = True
-    near_out[tree] = near
+        if not apart(block_low[block], block_high[block], actor_low[actor], actor_high[actor]):
+            for tree in range(block * BLOCK, wp.min((block + 1) * BLOCK, tree_low.shape[0])):
+                low = tree_low[tree]
+                high = tree_high[tree]
+                counts = tree_told[tree] or not actor_copy[actor]
+                if counts and not near_out[tree] and not apart(low, high, actor_low[actor], actor_high[actor]):
+                    for g in range(actor_first[actor], actor_first[actor + 1]):
+                        if not apart(low, high, geom_low[g], geom_high[g]):
+                            near_out[tree] = True
+
+
+@wp.kernel
+def bound_blocks(
+    # in
+    blocks: wp.array(dtype=wp.int32),
+    low: wp.array(dtype=wp.vec3),
+    high: wp.array(dtype=wp.vec3),
+    # out
+    low_out: wp.array(dtype=wp.vec3),
+    high_out: wp.array(dtype=wp.vec3),
+):
+    """Find the box around the boxes of one block."""
+    block = blocks[wp.tid()]
+    lowest = wp.vec3(1.0e30)
+    highest = wp.vec3(-1.0e30)
+    for i in range(block * BLOCK, wp.min((block + 1) * BLOCK, low.shape[0])):
+        lowest = wp.min(lowest, low[i])
+        highest = wp.max(highest, high[i])
+    low_out[block] = lowest
+    high_out[block] = highest
+
+
+@wp.func
+def there(when: int, fine: bool, bunch: int, attached: wp.array(dtype=wp.bool)):
+    """Whether a shape of a tree can be touched now."""
+    counts = here(when, fine)
+    if counts and bunch >= 0:
+        counts = attached[bunch]
+    return counts
+
+
+@wp.func
+def velocity_at(pose: wp.transform, motion: wp.spatial_vector, point: wp.vec3d):
+    """World velocity of a body's material at a point."""
+    lever = point - to_double(wp.transform_get_translation(pose))
+    return to_double(wp.spatial_top(motion)) + wp.cross(to_double(wp.spatial_bottom(motion)), lever)
 
 
 @wp.kernel
@@ -371,10 +478,14 @@ def meet(
     # model
     dt: wp.float64,
     slots: int,
+    movable: int,
     tree_shape: wp.array(dtype=wp.int32),
     shape_body: wp.array(dtype=wp.int32),
     shape_bunch: wp.array(dtype=wp.int32),
+    shape_when: wp.array(dtype=wp.int32),
     shape_radius: wp.array(dtype=float),
+    start_drawn: wp.array(dtype=wp.vec3),
+    end_drawn: wp.array(dtype=wp.vec3),
     geom_id: wp.array(dtype=wp.int32),
     geom_kind: wp.array(dtype=wp.int32),
     geom_size: wp.array(dtype=wp.vec3d),
@@ -382,6 +493,7 @@ def meet(
     geom_copy: wp.array(dtype=wp.bool),
     # in
     tree_told: wp.array(dtype=wp.bool),
+    tree_fine: wp.array(dtype=wp.bool),
     bunch_attached: wp.array(dtype=wp.bool),
     trees: wp.array(dtype=wp.int32),
     tree_low: wp.array(dtype=wp.vec3),
@@ -400,42 +512,52 @@ def meet(
     geom_speed: wp.array(dtype=wp.float64),
     geom_low: wp.array(dtype=wp.vec3),
     geom_high: wp.array(dtype=wp.vec3),
+    standing_low: wp.array(dtype=wp.vec3),
+    standing_high: wp.array(dtype=wp.vec3),
     # out
     close_out: wp.array2d(dtype=wp.int32),
+    found_out: wp.array(dtype=wp.int32),
     hit_shape_out: wp.array2d(dtype=wp.int32),
-    hit_geom_out: wp.array2d(dtype=wp.int32),
+    hit_other_out: wp.array2d(dtype=wp.int32),
     hit_gap_out: wp.array2d(dtype=wp.float64),
     hit_room_out: wp.array2d(dtype=wp.float64),
     hit_normal_out: wp.array2d(dtype=wp.vec3d),
     hit_point_out: wp.array2d(dtype=wp.vec3d),
     onset_out: wp.array(dtype=wp.bool),
-    missed_out: wp.array(dtype=wp.int32),
 ):
     """Find where one tree touches rigid shapes or may touch them before the tick ends, by (shape, geom)."""
     i = wp.tid()
     tree = trees[i]
+    fine = tree_fine[tree]
+    low = tree_low[tree]
+    high = tree_high[tree]
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
     close = int(0)  # noqa: RUF046 (Warp's way to say that it will change)
-    for g in range(geom_id.shape[0]):
+    for g in range(movable):
         counts = tree_told[tree] or not geom_copy[g]
-        if counts and not apart(tree_low[tree], tree_high[tree], geom_low[g], geom_high[g]):
+        if counts and not apart(low, high, geom_low[g], geom_high[g]):
             close_out[i, close] = g
             close = close + 1
-    zero = wp.float64(0.0)
+    for block in range(standing_low.shape[0]):
+        if not apart(low, high, standing_low[block], standing_high[block]):
+            from_g = movable + block * BLOCK
+            for g in range(from_g, wp.min(from_g + BLOCK, geom_id.shape[0])):
+                if close < close_out.shape[1] and not apart(low, high, geom_low[g], geom_high[g]):
+                    close_out[i, close] = g
+                    close = close + 1
     onset = bool(False)
     found = int(0)  # noqa: RUF046
     last = tree_shape[tree + 1]
     if close == 0:
         last = tree_shape[tree]
     for s in range(tree_shape[tree], last):
-        there = bool(True)
-        if shape_bunch[s] >= 0:
-            there = bunch_attached[shape_bunch[s]]
-        if there:
+        if there(shape_when[s], fine, shape_bunch[s], bunch_attached):
             radius = wp.float64(shape_radius[s])
             a = to_double(start[s])
             b = to_double(end[s])
-            center = wp.float64(0.5) * (a + b)
-            bound = wp.float64(0.5) * wp.length(b - a) + radius
+            center = half * (a + b)
+            bound = half * wp.length(b - a) + radius
             for k in range(close):
                 g = close_out[i, k]
                 margin = SKIN + (wp.float64(shape_speed[s]) + geom_speed[g]) * dt
@@ -446,48 +568,258 @@ def meet(
                     near = nearest(geom_kind[g], geom_size[g], rotation, middle[g], a, b)
                     gap = near[3] - radius
                     if gap < margin:
-                        if found < slots:
-                            normal = wp.vec3d(near[0], near[1], near[2])
-                            point = a + near[4] * (b - a) - (radius + wp.float64(0.5) * gap) * normal
-                            # how the two would come together if both went on as they go, and where they would touch
-                            body = shape_body[s]
-                            motion = body_qd[body]
-                            spin = to_double(wp.spatial_bottom(motion))
-                            lever = point - to_double(wp.transform_get_translation(body_q[body]))
-                            velocity = to_double(wp.spatial_top(motion)) + wp.cross(spin, lever)
-                            push = geom_velocity[g] + wp.cross(geom_spin[g], point - middle[g])
-                            come = dt * wp.dot(normal, velocity - push)
-                            turned = turn(dt * geom_spin[g], rotation)
+                        normal = wp.vec3d(near[0], near[1], near[2])
+                        point = a + near[4] * (b - a) - (radius + half * gap) * normal
+                        # how the two come together if both go on as they go, and where they are when the tick ends
+                        body = shape_body[s]
+                        velocity = velocity_at(body_q[body], body_qd[body], point)
+                        push = geom_velocity[g] + wp.cross(geom_spin[g], point - middle[g])
+                        come = dt * wp.dot(normal, velocity - push)
+                        wanted = bool(True)
+                        if g >= movable:
+                            drawn = nearest(
+                                geom_kind[g], geom_size[g], rotation, middle[g], to_double(start_drawn[s]),
+                                to_double(end_drawn[s]),
+                            )  # fmt: skip
+                            gap = gap - wp.min(drawn[3] - radius - SKIN, zero)
+                            wanted = gap + wp.min(come, zero) < SKIN
+                        if wanted:
                             later = nearest(
-                                geom_kind[g],
-                                geom_size[g],
-                                turned,
-                                middle[g] + dt * geom_velocity[g],
-                                to_double(start_ahead[s]),
-                                to_double(end_ahead[s]),
-                            )
+                                geom_kind[g], geom_size[g], turn(dt * geom_spin[g], rotation),
+                                middle[g] + dt * geom_velocity[g], to_double(start_ahead[s]), to_double(end_ahead[s]),
+                            )  # fmt: skip
                             normal_later = wp.vec3d(later[0], later[1], later[2])
-                            bent = wp.float64(0.0)
+                            bent = zero
                             if wp.dot(normal, normal_later) > AGREE:
                                 moved = dt * wp.length(velocity - push)
-                                bent = wp.clamp(later[3] - radius - gap - come, -moved, moved)
+                                bent = wp.clamp(later[3] - near[3] - come, -moved, moved)
                                 onto = to_double(start_ahead[s]) + later[4] * to_double(end_ahead[s] - start_ahead[s])
-                                onto = onto - (later[3] - wp.float64(0.5) * gap) * normal_later - dt * velocity
+                                onto = onto - (later[3] - half * gap) * normal_later - dt * velocity
                                 normal = wp.normalize(normal + normal_later)
-                                point = wp.float64(0.5) * (point + onto)
+                                point = half * (point + onto)
                             if gap + come + bent < zero and come < -ABRUPT * dt:
                                 onset = True
-                            hit_shape_out[i, found] = s
-                            hit_geom_out[i, found] = g
-                            hit_gap_out[i, found] = gap
-                            hit_room_out[i, found] = gap + bent
-                            hit_normal_out[i, found] = normal
-                            hit_point_out[i, found] = point
-                        found = found + 1
+                            if found < slots:
+                                hit_shape_out[i, found] = s
+                                hit_other_out[i, found] = g
+                                hit_gap_out[i, found] = gap
+                                hit_room_out[i, found] = gap + bent
+                                hit_normal_out[i, found] = normal
+                                hit_point_out[i, found] = point
+                            found = found + 1
     onset_out[i] = onset
-    missed_out[i] = wp.max(found - slots, 0)
+    found_out[i] = found
     for k in range(wp.min(found, slots), slots):
         hit_shape_out[i, k] = -1
+
+
+@wp.func
+def kin(x: int, y: int, parent: wp.array(dtype=wp.int32)):
+    """Whether two bodies are one, or at most two joints apart."""
+    close = x == y
+    if x >= 0 and y >= 0:
+        up = parent[x]
+        over = parent[y]
+        close = close or up == y or over == x or (up >= 0 and up == over)
+        if up >= 0:
+            close = close or parent[up] == y
+        if over >= 0:
+            close = close or parent[over] == x
+    return close
+
+
+@wp.kernel
+def meet_branches(
+    # model
+    dt: wp.float64,
+    slots: int,
+    body_parent: wp.array(dtype=wp.int32),
+    tree_shape: wp.array(dtype=wp.int32),
+    shape_body: wp.array(dtype=wp.int32),
+    shape_bunch: wp.array(dtype=wp.int32),
+    shape_when: wp.array(dtype=wp.int32),
+    shape_radius: wp.array(dtype=float),
+    start_drawn: wp.array(dtype=wp.vec3),
+    end_drawn: wp.array(dtype=wp.vec3),
+    # in
+    tree_fine: wp.array(dtype=wp.bool),
+    bunch_attached: wp.array(dtype=wp.bool),
+    order: wp.array(dtype=wp.int32),
+    tally: wp.array(dtype=wp.int32),
+    trees: wp.array(dtype=wp.int32),
+    tree_low: wp.array(dtype=wp.vec3),
+    tree_high: wp.array(dtype=wp.vec3),
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
+    start: wp.array(dtype=wp.vec3),
+    end: wp.array(dtype=wp.vec3),
+    start_ahead: wp.array(dtype=wp.vec3),
+    end_ahead: wp.array(dtype=wp.vec3),
+    shape_speed: wp.array(dtype=float),
+    # out
+    found_out: wp.array(dtype=wp.int32),
+    hit_shape_out: wp.array2d(dtype=wp.int32),
+    hit_other_out: wp.array2d(dtype=wp.int32),
+    hit_gap_out: wp.array2d(dtype=wp.float64),
+    hit_room_out: wp.array2d(dtype=wp.float64),
+    hit_normal_out: wp.array2d(dtype=wp.vec3d),
+    hit_point_out: wp.array2d(dtype=wp.vec3d),
+    onset_out: wp.array(dtype=wp.bool),
+):
+    """Find where one tree touches itself (with a bunch) or awake trees behind it in the order of their boxes along x."""
+    place = wp.tid()
+    i = order[place]
+    tree = trees[i]
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    found = found_out[i]
+    for ahead_of in range(place, tally[TREES]):
+        other = trees[order[ahead_of]]
+        if tree_low[other][0] > tree_high[tree][0]:
+            break
+        if not apart(tree_low[tree], tree_high[tree], tree_low[other], tree_high[other]):
+            low = wp.max(tree_low[tree], tree_low[other])
+            high = wp.min(tree_high[tree], tree_high[other])
+            for s in range(tree_shape[tree], tree_shape[tree + 1]):
+                grown = wp.vec3(shape_radius[s] + shape_speed[s] * float(dt))
+                s_low = wp.min(start[s], end[s]) - grown
+                s_high = wp.max(start[s], end[s]) + grown
+                within = not apart(s_low, s_high, low, high)
+                if other == tree:
+                    within = shape_bunch[s] >= 0
+                if within and there(shape_when[s], tree_fine[tree], shape_bunch[s], bunch_attached):
+                    for t in range(tree_shape[other], tree_shape[other + 1]):
+                        radius = shape_radius[s] + shape_radius[t]
+                        margin = radius + 0.002 + (shape_speed[s] + shape_speed[t]) * float(dt)
+                        between = 0.5 * (start[s] + end[s] - start[t] - end[t])
+                        limit = margin + 0.5 * (wp.length(end[s] - start[s]) + wp.length(end[t] - start[t]))
+                        pair = wp.length_sq(between) < limit * limit
+                        if pair and other == tree:
+                            pair = not kin(shape_body[s], shape_body[t], body_parent)
+                            if shape_bunch[t] >= 0:
+                                pair = pair and shape_bunch[t] > shape_bunch[s]
+                        if pair and there(shape_when[t], tree_fine[other], shape_bunch[t], bunch_attached):
+                            a = to_double(start[s])
+                            b = to_double(end[s])
+                            c = to_double(start[t])
+                            d = to_double(end[t])
+                            near = crossing(a, b, c, d)
+                            gap = near[3] - wp.float64(radius)
+                            if near[3] < wp.float64(margin):
+                                drawn = crossing(
+                                    to_double(start_drawn[s]), to_double(end_drawn[s]), to_double(start_drawn[t]),
+                                    to_double(end_drawn[t]),
+                                )  # fmt: skip
+                                normal = wp.vec3d(near[0], near[1], near[2])
+                                reach_s = wp.float64(shape_radius[s]) + half * gap
+                                point = a + near[4] * (b - a) - reach_s * normal
+                                velocity = velocity_at(body_q[shape_body[s]], body_qd[shape_body[s]], point)
+                                push = velocity_at(body_q[shape_body[t]], body_qd[shape_body[t]], point)
+                                come = dt * wp.dot(normal, velocity - push)
+                                gap = gap - wp.min(drawn[3] - wp.float64(radius) - SKIN, zero)
+                                if gap + wp.min(come, zero) < SKIN:
+                                    later = crossing(
+                                        to_double(start_ahead[s]), to_double(end_ahead[s]), to_double(start_ahead[t]),
+                                        to_double(end_ahead[t]),
+                                    )  # fmt: skip
+                                    normal_later = wp.vec3d(later[0], later[1], later[2])
+                                    bent = zero
+                                    if wp.dot(normal, normal_later) > AGREE:
+                                        moved = dt * wp.length(velocity - push)
+                                        bent = wp.clamp(later[3] - near[3] - come, -moved, moved)
+                                        normal = wp.normalize(normal + normal_later)
+                                    if gap + come + bent < zero and come < -ABRUPT * dt:
+                                        onset_out[i] = True
+                                    if found < slots:
+                                        hit_shape_out[i, found] = s
+                                        hit_other_out[i, found] = -1 - t
+                                        hit_gap_out[i, found] = gap
+                                        hit_room_out[i, found] = gap + bent
+                                        hit_normal_out[i, found] = normal
+                                        hit_point_out[i, found] = point
+                                    found = found + 1
+    found_out[i] = found
+
+
+@wp.kernel
+def gather(
+    # model
+    slots: int,
+    # in
+    found: wp.array(dtype=wp.int32),
+    onset: wp.array(dtype=wp.bool),
+    # out
+    hits_out: wp.array(dtype=wp.int32),
+    tally_out: wp.array(dtype=wp.int32),
+):
+    """List the hits of all trees one after the other (one thread does all); of too many only count the rest."""
+    trees = tally_out[TREES]
+    count = int(0)  # noqa: RUF046
+    missed = int(0)  # noqa: RUF046
+    struck = int(0)  # noqa: RUF046
+    for i in range(trees):
+        kept = wp.min(found[i], slots)
+        missed = missed + found[i] - kept
+        if onset[i]:
+            struck = struck + 1
+        for k in range(kept):
+            if count < hits_out.shape[0]:
+                hits_out[count] = i * slots + k
+            count = count + 1
+    tally_out[HITS] = count
+    tally_out[MISSED] = missed
+    tally_out[STRUCK] = struck
+
+
+@wp.kernel
+def index(
+    # model
+    shape_body: wp.array(dtype=wp.int32),
+    # in
+    hits: wp.array(dtype=wp.int32),
+    hit_shape: wp.array(dtype=wp.int32),
+    hit_other: wp.array(dtype=wp.int32),
+    # out
+    tally_out: wp.array(dtype=wp.int32),
+    bodies_out: wp.array(dtype=wp.int32),
+    shape_out: wp.array(dtype=wp.int32),
+    body_out: wp.array(dtype=wp.int32),
+    place_out: wp.array(dtype=wp.int32),
+    other_body_out: wp.array(dtype=wp.int32),
+    other_place_out: wp.array(dtype=wp.int32),
+):
+    """Number the plant bodies that take part in contacts, sorted, each once (one thread does all)."""
+    contacts = tally_out[HITS]
+    count = int(0)  # noqa: RUF046
+    for c in range(contacts):
+        shape = hit_shape[hits[c]]
+        other = hit_other[hits[c]]
+        shape_out[c] = shape
+        body_out[c] = shape_body[shape]
+        other_body_out[c] = -1
+        if other < 0:
+            other_body_out[c] = shape_body[-1 - other]
+        for side in range(2):
+            body = body_out[c]
+            if side == 1:
+                body = other_body_out[c]
+            at = int(count)
+            while at > 0 and bodies_out[at - 1] >= body:
+                at = at - 1
+            if body >= 0 and (at == count or bodies_out[at] != body):
+                for k in range(count - at):
+                    bodies_out[count - k] = bodies_out[count - k - 1]
+                bodies_out[at] = body
+                count = count + 1
+    for c in range(contacts):
+        place_out[c] = 0
+        other_place_out[c] = 0
+        for k in range(count):
+            if bodies_out[k] == body_out[c]:
+                place_out[c] = k
+            if bodies_out[k] == other_body_out[c]:
+                other_place_out[c] = k
+    tally_out[BODIES] = count
 
 
 @wp.kernel
@@ -496,19 +828,21 @@ def couple(
     dt: wp.float64,
     stiffness: wp.float64,
     damping: wp.float64,
+    bark: wp.float64,
+    geom_friction: wp.array(dtype=wp.float64),
     geom_dof: wp.array(dtype=wp.int32),
     geom_root: wp.array(dtype=wp.int32),
     dof_parent: wp.array(dtype=wp.int32),
     # in
     hits: wp.array(dtype=wp.int32),
-    hit_geom: wp.array(dtype=wp.int32),
+    hit_other: wp.array(dtype=wp.int32),
     hit_gap: wp.array(dtype=wp.float64),
     hit_room: wp.array(dtype=wp.float64),
     hit_normal: wp.array(dtype=wp.vec3d),
     hit_point: wp.array(dtype=wp.vec3d),
     contact_shape: wp.array(dtype=wp.int32),
     contact_body: wp.array(dtype=wp.int32),
-    contact_column: wp.array(dtype=wp.int32),
+    other_body: wp.array(dtype=wp.int32),
     body_q: wp.array(dtype=wp.transform),
     body_qd_free: wp.array(dtype=wp.spatial_vector),
     dof_free: wp.array(dtype=wp.float64),
@@ -516,13 +850,14 @@ def couple(
     subtree_com: wp.array(dtype=wp.vec3d),
     known_count: wp.array(dtype=wp.int32),
     known_shape: wp.array(dtype=wp.int32),
-    known_geom: wp.array(dtype=wp.int32),
+    known_other: wp.array(dtype=wp.int32),
     known_push: wp.array(dtype=wp.float64),
     known_rub: wp.array(dtype=wp.vec3d),
     known_anchor: wp.array(dtype=wp.vec3d),
     # out
-    geom_out: wp.array(dtype=wp.int32),
+    other_out: wp.array(dtype=wp.int32),
     gap_out: wp.array(dtype=wp.float64),
+    friction_out: wp.array(dtype=wp.float64),
     point_out: wp.array(dtype=wp.vec3d),
     axes_out: wp.array(dtype=wp.mat33d),
     plant_rows_out: wp.array2d(dtype=wp.float64),
@@ -531,25 +866,36 @@ def couple(
     offset_out: wp.array(dtype=wp.float64),
     impulse_out: wp.array(dtype=wp.float64),
 ):
-    """Write the three rows of one contact into zeroed Jacobians, with its free approach, stored stretch, first guess."""
+    """Write one contact's three rows of the Jacobians (body and other; zeroed for the rigid), free approach, guess."""
     c = wp.tid()
     zero = wp.float64(0.0)
     h = hits[c]
-    g = hit_geom[h]
+    g = hit_other[h]
     n = hit_normal[h]
     x = hit_point[h]
     gap = hit_gap[h]
     t1 = tangent(n)
     t2 = wp.cross(n, t1)
-    geom_out[c] = g
+    other_out[c] = g
     gap_out[c] = gap
     point_out[c] = x
     axes_out[c] = wp.matrix_from_rows(n, t1, t2)
     body = contact_body[c]
     lever = x - to_double(wp.transform_get_translation(body_q[body]))
-    motion = body_qd_free[body]
-    spin = to_double(wp.spatial_bottom(motion))
-    approach = to_double(wp.spatial_top(motion)) + wp.cross(spin, lever)
+    approach = velocity_at(body_q[body], body_qd_free[body], x)
+    friction_out[c] = bark
+    other = other_body[c]
+    other_lever = lever
+    dof = int(-1)  # noqa: RUF046
+    about = lever
+    if g >= 0:
+        friction_out[c] = geom_friction[g]
+        dof = geom_dof[g]
+        about = x - subtree_com[geom_root[g]]
+    else:
+        other_lever = x - to_double(wp.transform_get_translation(body_q[other]))
+        approach = approach - velocity_at(body_q[other], body_qd_free[other], x)
+    last_dof = dof
 
     for r in range(3):
         axis = n
@@ -559,12 +905,15 @@ def couple(
             axis = t2
         row = 3 * c + r
         turn = wp.cross(lever, axis)
-        column = contact_column[c]
         for k in range(3):
-            plant_rows_out[row, column + k] = axis[k]
-            plant_rows_out[row, column + 3 + k] = turn[k]
-        about = x - subtree_com[geom_root[g]]
-        dof = geom_dof[g]
+            plant_rows_out[row, k] = axis[k]
+            plant_rows_out[row, 3 + k] = turn[k]
+        if g < 0:
+            other_turn = wp.cross(other_lever, axis)
+            for k in range(3):
+                plant_rows_out[row, 6 + k] = -axis[k]
+                plant_rows_out[row, 9 + k] = -other_turn[k]
+        dof = last_dof
         carried = zero
         while dof >= 0:
             angular = wp.vec3d(cdof[dof, 0], cdof[dof, 1], cdof[dof, 2])
@@ -585,7 +934,7 @@ def couple(
     else:
         offset_out[3 * c] = wp.max(room * stiffness / give, -FASTEST_EXIT)
     for k in range(known_count[0]):
-        if known_shape[k] == contact_shape[c] and known_geom[k] == g:
+        if known_shape[k] == contact_shape[c] and known_other[k] == g:
             impulse_out[3 * c] = known_push[k]
             impulse_out[3 * c + 1] = wp.dot(t1, known_rub[k])
             impulse_out[3 * c + 2] = wp.dot(t2, known_rub[k])
@@ -594,16 +943,127 @@ def couple(
 
 
 @wp.kernel
+def answer(
+    # model
+    dof_tree: wp.array(dtype=wp.int32),
+    tree_dof: wp.array(dtype=wp.int32),
+    tree_dofs: wp.array(dtype=wp.int32),
+    geom_dof: wp.array(dtype=wp.int32),
+    row_entry: wp.array(dtype=wp.int32),
+    row_entries: wp.array(dtype=wp.int32),
+    entry_dof: wp.array(dtype=wp.int32),
+    # in
+    tally: wp.array(dtype=wp.int32),
+    other: wp.array(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    other_place: wp.array(dtype=wp.int32),
+    plant_rows: wp.array2d(dtype=wp.float64),
+    rigid_rows: wp.array2d(dtype=wp.float64),
+    response: wp.array2d(dtype=float),
+    factor: wp.array(dtype=wp.float64),
+    factor_inverse: wp.array(dtype=wp.float64),
+    plain: wp.array(dtype=wp.float64),
+    plain_inverse: wp.array(dtype=wp.float64),
+    # out
+    plant_answer_out: wp.array2d(dtype=wp.float64),
+    rigid_answer_out: wp.array2d(dtype=wp.float64),
+):
+    """Find how all bodies in contact, and one kinematic tree (if free of constraints), answer one row's impulse."""
+    row = wp.tid()
+    zero = wp.float64(0.0)
+    c = row // 3
+    at = 6 * place[c]
+    over = 6 * other_place[c]
+    branch = other[c] < 0
+    for k in range(6 * tally[BODIES]):
+        moved = zero
+        for j in range(6):
+            moved = moved + plant_rows[row, j] * wp.float64(response[k, at + j])
+        if branch:
+            for j in range(6):
+                moved = moved + plant_rows[row, 6 + j] * wp.float64(response[k, over + j])
+        plant_answer_out[row, k] = moved
+    last = int(-1)  # noqa: RUF046
+    if not branch:
+        last = geom_dof[other[c]]
+    if last >= 0 and tally[BOUND] == 0:
+        tree = dof_tree[last]
+        first = tree_dof[tree]
+        end = first + tree_dofs[tree]
+        for i in range(first, end):
+            rigid_answer_out[row, i] = rigid_rows[row, i]
+        # L^T D L x = b, where MuJoCo keeps it; without anything implicit it leaves M^ unset, which then is M
+        implicit = factor_inverse[last] != zero
+        for k in range(end - first):
+            i = end - 1 - k
+            for e in range(row_entry[i], row_entry[i] + row_entries[i] - 1):
+                scale = plain[e]
+                if implicit:
+                    scale = factor[e]
+                j = entry_dof[e]
+                rigid_answer_out[row, j] = rigid_answer_out[row, j] - scale * rigid_answer_out[row, i]
+        for i in range(first, end):
+            pivot = plain_inverse[i]
+            if implicit:
+                pivot = factor_inverse[i]
+            moved = rigid_answer_out[row, i] * pivot
+            for e in range(row_entry[i], row_entry[i] + row_entries[i] - 1):
+                scale = plain[e]
+                if implicit:
+                    scale = factor[e]
+                moved = moved - scale * rigid_answer_out[row, entry_dof[e]]
+            rigid_answer_out[row, i] = moved
+
+
+@wp.kernel
+def assemble(
+    # model
+    geom_dof: wp.array(dtype=wp.int32),
+    dof_parent: wp.array(dtype=wp.int32),
+    # in
+    tally: wp.array(dtype=wp.int32),
+    other: wp.array(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    other_place: wp.array(dtype=wp.int32),
+    plant_rows: wp.array2d(dtype=wp.float64),
+    rigid_rows: wp.array2d(dtype=wp.float64),
+    plant_answer: wp.array2d(dtype=wp.float64),
+    rigid_answer: wp.array2d(dtype=wp.float64),
+    # out
+    A_out: wp.array2d(dtype=wp.float64),
+):
+    """Write one row of A: how fast the impulses of all contacts part the two bodies of this one along this axis."""
+    row = wp.tid()
+    c = row // 3
+    at = 6 * place[c]
+    over = 6 * other_place[c]
+    last = int(-1)  # noqa: RUF046
+    if other[c] >= 0:
+        last = geom_dof[other[c]]
+    for column in range(3 * tally[HITS]):
+        moved = wp.float64(0.0)
+        for k in range(6):
+            moved = moved + plant_rows[row, k] * plant_answer[column, at + k]
+        if other[c] < 0:
+            for k in range(6):
+                moved = moved + plant_rows[row, 6 + k] * plant_answer[column, over + k]
+        dof = last
+        while dof >= 0:
+            moved = moved + rigid_rows[row, dof] * rigid_answer[column, dof]
+            dof = dof_parent[dof]
+        A_out[row, column] = moved
+
+
+@wp.kernel
 def relax(
     # model
     softness: wp.float64,
     iterations: int,
     tolerance: wp.float64,
-    geom_friction: wp.array(dtype=wp.float64),
     # in
     island_first: wp.array(dtype=wp.int32),
     island_member: wp.array(dtype=wp.int32),
-    geom: wp.array(dtype=wp.int32),
+    friction: wp.array(dtype=wp.float64),
     A: wp.array2d(dtype=wp.float64),
     free: wp.array(dtype=wp.float64),
     offset: wp.array(dtype=wp.float64),
@@ -650,7 +1110,7 @@ def relax(
             fu = impulse_out[u] - ru / step
             fv = impulse_out[v] - rv / step
             rub = wp.sqrt(fu * fu + fv * fv)
-            limit = geom_friction[geom[j]] * push
+            limit = friction[j] * push
             if rub > limit:
                 fu = fu * limit / wp.max(rub, wp.float64(1.0e-30))
                 fv = fv * limit / wp.max(rub, wp.float64(1.0e-30))
@@ -671,7 +1131,7 @@ def remember(
     # in
     count: wp.array(dtype=wp.int32),
     shape: wp.array(dtype=wp.int32),
-    geom: wp.array(dtype=wp.int32),
+    other: wp.array(dtype=wp.int32),
     axes: wp.array(dtype=wp.mat33d),
     A: wp.array2d(dtype=wp.float64),
     free: wp.array(dtype=wp.float64),
@@ -679,7 +1139,7 @@ def remember(
     # out
     force_out: wp.array(dtype=wp.vec3d),
     known_shape_out: wp.array(dtype=wp.int32),
-    known_geom_out: wp.array(dtype=wp.int32),
+    known_other_out: wp.array(dtype=wp.int32),
     known_push_out: wp.array(dtype=wp.float64),
     known_rub_out: wp.array(dtype=wp.vec3d),
     known_anchor_out: wp.array(dtype=wp.vec3d),
@@ -701,9 +1161,37 @@ def remember(
     stretch = -(impulse[n + 1] / dt + damping * slip_u) / stiffness * t1
     stretch = stretch - (impulse[n + 2] / dt + damping * slip_v) / stiffness * t2
     known_shape_out[c] = shape[c]
-    known_geom_out[c] = geom[c]
+    known_other_out[c] = other[c]
     known_push_out[c] = impulse[n]
     known_rub_out[c] = impulse[n + 1] * t1 + impulse[n + 2] * t2
     known_anchor_out[c] = stretch
     if impulse[n] <= wp.float64(0.0):
         known_shape_out[c] = -1
+
+
+@wp.kernel
+def add_up(
+    # model
+    dt: wp.float64,
+    # in
+    tally: wp.array(dtype=wp.int32),
+    other: wp.array(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    other_place: wp.array(dtype=wp.int32),
+    plant_rows: wp.array2d(dtype=wp.float64),
+    impulse: wp.array(dtype=wp.float64),
+    # out
+    wrench_out: wp.array2d(dtype=wp.float64),
+):
+    """Add up the wrenches of all contacts on one plant body."""
+    body = wp.tid()
+    for k in range(6):
+        wrench_out[body, k] = wp.float64(0.0)
+    for row in range(3 * tally[HITS]):
+        force = impulse[row] / dt
+        if place[row // 3] == body:
+            for k in range(6):
+                wrench_out[body, k] = wrench_out[body, k] + force * plant_rows[row, k]
+        if other[row // 3] < 0 and other_place[row // 3] == body:
+            for k in range(6):
+                wrench_out[body, k] = wrench_out[body, k] + force * plant_rows[row, 6 + k]

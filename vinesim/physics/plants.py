@@ -168,6 +168,7 @@ class Plants:
         self.state.joint_xd[bodies] = 0.0
         self.velocity_free[bodies] = 0.0
         self.acceleration[bodies] = 0.0
+        self._wrench[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._onset[trees] = 0
         self.kinematics(trees)

@@ -31,6 +31,8 @@ GIVE = 0.01
 """The tracks hold the base like a spring that reaches its full effort at this offset [m or rad], then they slip."""
 FOLLOW_GIVE = 0.05
 """The same for the copy of a remote robot: how far ahead of the copy the pull starts [m or rad]."""
+WIDE = 1e6
+"""[m] The ground reaches so far from the middle."""
 TRACK_TIME = 0.05
 """Ratio of the base servo's damping to its stiffness [s]."""
 WAITING = 12
@@ -93,7 +95,9 @@ class Loose:
     mass: float
     com: np.ndarray
     inertia: np.ndarray
-    """[3] kg m^2 about the centre of mass."""
+    """[3] kg m^2 about the centre of mass: moments xx, yy, zz."""
+    product: np.ndarray
+    """[3] kg m^2: entries yz, zx, xy."""
     start: np.ndarray
     """[shape, 3] m; a capsule reaches from here to ``end``, a sphere has both in one place."""
     end: np.ndarray
@@ -115,25 +119,25 @@ class Loose:
 
 @dataclasses.dataclass(frozen=True)
 class Geoms:
-    """The shapes of robots and boxes that plants can touch, sorted by MuJoCo geom."""
+    """Rigid shapes that plants can touch, sorted by MuJoCo geom."""
 
     id: np.ndarray
     """[geom] index in MuJoCo's geom arrays."""
     body: np.ndarray
     """[geom] MuJoCo body."""
     kind: np.ndarray
-    """[geom] MuJoCo's type: 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box (meshes stand as their box)."""
+    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box; a mesh stands as its box."""
     size: np.ndarray
     """[geom, 3] as MuJoCo writes it for the kind."""
     half: np.ndarray
-    """[geom, 3] half edges of the box around the shape, in its own axes."""
+    """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`WIDE` and no height."""
     center: np.ndarray
     """[geom, 3] middle of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
     """[geom] of the bounding sphere about the middle."""
     friction: np.ndarray
     dof: np.ndarray
-    """[geom] last degree of freedom that moves it; its ancestors follow ``dof_parentid``."""
+    """[geom] last degree of freedom that moves it (-1: none); its ancestors follow ``dof_parentid``."""
     root: np.ndarray
     """[geom] root body of its kinematic tree, about whose centre of mass MuJoCo writes ``cvel`` and ``cdof``."""
     actor: tuple[str, ...]
@@ -390,6 +394,17 @@ class Rigid:
             label[:-1] = np.where(d.tree_island >= 0, m.ntree + 1 + d.tree_island, label[:-1])
         return label[m.body_treeid[m.geom_bodyid]]
 
+    def bound(self, bodies: np.ndarray) -> bool:
+        """Whether native constraints that are active now bind one of these MuJoCo bodies [k].
+
+        If not, the metric of the tick is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.
+        """
+        m, d = self.world, self.data
+        if d.nefc == 0:
+            return False
+        tree = m.body_treeid[bodies]
+        return d.nisland == 0 or bool((d.tree_island[tree[tree >= 0]] >= 0).any())
+
     def inverse(self, J: np.ndarray) -> np.ndarray:
         """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
 
@@ -537,6 +552,7 @@ class Rigid:
         self.world.opt.noslip_iterations = 3 if self._bunches else 0
         self._links, self._link_body = self._list_links()
         self.geoms = self._list_geoms()
+        self.standing = self._list_standing()
 
     def _embody(self, bunch: int, alone: mujoco.MjModel) -> None:
         """Give the waiting body of a bunch its weight and shapes, with all constants that MuJoCo derives from them.
@@ -606,6 +622,17 @@ class Rigid:
             owner.update({body: (name, link) for link, body in robot.bodies.items()})
         owner.update({m.body(f"loose/{slot}").id: (f"bunch/{i}", "bunch") for i, slot in self._slot.items()})
         ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] in owner and m.geom_contype[g]], int)
+        return self._geoms(ids, [owner[int(b)] for b in m.geom_bodyid[ids]])
+
+    def _list_standing(self) -> Geoms:
+        """Ground, poles and trunks."""
+        m = self.world
+        ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] == 0 and m.geom_contype[g]], int)
+        return self._geoms(ids, [("world", m.geom(g).name) for g in ids.tolist()])
+
+    def _geoms(self, ids: np.ndarray, names: list[tuple[str, str]]) -> Geoms:
+        """What touching must know of some geoms; ``names``: actor and link of each."""
+        m = self.world
         last = np.full(m.nbody, -1)
         for body in range(1, m.nbody):
             count = m.body_dofnum[body]
@@ -620,7 +647,8 @@ class Rigid:
         half[round_] = size[round_, :1] + size[round_, 1:2] * [0.0, 0.0, 1.0]
         cylinder = kind == mujoco.mjtGeom.mjGEOM_CYLINDER
         half[cylinder] = size[cylinder][:, [0, 0, 1]]
-        names = [owner[int(b)] for b in body]
+        plane = kind == mujoco.mjtGeom.mjGEOM_PLANE
+        half[plane], radius[plane] = (WIDE, WIDE, 0.0), np.inf
         return Geoms(
             id=ids.astype(np.int32),
             body=body.astype(np.int32),
@@ -790,7 +818,10 @@ def _drop(spec: mujoco.MjSpec, loose: Loose) -> None:
     """A bunch as a free body of round shapes, hard enough not to creep out of a gripper."""
     if not 0 < len(loose.radius) <= LUMPS:
         raise ValueError(f"a bunch of {len(loose.radius)} shapes; a loose one has 1 to {LUMPS}")
-    body = spec.worldbody.add_body(mass=loose.mass, ipos=loose.com, inertia=loose.inertia, explicitinertial=True)
+    yz, zx, xy = loose.product
+    body = spec.worldbody.add_body(
+        mass=loose.mass, ipos=loose.com, fullinertia=[*loose.inertia, xy, zx, yz], explicitinertial=True
+    )
     body.add_freejoint()
     for start, end, radius in zip(loose.start, loose.end, loose.radius, strict=True):
         kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}

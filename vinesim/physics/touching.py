@@ -12,10 +12,11 @@ import dataclasses
 import numpy as np
 import warp as wp
 
+from vinesim import frames
 from vinesim.kernels import contact as kernels
 from vinesim.kernels.launch import bind
 from vinesim.physics.plants import Plants
-from vinesim.physics.rigid import Rigid
+from vinesim.physics.rigid import FRICTION, WIDE, Geoms, Rigid
 from vinesim.world.model import Model
 from vinesim.world.values import Contact
 
@@ -29,6 +30,11 @@ SLOTS = 64
 """Contacts that one tree can have at once."""
 ISLANDS = 24
 """Up to so many contacts are solved as one block; more are parted into islands that do not feel each other."""
+CLOSE = 256
+"""Standing things that can be close to one tree at once."""
+NOBODY = np.iinfo(np.int32).max
+"""In place of a geom that is gone."""
+BLOCK = int(kernels.BLOCK)
 STIR = 1e-3
 """[m/s] A box or a loose bunch slower than this wakes nobody."""
 
@@ -42,7 +48,9 @@ class Shapes:
     body: np.ndarray
     """[shape]"""
     bunch: np.ndarray
-    """[shape] the bunch it belongs to, -1 for wood."""
+    """[shape] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left is in nobody's way."""
+    when: np.ndarray
+    """[shape] 0: always there; 1: while its tree is coarse; 2: while it is fine (see ``State.tree_fine``)."""
     start: np.ndarray
     """[shape, 3] m, in the body's frame; equal to ``end`` for a sphere."""
     end: np.ndarray
@@ -51,39 +59,47 @@ class Shapes:
 
 
 def shapes_of(model: Model) -> Shapes:
-    """A capsule for each piece of wood and a few spheres for each bunch.
+    """A capsule for each piece of wood, a few spheres for each bunch, a capsule or sphere for each of its clusters.
 
     The spheres are the largest that fit a spheroid of the bunch's length and radius: a ball of radius
     R sqrt(1 - c^2 / (a^2 - R^2)) about each point c of the axis between its centres of curvature (a: half length).
+    They stand for a bunch without clusters, and for one with clusters while its tree is coarse.
     """
-    body, bunch, start, end, radius = [], [], [], [], []
+    parts: list[tuple[int, int, int, float, float, float]] = []  # body, bunch, when, start and end along x, radius
     of_body = {int(b): i for i, b in enumerate(model.bunch_body)}
-    for b in range(len(model.body_mass)):
+    of_cluster = {
+        int(first) + k: i
+        for i, (first, count) in enumerate(zip(model.bunch_cluster, model.bunch_clusters, strict=True))
+        for k in range(count)
+    }
+    stalk_of = model.bunch_of().tolist()
+    lengths, radii = model.body_length.tolist(), model.body_radius.mean(1).tolist()
+    for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
         if b in of_body:
             i = of_body[b]
+            when = int(model.bunch_clusters[i] > 0)
             a, r = 0.5 * float(model.bunch_length[i]), float(model.bunch_radius[i])
             furthest = (a * a - r * r) / a if a > r else 0.0
             count = min(1 + 2 * int(np.ceil(furthest / r - 1e-6)), 7) if furthest > 1e-6 else 1
             for c in np.linspace(-furthest, furthest, count) if count > 1 else [0.0]:
-                body.append(b)
-                bunch.append(i)
-                start.append((a + c, 0.0, 0.0))
-                end.append((a + c, 0.0, 0.0))
-                radius.append(min(a, r) * np.sqrt(1.0 - c * c / (a * a - r * r)) if count > 1 else min(a, r))
+                ball = min(a, r) * np.sqrt(1.0 - c * c / (a * a - r * r)) if count > 1 else min(a, r)
+                parts.append((b, i, when, a + c, a + c, ball))
+        elif b in of_cluster:
+            half = 0.5 * length
+            inset = min(thick, half)
+            parts.append((b, of_cluster[b], 2, inset, length - inset, thick))
         else:
-            body.append(b)
-            bunch.append(-1)
-            start.append((0.0, 0.0, 0.0))
-            end.append((float(model.body_length[b]), 0.0, 0.0))
-            radius.append(float(model.body_radius[b].mean()))
-    tree = np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))) if body else np.zeros(1)
+            parts.append((b, stalk_of[b], 0, 0.0, length, thick))
+    body, bunch, when, start, end, radius = (np.array(column) for column in zip(*parts, strict=True))
+    along = np.array([1.0, 0.0, 0.0], np.float32)
     return Shapes(
-        tree=np.asarray(tree, np.int32),
-        body=np.array(body, np.int32),
-        bunch=np.array(bunch, np.int32),
-        start=np.array(start, np.float32).reshape(-1, 3),
-        end=np.array(end, np.float32).reshape(-1, 3),
-        radius=np.array(radius, np.float32),
+        tree=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),
+        body=body.astype(np.int32),
+        bunch=bunch.astype(np.int32),
+        when=when.astype(np.int32),
+        start=start.astype(np.float32)[:, None] * along,
+        end=end.astype(np.float32)[:, None] * along,
+        radius=radius.astype(np.float32),
     )
 
 
@@ -93,17 +109,29 @@ class Touching:
     ``find()`` (before ``plants.free()``) wakes whatever a rigid body comes near; ``solve()`` (after it) leaves
     ``bodies`` and ``wrenches`` for ``plants.commit()`` and ``force`` for ``rigid.finish()``.
 
+    Robots, boxes and loose bunches wake the trees that they come near. What stands (ground, poles, trunks) and other
+    branches only hold back what moves already; what overlaps in the shape as drawn does so only beyond that.
+
     Args:
         capacity: contacts solved in one tick; of more, the deepest are kept, and ``dropped`` and ``complaint`` say so.
         stiffness: [N/m] see :data:`STIFFNESS`.
+        branches: whether branches and bunches of awake trees touch each other too.
     """
 
     def __init__(
-        self, model: Model, plants: Plants, rigid: Rigid, *, capacity: int = 128, stiffness: float = STIFFNESS
+        self,
+        model: Model,
+        plants: Plants,
+        rigid: Rigid,
+        *,
+        capacity: int = 128,
+        stiffness: float = STIFFNESS,
+        branches: bool = True,
     ) -> None:
         self.model, self.plants, self.rigid = model, plants, rigid
         self.dt, self.capacity = rigid.dt, capacity
         self.stiffness, self.damping = stiffness, 2.0 * stiffness * rigid.dt
+        self.branches = branches
         self.shapes = shapes_of(model)
         self.count = 0
         """Contacts of the last tick, those that do not press included."""
@@ -130,7 +158,11 @@ class Touching:
         self._awake = np.zeros(0, np.int32)
         self._allocate()
         self._renew()
+        drawn = model.forward(model.joint_settled)[self.shapes.body]
+        for kept, end in ((self._start_drawn, self.shapes.start), (self._end_drawn, self.shapes.end)):
+            kept[:] = drawn[:, :3] + frames.rotate(drawn[:, 3:], end.astype(float))
         self._bound(np.arange(len(model.tree_first), dtype=np.int32))
+        self._bound_tree_blocks(np.arange(len(self._block_low), dtype=np.int32))
 
     # ------------------------------------------------------------------ the two halves of a tick
 
@@ -141,9 +173,15 @@ class Touching:
         fallen_asleep = self._awake[~self.plants.state.tree_awake[self._awake]]
         if len(fallen_asleep):
             self._bound(fallen_asleep)
-        self._bound_geoms(len(self._geoms.id))
+            self._bound_tree_blocks(np.unique(fallen_asleep // BLOCK))
+        if self._standing_bound:
+            self._bound_geoms(self._movable)
+        else:
+            self._bound_geoms(len(self._geoms.id))
+            self._bound_standing()
         self._bound_actors(len(self._actor_lies))
-        self._reach(len(self._near))
+        self._near[:] = False
+        self._reach(len(self._block_low))
         self.near = np.flatnonzero(self._near)
         if len(self.near) and not self.plants.state.tree_awake[self.near].all():
             self.plants.wake(self.near)
@@ -166,16 +204,20 @@ class Touching:
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """The contacts of the last tick that press, sorted by (tree, body, shape, geom)."""
+        """The contacts of the last tick that press, sorted by (tree, body, shape, other).
+
+        What stands has the actor ``world`` (links ``ground``, ``fixed/7``), another branch the actor ``plants`` (links
+        ``body/42``).
+        """
         if self._values is None:
-            n, geoms = self.count, self._geoms
+            n = self.count
             force, push = self._force[:n], self._impulse[0 : 3 * n : 3]
             self._values = tuple(
                 Contact(
-                    geoms.actor[g], geoms.link[g], int(self._contact_body[c]), self._point[c].copy(), -force[c],
+                    *self._name(other), int(self._contact_body[c]), self._point[c].copy(), -force[c],
                     float(self._gap[c]),
                 )
-                for c, g in enumerate(self._geom[:n].tolist())
+                for c, other in enumerate(self._other[:n].tolist())
                 if push[c] > 0.0
             )  # fmt: skip
         return self._values
@@ -185,6 +227,12 @@ class Touching:
         """(tree, actor) for every tree that somebody presses on in the last tick, sorted."""
         return tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
 
+    def _name(self, other: int) -> tuple[str, str]:
+        """Actor and link of what a plant touches."""
+        if other < 0:
+            return "plants", f"body/{self.shapes.body[-1 - other]}"
+        return self._actor[other], self._link[other]
+
     # ------------------------------------------------------------------ who is close
 
     def _bound(self, trees: np.ndarray) -> None:
@@ -192,26 +240,48 @@ class Touching:
         self._trees[: len(trees)] = trees
         self._bound_trees(len(trees))
 
+    def _bound_tree_blocks(self, blocks: np.ndarray) -> None:
+        """Bring the boxes around some blocks of trees up to their trees."""
+        self._blocks[: len(blocks)] = blocks
+        self._bound_blocks(len(blocks))
+
+    def _bound_standing(self) -> None:
+        """Boxes around blocks of what stands; the ground goes down for ever."""
+        first = self._movable
+        deep = np.flatnonzero(self._geoms.kind[first:] == 0) + first
+        self._geom_low[deep, 2] = -WIDE
+        for block in range(len(self._standing_low)):
+            of = slice(first + BLOCK * block, first + BLOCK * (block + 1))
+            self._standing_low[block], self._standing_high[block] = (
+                self._geom_low[of].min(0),
+                self._geom_high[of].max(0),
+            )
+        self._standing_bound = True
+
     def _meet(self, trees: int) -> None:
         """List the contacts of the trees that were just bounded."""
         if trees > self._room:
             self._make_room(2 * trees)
+        self._tally[kernels.TREES] = trees
         self._meeting(trees)
-        hits = np.flatnonzero(self._hit_shape[:trees].ravel() >= 0)
-        dropped = int(self._missed[:trees].sum())
-        if len(hits) > self.capacity:
-            dropped += len(hits) - self.capacity
+        if self.branches:
+            self._order[:trees] = np.argsort(self._tree_low[self._trees[:trees], 0], kind="stable")
+            self._meeting_branches(trees)
+        self._gathering(1)
+        _, count, missed, _, _, _ = self._tally.tolist()
+        if count > self.capacity:
+            missed += count - self.capacity
+            hits = np.flatnonzero(self._slot < self._found[:trees, None])
             deepest = np.argsort(self._hit_gap.ravel()[hits], kind="stable")[: self.capacity]
-            hits = np.sort(hits[deepest])
-        if dropped:
-            self.dropped += dropped
+            self._hits[:] = np.sort(hits[deepest])
+            self._tally[kernels.HITS] = count = self.capacity
+        if missed:
+            self.dropped += missed
             self.complaint = (
-                f"{dropped} of {len(hits) + dropped} contacts of one tick were left out, the shallowest; there is room "
+                f"{missed} of {count + missed} contacts of one tick were left out, the shallowest; there is room "
                 f"for {self.capacity}, and for {SLOTS} at one tree: raise Touching's capacity or touch less at once"
             )
-        self.count = len(hits)
-        self._hits[: len(hits)] = hits
-        self._contact_shape[: len(hits)] = self._hit_shape.ravel()[hits]
+        self.count = count
 
     def _brace(self, awake: np.ndarray) -> None:
         """Step trees that are about to take a blow with phi = 1 from this tick on.
@@ -219,42 +289,42 @@ class Touching:
         The trapezoidal rule moves a body by the mean of its velocities before and after: what is hit from rest would
         give way only half as far as it must, overlap, and be thrown out again.
         """
-        struck = awake[self._onset[: len(awake)]]
-        if len(struck) and (self.plants.phi_used[struck] < 1.0).any():
-            self.plants.brace(struck)
-            self.plants.free()
+        if self._tally[kernels.STRUCK]:
+            struck = awake[self._onset[: len(awake)]]
+            if (self.plants.phi_used[struck] < 1.0).any():
+                self.plants.brace(struck)
+                self.plants.free()
 
     # ------------------------------------------------------------------ with what force
 
     def _press(self) -> None:
         """Impulses of all contacts at once, and what they do to either side."""
         n, rows = self.count, 3 * self.count
-        shape = self._contact_shape[:n]
-        body = self._contact_body[:n] = self.shapes.body[shape]
-        new = self._new_body[:n]  # they come sorted by body
-        np.not_equal(body[1:], body[:-1], out=new[1:])
-        bodies = body[new]
-        np.multiply(new.cumsum() - 1, 6, out=self._contact_column[:n])
-        columns = 6 * len(bodies)
-        plant_rows, rigid_rows = self._plant_rows[:rows, :columns], self._rigid_rows[:rows]
-        plant_rows[:] = 0.0
+        self._indexing(1)
+        touched = int(self._tally[kernels.BODIES])
+        bodies = self._bodies[:touched]
+        rigid_rows, rigid_answer = self._rigid_rows[:rows], self._rigid_answer[:rows]
         rigid_rows[:] = 0.0
+        rigid_answer[:] = 0.0
         self._dof_free[:] = self.rigid.velocity_free
         self._coupling(n)
 
-        response = self.plants.response(bodies).reshape(columns, columns)
-        A = self._A[:rows, :rows]
-        np.add(plant_rows @ response @ plant_rows.T, rigid_rows @ self.rigid.inverse(rigid_rows), out=A)
+        self._y[: 6 * touched, : 6 * touched] = self.plants.response(bodies).reshape(6 * touched, -1)
+        bound = self._tally[kernels.BOUND] = self.rigid.bound(self._geoms.body[self._other[:n].clip(0)])
+        self._answering(rows)
+        if bound:
+            rigid_answer[:] = self.rigid.inverse(rigid_rows).T
+        self._assembling(rows)
         islands = self._part(n)
         self._relaxing(islands)
         self.sweeps = int(self._sweeps[:islands].max())
 
-        impulse = self._impulse[:rows]
         self._known_count[0] = n
         self._remembering(n)
-        self.bodies = bodies
-        self.wrenches = (impulse @ plant_rows / self.dt).reshape(-1, 6)
-        self.force = impulse @ rigid_rows / -self.dt
+        self._adding(touched)
+        self.bodies = bodies.copy()
+        self.wrenches = self._wrench[:touched].copy()
+        self.force = self._impulse[:rows] @ rigid_rows / -self.dt
         self._values = None
 
     def _part(self, n: int) -> int:
@@ -263,8 +333,10 @@ class Touching:
             self._island_first[1] = n
             self._island_member[:n] = self._every[:n]
             return 1
-        tree = self.model.body_tree[self._contact_body[:n]]
-        thing = self.rigid.group[self._geoms.id[self._geom[:n]]]
+        tree, other = self.model.body_tree[self._contact_body[:n]], self._other[:n]
+        # what stands parts islands: it does not hand on what it feels
+        thing = np.where(other >= self._movable, tree, -1 - self.rigid.group[self._geoms.id[np.maximum(other, 0)]])
+        thing = np.where(other < 0, self.model.body_tree[self._other_body[:n]], thing)
         label: dict[int, int] = {}
 
         def root(x: int) -> int:
@@ -273,7 +345,7 @@ class Touching:
             return x
 
         for t, r in sorted(set(zip(tree.tolist(), thing.tolist(), strict=True))):
-            a, b = sorted((root(t), root(-1 - r)))
+            a, b = sorted((root(t), root(r)))
             label[b] = a
         of_contact = np.array([root(t) for t in tree.tolist()])
         _, member = np.unique(of_contact, return_inverse=True)
@@ -294,17 +366,25 @@ class Touching:
             setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
         self._bend = np.zeros((len(self.model.body_mass), 6), np.float32)
         self._shape_speed = np.zeros(shapes, np.float32)
-        for name in ("hits", "contact_shape", "contact_body", "contact_column", "geom", "known_shape", "known_geom"):
+        for name in ("start_drawn", "end_drawn"):
+            setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
+        blocks = -(-trees // BLOCK)
+        self._blocks = np.zeros(blocks, np.int32)
+        self._block_low, self._block_high = np.zeros((blocks, 3), np.float32), np.zeros((blocks, 3), np.float32)
+        self._order, self._tally = np.zeros(trees, np.int32), np.zeros(6, np.int32)
+        for name in ("hits", "contact_shape", "contact_body", "place", "other", "other_body", "other_place",
+                     "known_shape", "known_other"):  # fmt: skip
             setattr(self, "_" + name, np.zeros(n, np.int32))
-        for name in ("gap", "known_push"):
+        for name in ("gap", "friction", "known_push"):
             setattr(self, "_" + name, np.zeros(n))
         for name in ("point", "known_rub", "known_anchor", "force"):
             setattr(self, "_" + name, np.zeros((n, 3)))
         for name in ("free", "offset", "impulse"):
             setattr(self, "_" + name, np.zeros(3 * n))
         self._axes = np.zeros((n, 3, 3))
-        self._new_body = np.ones(n, np.bool_)
-        self._plant_rows, self._A = np.zeros((3 * n, 6 * n)), np.zeros((3 * n, 3 * n))
+        self._bodies, self._wrench = np.zeros(2 * n + 1, np.int32), np.zeros((2 * n, 6))
+        self._plant_rows, self._A = np.zeros((3 * n, 12)), np.zeros((3 * n, 3 * n))
+        self._y, self._plant_answer = np.zeros((12 * n, 12 * n), np.float32), np.zeros((3 * n, 12 * n))
         self._island_first, self._island_member = np.zeros(n + 1, np.int32), np.zeros(n, np.int32)
         self._sweeps, self._every = np.zeros(n, np.int32), np.arange(n, dtype=np.int32)
         self._known_count = np.zeros(1, np.int32)
@@ -315,9 +395,9 @@ class Touching:
     def _make_room(self, trees: int) -> None:
         """Room for the contacts of so many awake trees."""
         self._room = trees
-        self._close = np.zeros((trees, len(self._geoms.id)), np.int32)
-        self._missed = np.zeros(trees, np.int32)
-        self._hit_shape, self._hit_geom = np.zeros((trees, SLOTS), np.int32), np.zeros((trees, SLOTS), np.int32)
+        self._close = np.zeros((trees, min(len(self._geoms.id), self._movable + CLOSE)), np.int32)
+        self._found, self._slot = np.zeros(trees, np.int32), np.arange(SLOTS)
+        self._hit_shape, self._hit_other = np.zeros((trees, SLOTS), np.int32), np.zeros((trees, SLOTS), np.int32)
         self._onset = np.zeros(trees, np.bool_)
         self._hit_gap, self._hit_room = np.zeros((trees, SLOTS)), np.zeros((trees, SLOTS))
         self._hit_normal, self._hit_point = np.zeros((trees, SLOTS, 3)), np.zeros((trees, SLOTS, 3))
@@ -325,24 +405,38 @@ class Touching:
 
     def _renew(self) -> None:
         """Take over the rigid world after an actor came or went; contacts remember by the names of the geoms."""
-        old, self._geoms = self._geoms, self.rigid.geoms
-        g, d = self._geoms, self.rigid.data
+        old = None if self._geoms is None else self._names
+        move, stand, d = self.rigid.geoms, self.rigid.standing, self.rigid.data
+        both = {f.name: (getattr(move, f.name), getattr(stand, f.name)) for f in dataclasses.fields(move)}
+        g = self._geoms = Geoms(
+            **{k: a + b if isinstance(a, tuple) else np.concatenate([a, b]) for k, (a, b) in both.items()}
+        )
+        self._actor, self._link = g.actor, g.link
+        self._movable, self._standing_bound = len(move.id), False
+        blocks = -(-len(stand.id) // BLOCK)
+        self._standing_low, self._standing_high = (np.zeros((blocks, 3), np.float32) for _ in range(2))
         self._generation = self.rigid.generation
-        names = _names(g)
+        self._names = _names(g)
         if old is not None:
-            at = {name: i for i, name in enumerate(names)}
-            for k, name in enumerate(_names(old)[i] for i in self._known_geom[: self._known_count[0]]):
-                self._known_geom[k] = at.get(name, -1)
+            at = {name: i for i, name in enumerate(self._names)}
+            for k, other in enumerate(self._known_other[: self._known_count[0]].tolist()):
+                if other >= 0:
+                    self._known_other[k] = at.get(old[other], NOBODY)
         count = len(g.id)
         self._geom_middle, self._geom_velocity = np.zeros((count, 3)), np.zeros((count, 3))
         self._geom_spin, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
         self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-        self._rigid_rows = np.zeros((3 * self.capacity, self.rigid.world.nv))
+        self._rigid_rows, self._rigid_answer = (np.zeros((3 * self.capacity, self.rigid.world.nv)) for _ in range(2))
         self._dof_free = np.zeros(self.rigid.world.nv)
         self._dof_parent = self.rigid.world.dof_parentid
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
-        first = [i for i in range(count) if i == 0 or g.actor[i] != g.actor[i - 1]]
-        self._actor_first = np.array([*first, count], np.int32)
+        m = self.rigid.world
+        self._mujoco["sparse"] = (
+            m.dof_treeid, m.tree_dofadr, m.tree_dofnum, m.M_rowadr, m.M_rownnz, m.M_colind
+        )  # fmt: skip
+        self._mujoco["factors"] = (d.qH, d.qHDiagInv, d.qLD, d.qLDiagInv)
+        first = [i for i in range(self._movable) if i == 0 or g.actor[i] != g.actor[i - 1]]
+        self._actor_first = np.array([*first, self._movable], np.int32)
         self._actor_copy = np.array([g.actor[i] in self.copies for i in first], np.bool_)
         self._geom_copy = np.array([actor in self.copies for actor in g.actor], np.bool_)
         self._actor_lies = np.array([g.actor[i] not in self.rigid.robots for i in first], np.bool_)
@@ -376,7 +470,11 @@ class Touching:
         t_box = [shared(x, wp.vec3) for x in (self._tree_low, self._tree_high)]
         a_box = [shared(x, wp.vec3) for x in (self._actor_low, self._actor_high)]
         a_first, a_lies = shared(self._actor_first, wp.int32), shared(self._actor_lies, wp.bool)
-        s_tree, s_body, s_bunch = (shared(x, wp.int32) for x in (s.tree, s.body, s.bunch))
+        s_tree, s_body, s_bunch, s_when = (shared(x, wp.int32) for x in (s.tree, s.body, s.bunch, s.when))
+        s_drawn = [shared(x, wp.vec3) for x in (self._start_drawn, self._end_drawn)]
+        fine, core = shared(state.tree_fine, wp.bool), shared(self.model.tree_core, wp.int32)
+        blocks = [shared(x, wp.vec3) for x in (self._block_low, self._block_high)]
+        standing = [shared(x, wp.vec3) for x in (self._standing_low, self._standing_high)]
         s_radius, s_speed = shared(s.radius, float), shared(self._shape_speed, float)
         s_at = [shared(x, wp.vec3) for x in (self._start, self._end)]
         s_ahead = [shared(x, wp.vec3) for x in (self._start_ahead, self._end_ahead)]
@@ -401,48 +499,75 @@ class Touching:
         self._bound_actors = bind(kernels.bound_actors, [STIR, a_first, a_lies, speed, *g_box], a_box)
         self._bound_trees = bind(
             kernels.bound_trees,
-            [dt, m_first, m_size, m_parent, s_tree, s_body, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius,
-             *ints("trees"), body_q, body_qd, shared(state.body_cut, wp.bool)],
+            [dt, m_first, m_size, core, m_parent, s_tree, s_body, s_when, shared(s.start, wp.vec3),
+             shared(s.end, wp.vec3), s_radius, *ints("trees"), body_q, body_qd, shared(state.body_cut, wp.bool), fine],
             [shared(self._bend, wp.spatial_vector), *s_at, *s_ahead, s_speed, *t_box],
         )  # fmt: skip
         told = shared(self.told, wp.bool)
         a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
         self._reach = bind(
-            kernels.reach, [a_first, a_copy, told, *t_box, *a_box, *g_box], [shared(self._near, wp.bool)]
+            kernels.reach, [a_first, a_copy, told, *blocks, *t_box, *a_box, *g_box], [shared(self._near, wp.bool)]
         )
-        hit = [shared(x, wp.int32) for x in (self._hit_shape, self._hit_geom)]
+        self._bound_blocks = bind(kernels.bound_blocks, [*ints("blocks"), *t_box], blocks)
+        hit = [shared(x, wp.int32) for x in (self._hit_shape, self._hit_other)]
         hit += [
             shared(self._hit_gap, wp.float64),
             shared(self._hit_room, wp.float64),
             shared(self._hit_normal, wp.vec3d),
             shared(self._hit_point, wp.vec3d),
         ]
+        onset, now = shared(self._onset, wp.bool), [body_q, body_qd, *s_at, *s_ahead, s_speed]
         self._meeting = bind(
             kernels.meet,
-            [dt, SLOTS, s_tree, s_body, s_bunch, s_radius, g_id, g_kind, g_size, g_radius, g_copy, told, attached,
-             *ints("trees"), *t_box, body_q, body_qd, *s_at, *s_ahead, s_speed, xmat, *moving, speed, *g_box],
-            [*ints("close"), *hit, shared(self._onset, wp.bool), *ints("missed")],
+            [dt, SLOTS, self._movable, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, g_id, g_kind, g_size,
+             g_radius, g_copy, told, fine, attached, *ints("trees"), *t_box, *now, xmat, *moving, speed, *g_box,
+             *standing],
+            [*ints("close", "found"), *hit, onset],
+        )  # fmt: skip
+        self._meeting_branches = bind(
+            kernels.meet_branches,
+            [dt, SLOTS, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, fine, attached,
+             *ints("order", "tally", "trees"), *t_box, *now],
+            [*ints("found"), *hit, onset],
         )  # fmt: skip
         flat = [x.flatten() for x in hit]
-        known = [*ints("known_shape", "known_geom"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
+        known = [*ints("known_shape", "known_other"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
         axes = shared(self._axes, wp.mat33d)
+        self._gathering = bind(kernels.gather, [SLOTS, *ints("found"), onset], ints("hits", "tally"))
+        self._indexing = bind(
+            kernels.index,
+            [s_body, *ints("hits"), *flat[:2]],
+            ints("tally", "bodies", "contact_shape", "contact_body", "place", "other_body", "other_place"),
+        )
         self._coupling = bind(
             kernels.couple,
-            [dt, k, c, g_dof, g_root, shared(self._dof_parent, wp.int32), *ints("hits"), *flat[1:],
-             *ints("contact_shape", "contact_body", "contact_column"), body_q, body_qd_free, *doubles("dof_free"), cdof,
-             com, *ints("known_count"), *known],
-            [*ints("geom"), *doubles("gap"), *vectors("point"), axes,
+            [dt, k, c, FRICTION, g_friction, g_dof, g_root, shared(self._dof_parent, wp.int32), *ints("hits"),
+             *flat[1:], *ints("contact_shape", "contact_body", "other_body"), body_q,
+             body_qd_free, *doubles("dof_free"), cdof, com, *ints("known_count"), *known],
+            [*ints("other"), *doubles("gap", "friction"), *vectors("point"), axes,
              *doubles("plant_rows", "rigid_rows", "free", "offset", "impulse")],
         )  # fmt: skip
+        pairs, rows = ints("tally", "other", "place", "other_place"), doubles("plant_rows", "rigid_rows")
+        answers = doubles("plant_answer", "rigid_answer")
+        self._answering = bind(
+            kernels.answer,
+            [*(shared(x, wp.int32) for x in mj["sparse"][:3]), g_dof, *(shared(x, wp.int32) for x in mj["sparse"][3:]),
+             *pairs, *rows, shared(self._y, float), *(shared(x, wp.float64) for x in mj["factors"])],
+            answers,
+        )  # fmt: skip
+        self._assembling = bind(
+            kernels.assemble, [g_dof, shared(self._dof_parent, wp.int32), *pairs, *rows, *answers], doubles("A")
+        )
+        self._adding = bind(kernels.add_up, [dt, *pairs, rows[0], *doubles("impulse")], doubles("wrench"))
         self._relaxing = bind(
             kernels.relax,
-            [softness, SWEEPS, TOLERANCE, g_friction, *ints("island_first", "island_member", "geom"),
-             *doubles("A", "free", "offset")],
+            [softness, SWEEPS, TOLERANCE, *ints("island_first", "island_member"),
+             *doubles("friction", "A", "free", "offset")],
             [*doubles("impulse"), *ints("sweeps")],
         )  # fmt: skip
         self._remembering = bind(
             kernels.remember,
-            [dt, k, c, *ints("known_count", "contact_shape", "geom"), axes, *doubles("A", "free", "impulse")],
+            [dt, k, c, *ints("known_count", "contact_shape", "other"), axes, *doubles("A", "free", "impulse")],
             [*vectors("force"), *known],
         )  # fmt: skip
 
