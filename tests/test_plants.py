@@ -11,6 +11,7 @@ from clustered import clustered, momenta, moving
 
 from vinesim import frames
 from vinesim.physics.memory import Memory, NoDevice
+from vinesim.physics.guard import Guard
 from vinesim.physics.plants import ONSET, Plants
 from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.model import Model
@@ -657,3 +658,53 @@ def test_a_gpu_agrees_with_the_cpu() -> None:
     np.testing.assert_allclose(far, near, rtol=1e-3, atol=1e-3 * abs(near).max())
     for a, b in zip(cpu, gpu, strict=True):
         np.testing.assert_allclose(np.frombuffer(b, np.float32), np.frombuffer(a, np.float32), atol=2e-2, rtol=1e-2)
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"tie_body": 99}, r"tie 1 on body 99: there are 10 bodies, counted from 0"),
+        ({"tie_body": -1}, r"tie 1 on body -1: there are 10 bodies"),
+        ({"tie_body": 1}, r"tie 1 on body 1: it stands behind a tie of a later body; sort ties by body"),
+        ({"tie_stiffness": -1.0}, r"tie 1 on body 4: stiffness below 0 N/m; a spring pulls back"),
+        ({"tie_damping": -1.0}, r"tie 1 on body 4: damping below 0 N s/m; a damper takes energy"),
+        ({"tie_anchor": np.nan}, r"Model.tie_anchor\[1, 0\] is not finite"),
+        ({"body_drag": -0.1}, r"body 1 of tree 0: drag area \[m\^2\] -0.1.*; air holds back"),
+    ],
+)
+def test_wrong_ties_and_drag_are_refused_in_words(change: dict[str, float], says: str) -> None:
+    tree = Tree(frames.pose(np.zeros(3)))
+    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0), 10)
+    model = assemble([tree], tie_body=[3, 4], tie_point=np.zeros((2, 3)), tie_stiffness=[10.0, 10.0])
+    state = State.at_rest(model)
+    for name, value in change.items():
+        getattr(model, name)[1] = value
+    with pytest.raises(ValueError, match=says):
+        Plants(model, state)
+
+
+def test_a_cluster_is_not_tied() -> None:
+    model = clustered(1)
+    ties = Model.allocate(**(model.counts() | {"tie": 1}))
+    for name in Model.dims():
+        if not name.startswith("tie_"):
+            setattr(ties, name, getattr(model, name))
+    ties.tie_body[0] = model.bunch_cluster[0]
+    with pytest.raises(ValueError, match="a berry cluster cannot be tied; tie its bunch"):
+        Plants(ties, State.at_rest(ties))
+
+
+def test_a_bad_pose_of_a_cut_tree_is_stopped(plants: Plants) -> None:
+    guard = Guard(plants)
+    plants.wake(np.arange(4))
+    plants.cut(7)
+    plants.state.joint_x[7, 1] = np.nan
+    step(plants)
+    assert guard.check().tolist() == [1]
+    plants.kinematics(np.arange(4))
+    assert np.isfinite(plants.state.body_q).all()
+    plants.wake(1)
+    step(plants, 5)
+    assert len(guard.check()) == 0
+    plants.state.joint_xd[7] = [0.0, 0.0, np.inf]
+    step(plants)
+    assert guard.check().tolist() == [1]
+    assert not plants.state.joint_xd[7].any()

@@ -429,3 +429,237 @@ def test_a_violently_cut_tree_calms_down() -> None:
             rates.append(np.linalg.norm(np.delete(plants.state.joint_qd, body, 0), axis=1).max())
             assert rates[-1] < 100.0
         assert np.mean(rates[-100:]) < 2.0
+
+
+# ---- ties
+
+
+def bound(
+    tree: Tree, body: int, stiffness: float, damping: float = 0.0, point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Model:
+    """A tree with one tie that is slack as the tree is drawn."""
+    drawn = assemble([tree])
+    at = frames.compose(drawn.forward(drawn.joint_settled)[body], frames.pose(np.array(point)))[:3]
+    return assemble(
+        [tree], tie_body=[body], tie_point=[point], tie_anchor=[at], tie_stiffness=[stiffness], tie_damping=[damping]
+    )
+
+
+def flat(mass: float = 0.0, beta: float = 0.01) -> Tree:
+    """A horizontal cane of 1 m, settled, with a mass at its tip."""
+    tree = Tree(frames.pose(np.zeros(3)))
+    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, beta), 16)
+    tree.bodies[-1]["mass"] += mass
+    tree.settle()
+    return tree
+
+
+@pytest.mark.parametrize("stiffness", [5.0, 100.0, 1e4, 1e6])
+def test_a_tied_cane_bends_like_a_propped_beam(stiffness: float) -> None:
+    """Side load P at the tip, spring support at a: w(x) by superposition of two cantilevers (Euler-Bernoulli)."""
+    model = bound(flat(beta=0.05), 9, stiffness, point=(1 / 16, 0.0, 0.0))
+    plants = awake(model, State.at_rest(model), phi=1.0)
+    load, bend, a = 0.01, 5e9 * np.pi / 4 * 0.004**4, 10 / 16
+    plants.body_load[15] = [0.0, load, 0.0, 0.0, 0.0, load / 16]
+    for _ in range(1500):
+        plants.free()
+        plants.commit()
+    plants.kinematics()
+    assert plants.tree_rate[0] < 1e-4
+    alone = load * a * a * (3.0 - a) / (6.0 * bend)
+    held = stiffness * alone / (1.0 + stiffness * a**3 / (3.0 * bend))
+    tip = load / (3.0 * bend) - held * a * a * (3.0 - a) / (6.0 * bend)
+    rest = model.forward(model.joint_settled)
+    seen = [
+        frames.compose(plants.state.body_q[b], frames.pose([1 / 16, 0, 0]))[1]
+        - frames.compose(rest[b], frames.pose([1 / 16, 0, 0]))[1]
+        for b in (15, 9)
+    ]
+    assert seen[0] == pytest.approx(tip, rel=0.02)
+    assert stiffness * seen[1] == pytest.approx(held, rel=0.01, abs=1e-7 * stiffness)
+    # what the joint bears is the load less what the tie takes, and the weight
+    root = plants.joint_wrench(np.array([0]))[0]
+    assert root[1] == pytest.approx(held - load, abs=2e-4 + 2e-7 * stiffness)
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e3, 1e4, 1e5, 1e6])
+@pytest.mark.parametrize(("mass", "beta"), [(0.0, 0.0), (0.5, 0.006)])
+def test_a_tied_cane_gains_no_energy(stiffness: float, mass: float, beta: float) -> None:
+    model = bound(flat(mass, beta), 9, stiffness, point=(1 / 16, 0.0, 0.0))
+    rest = awake(model, State.at_rest(model))
+    rest.free()
+    plants = awake(model, State.at_rest(model))
+    plants.state.joint_qd[:, 1:] = [0.1, 0.06]
+    seen = []
+    for _ in range(1000):
+        plants.free()
+        at = frames.compose(plants.state.body_q[9], frames.pose([1 / 16, 0, 0]))[:3]
+        stretched = 0.5 * stiffness * ((at - model.tie_anchor[0]) ** 2).sum()
+        seen.append(energy(plants) - energy(rest) + stretched)
+        plants.commit()
+    assert max(seen[1:]) <= seen[0]
+    assert plants.tree_rate[0] < 0.1
+
+
+@pytest.mark.parametrize("zeta", [0.03, 0.1, 0.2])
+def test_a_tie_damps_as_asked(zeta: float) -> None:
+    """A balanced wheel of 0.02 kg m^2 on a spring of 50 N/m at a lever of 0.2 m: 10 rad/s."""
+    inertia, lever, stiffness = 0.02, 0.2, 50.0
+    tree = Tree(frames.pose(np.zeros(3)))
+    tree.add(-1, mass=1.0, inertia=[inertia] * 3, length=0.2)
+    damping = 2.0 * zeta * np.sqrt(stiffness * inertia) / lever
+    model = bound(tree, 0, stiffness, damping, point=(lever, 0.0, 0.0))
+    state = State.at_rest(model)
+    state.joint_q[0] = frames.exp(np.array([0.0, 0.0, 0.02]))
+    plants = awake(model, state)
+    angle = []
+    for _ in range(400):
+        plants.free()
+        plants.commit()
+        angle.append(frames.log(state.joint_q[0].astype(float))[2])
+    angle = np.array(angle)
+    turns = np.flatnonzero((angle[1:-1] < angle[:-2]) & (angle[1:-1] < angle[2:])) + 1  # troughs, by a parabola
+    trough = angle[turns] - (angle[turns + 1] - angle[turns - 1]) ** 2 / (
+        8.0 * (angle[turns + 1] - 2 * angle[turns] + angle[turns - 1])
+    )
+    loss = np.log(trough[0] / trough[1])
+    assert loss / np.hypot(loss, 2.0 * np.pi) == pytest.approx(zeta, abs=0.005)
+    assert (turns[1] - turns[0]) * DT == pytest.approx(2.0 * np.pi / (10.0 * np.sqrt(1.0 - zeta**2)), rel=0.03)
+
+
+def test_a_tie_follows_its_anchor_and_can_be_undone() -> None:
+    model = bound(flat(), 15, 200.0, 1.0)
+    plants = awake(model, State.at_rest(model), phi=1.0)
+    plants.tie_anchor[0, 1] += 0.05
+    for _ in range(500):
+        plants.free()
+        plants.commit()
+    plants.kinematics()
+    drawn = model.forward(model.joint_settled)
+    assert plants.state.body_q[15, 1] == pytest.approx(0.05, abs=0.002)
+    plants.tie_stiffness[0] = plants.tie_damping[0] = 0.0
+    for _ in range(1500):
+        plants.free()
+        plants.commit()
+    plants.kinematics()
+    np.testing.assert_allclose(plants.state.body_q[15, :3], drawn[15, :3], atol=2e-3)
+
+
+def test_what_is_tied_hangs_by_its_tie_when_it_is_cut() -> None:
+    model = bound(flat(), 9, 500.0, 2.0)
+    plants = awake(model, State.at_rest(model), phi=1.0)
+    plants.cut(4)
+    for tick in range(3000):
+        plants.free()
+        plants.commit()
+        if tick % 12 == 0:  # nothing else would end its swinging
+            plants.state.joint_qd[:] = 0.0
+            plants.state.joint_xd[:] = 0.0
+    plants.kinematics()
+    at = plants.state.body_q[9, :3].astype(float)
+    off = np.arange(4, 16)
+    _, _, center, _ = momenta(plants, off, np.zeros(3))
+    weight = 9.81 * plants.body_mass[off].sum()
+    np.testing.assert_allclose(at - model.tie_anchor[0], [0.0, 0.0, -weight / 500.0], atol=1e-4)
+    np.testing.assert_allclose(center[:2], at[:2], atol=1e-3)  # hanging straight below
+
+
+# ---- trunk, arms, canes: all one tree
+
+
+def vine() -> tuple[Tree, list[int]]:
+    """A trunk of 7 cm and 1.5 m, two arms, eight canes, a bunch on each: one tree, parents of like kind."""
+    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
+    trunk = tree.rod(-1, 1.5, (0.035, 0.035), Wood(10e9, 900.0, 0.004), 6)
+    bunches = []
+    for side in (-1.0, 1.0):
+        arm = tree.rod(
+            trunk[-1], 1.0, (0.02, 0.015), Wood(8e9, 900.0, 0.005), 5, rest=frames.exp(np.array([0.0, 0.0, 1.5 * side]))
+        )
+        for i in range(4):
+            out = frames.exp(np.array([0.0, 0.8 * (-1) ** i, 0.2 * side]))
+            cane = tree.rod(arm[1 + i], 0.8, (0.005, 0.003), Wood(4e9, 800.0, 0.008), 8, rest=out)
+            bunches.append(
+                tree.add(
+                    cane[2],
+                    offset=(0.1, 0.0, 0.0),
+                    rest=frames.exp(np.array([0.3 * i, 1.0, 0.2])),
+                    mass=0.4,
+                    com=(0.1, 0, 0),
+                    inertia=(4e-4, 5e-4, 5e-4),
+                    length=0.15,
+                    stiffness=[1.5] * 3,
+                    damping=[0.03] * 3,
+                )
+            )
+    return tree, bunches
+
+
+def test_a_whole_vine_is_one_tree_and_stands() -> None:
+    """Drawn at rest it stays; shaken hard it calms down where it was; its foot bears all its weight."""
+    tree, bunches = vine()
+    tree.settle()
+    model = assemble([tree])
+    assert len(bunches) == 8
+    drawn = model.forward(model.joint_settled)
+    plants = awake(model, State.at_rest(model))
+    for _ in range(200):
+        plants.free()
+        plants.commit()
+    plants.kinematics()
+    np.testing.assert_allclose(plants.state.body_q[:, :3], drawn[:, :3], atol=2e-4)
+    foot = plants.joint_wrench(np.array([0]))[0]
+    np.testing.assert_allclose(foot[:3], -model.body_mass.sum() * GRAVITY, atol=0.02)
+    plants.state.joint_qd[:] = np.random.default_rng(37).normal(size=plants.state.joint_qd.shape) * 3.0
+    for _ in range(3000):
+        plants.free()
+        plants.commit()
+        assert plants.tree_rate[0] < 1000.0
+    plants.kinematics()
+    assert plants.tree_rate[0] < 0.1
+    np.testing.assert_allclose(plants.state.body_q[:, :3], drawn[:, :3], atol=2e-2)
+
+
+def test_sag_of_an_arm_on_its_trunk() -> None:
+    """A stiff arm sideways on a trunk: its tip sinks by w L^4 / 8EI and by what the trunk's head turns, (w L^2 / 2) h /
+    EI L."""
+    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
+    trunk = tree.rod(-1, 1.5, (0.035, 0.035), Wood(10e9, 900.0, 0.05), 12)
+    arm = tree.rod(
+        trunk[-1], 1.0, (0.02, 0.02), Wood(8e9, 900.0, 0.05), 12, rest=frames.exp(np.array([0.0, 0.0, np.pi / 2]))
+    )
+    model = assemble([tree])
+    plants = awake(model, State.at_rest(model), phi=1.0)
+    start = plants.state.body_q[:, :3].copy()
+    for _ in range(1500):
+        plants.free()
+        plants.commit()
+    plants.kinematics()
+    w = 900.0 * np.pi * 0.02**2 * 9.81
+    arm_bend, trunk_bend = 8e9 * np.pi / 4 * 0.02**4, 10e9 * np.pi / 4 * 0.035**4
+    pose = plants.state.body_q[arm[-1]].astype(float)
+    tip = frames.compose(pose, frames.pose([1 / 12, 0, 0]))[2]
+    sag = w / (8.0 * arm_bend) + 0.5 * w * 1.5 / trunk_bend
+    assert start[arm[-1], 2] == pytest.approx(1.5, abs=1e-6)
+    assert 1.5 - tip == pytest.approx(sag, rel=0.02)
+
+
+def test_a_trunks_first_frequency() -> None:
+    """A bare trunk under its own stiffness, 10 Hz and more: free swings at 1 ms against Euler-Bernoulli, 1 %."""
+    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
+    tree.rod(-1, 1.5, (0.035, 0.035), Wood(10e9, 900.0), 12)
+    model = assemble([tree])
+    plants = Plants(model, State.at_rest(model), dt=0.001, phi=0.5)
+    plants.wake(0)
+    shape = (np.arange(12) + 0.5)[::-1]
+    plants.state.joint_qd[:, 1] = 1e-3 * shape
+    seen = []
+    for _ in range(4000):
+        plants.free()
+        seen.append(plants.velocity_free[11, 0])
+        plants.commit()
+    spectrum = np.abs(np.fft.rfft(np.array(seen) * np.hanning(len(seen)), 1 << 18))
+    frequency = np.argmax(spectrum) * 1000.0 / (1 << 18)
+    theory = 1.8751**2 / (2 * np.pi) * np.sqrt(10e9 * 0.035**2 / 4 / 900.0) / 1.5**2
+    assert theory == pytest.approx(14.5, rel=0.01)
+    assert frequency == pytest.approx(theory, rel=0.01)

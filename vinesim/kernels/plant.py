@@ -143,17 +143,18 @@ def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int):
 
 @wp.func
 def fleeing(
+    places: wp.array(dtype=wp.vec3),
     speeds: wp.array(dtype=wp.vec3),
     body_parent: wp.array(dtype=wp.int32),
     body_root: wp.array(dtype=wp.int32),
     first: int,
     size: int,
 ):
-    """Fastest of the floating roots [m/s]; NaN enters, and stays."""
+    """Fastest of the floating roots [m/s]; NaN, be it in where one is, enters and stays."""
     most = float(0.0)
     for k in range(first, first + size):
         if body_parent[k] < 0 and body_root[k] >= 0:
-            speed = wp.length(speeds[k])
+            speed = wp.length(speeds[k]) + 0.0 * wp.length(places[k])
             if speed > most or speed != speed:
                 most = speed
     return most
@@ -326,17 +327,19 @@ def free(
         if area > 0.0:
             wind = tree_air[tree] - velocity - slip
             c = blown(area, wind)
-            J_out[k] += at_lever(dt * c, com)
+            J_out[k] += at_lever(dt * c, com) + reach * taut(com, c * wind)
             H_out[k] += dt * c * wp.skew(com)
             M_out[k] += dt * c * wp.identity(n=3, dtype=float)
-            bias_out[k] += wp.spatial_vector(-c * wind, -c * wp.cross(com, wind))
+            bias_out[k] += wp.spatial_vector(-c * wind, -c * wp.cross(com + ahead * slip, wind))
+            drawn_out[k] += c * wind
         for t in range(tie_first[k], tie_first[k + 1]):
             at = rotation * tie_point[t]
             stretch = wp.transform_get_translation(above) + lever + at - tie_anchor[t]
             tie = tie_stiffness[t]
             damper = remaining(tie_damping[t], tie, phi, dt)
             grip = phi * dt * (phi * dt * tie + damper)
-            hold = tied(tie, damper, stretch, velocity + wp.cross(omega, at), phi, dt)
+            swing = wp.cross(omega, at)
+            hold = tied(tie, damper, stretch, velocity + swing, phi, dt) - grip * wp.cross(omega, swing)
             J_out[k] += at_lever(grip, at)
             H_out[k] += grip * wp.skew(at)
             M_out[k] += grip * wp.identity(n=3, dtype=float)
@@ -612,7 +615,7 @@ def integrate(
     first = tree_first[tree]
     size = tree_moving[tree]
     turning = fastest(joint_qd_free, first, size)
-    most = wp.length(wp.vec2(turning, fleeing(joint_xd_free, body_parent, body_root, first, size)))
+    most = wp.length(wp.vec2(turning, fleeing(joint_x, joint_xd_free, body_parent, body_root, first, size)))
     tree_rate_out[tree] = most
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
     sound = most <= bound
@@ -677,8 +680,9 @@ def held(
         tie = tie_stiffness[t]
         damper = remaining(tie_damping[t], tie, phi, dt)
         grip = phi * dt * (phi * dt * tie + damper)
-        force = tied(tie, damper, stretch, velocity + wp.cross(omega, at), phi, dt)
-        force = force - grip * (a + wp.cross(alpha, at))
+        swing = wp.cross(omega, at)
+        force = tied(tie, damper, stretch, velocity + swing, phi, dt)
+        force = force - grip * (a + wp.cross(alpha, at) + wp.cross(omega, swing))
         wrench += wp.spatial_vector(force, wp.cross(at, force))
     return wrench
 

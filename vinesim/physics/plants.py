@@ -42,6 +42,13 @@ LIMIT = 50.0
 BOUND = 5000.0
 """[rad/s] A tree of which a joint would turn faster than this is not integrated: see :mod:`vinesim.physics.guard`."""
 
+AIR = float(plant.AIR)
+"""[kg/m^3] density of air"""
+
+RIGID = 10.0
+"""[kg] A tie of which stiffness dt^2 is more than this (1e5 N/m at 10 ms) moves any cane to and fro within a tick. Of
+that nothing is seen, but with phi below 1 it rings on and pumps the cane."""
+
 
 FEW = 100
 """[tree] For fewer awake trees a thread, handing ``free()`` to other threads costs more than it saves."""
@@ -97,9 +104,11 @@ class Plants:
         self.dt, self.brisk, self.limit, self.bound = dt, brisk, limit, bound
         trees, bodies = len(model.tree_first), len(model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """phi asked for each tree [tree]; set it as you like."""
+        """phi asked for each tree [tree]; set it as you like. 1 from the start where a tie is ``RIGID``."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """Fastest joint that the last commit found [tree] rad/s; NaN or above ``bound`` for a tree that it stopped."""
+        """Fastest joint that the last commit found [tree] rad/s, and m/s of what falls; NaN or above ``bound`` for a
+        tree that it stopped."""
+        self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > RIGID]]] = 1.0
         self.body_load = np.zeros((bodies, 6), np.float32)
         """Wrenches that last until changed (wind, a rope): force [N], moment about the body's origin [N m], world."""
         self.velocity_free = np.zeros((bodies, 6), np.float32)
