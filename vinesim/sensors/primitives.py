@@ -408,16 +408,16 @@ def _rigid(
             continue
         material = _RIGID.get(link.organ, int(shade.PAINT))
         name = label(link.organ, link.index)
-        for shape in link.shapes:
+        for piece in link.shapes:
             common = {
                 "material": material,
-                "tint": np.asarray(shape.rgba[:3]) ** 2.2,
+                "tint": np.asarray(piece.rgba[:3]) ** 2.2,
                 "organ": int(link.organ),
                 "label": name,
                 "carrier": first + k,
                 "group": groups + k,
             }
-            batches.append(_rigid_shape(shape, common))
+            batches.append(_rigid_shape(piece, common))
     return batches
 
 
