@@ -520,9 +520,9 @@ class Plants:
                 inputs=[
                     self.dt, wp.vec3(GRAVITY), self.memory.pitch, m["tree_first"], m["tree_moving"], m["body_tree"],
                     m["body_parent"], m["body_root"], m["body_mass"], m["body_com"], m["body_inertia"],
-                    m["body_product"], m["body_drag"], m["tie_span"], m["tie_point"], m["tie_stiffness"], m["tie_damping"], asked,
-                    m["phi_used"], m["tree_air"], m["tie_anchor"], m["body_q"], m["body_qd"], m["acceleration"],
-                    m["body_load"], m["wrench"],
+                    m["body_product"], m["body_drag"], m["tie_span"], m["tie_point"], m["tie_stiffness"],
+                    m["tie_damping"], asked, m["phi_used"], m["tree_air"], m["tie_anchor"], m["body_q"], m["body_qd"],
+                    m["acceleration"], m["body_load"], m["wrench"],
                 ],
                 outputs=[out],
                 device=device,
