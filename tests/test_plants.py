@@ -588,7 +588,8 @@ def test_threads_and_copies_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("vinesim.physics.plants.FEW", 0)
     monkeypatch.setattr("vinesim.physics.plants.FEW_MOVES", 0)
     alone, response = eventful()
-    for options in ({"threads": 2}, {"threads": 3}, {"memory": Memory("cpu", apart=True)}):
+    copies = [{"memory": Memory("cpu", lanes=lanes)} for lanes in (1, 3)]
+    for options in ({"threads": 2}, {"threads": 3}, *copies):
         told, seen = eventful(**options)
         assert told == alone, options
         np.testing.assert_array_equal(seen, response)

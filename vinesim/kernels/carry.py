@@ -1,4 +1,4 @@
-"""Carrying what belongs to some trees from one memory to another."""
+"""Carrying what belongs to some trees between two memories that keep it in unlike order."""
 
 import warp as wp
 
@@ -8,20 +8,34 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def carry(
     # model
-    width: int,
-    stride: int,
+    threads: int,
+    pitch: int,
+    pitch_there: int,
     tree_first: wp.array(dtype=wp.int32),
+    tree_first_there: wp.array(dtype=wp.int32),
     tree_size: wp.array(dtype=wp.int32),
+    starts: wp.array(dtype=wp.int32),
+    widths: wp.array(dtype=wp.int32),
     # in
     trees: wp.array(dtype=wp.int32),
-    rows: wp.array(dtype=wp.int32),
+    addresses: wp.array(dtype=wp.uint64),
     # out
-    rows_out: wp.array(dtype=wp.int32),
+    addresses_out: wp.array(dtype=wp.uint64),
 ):
-    """Copy one word of four bytes of one listed tree; each body has a row of ``width``, a tree ``stride`` threads."""
-    slot = wp.tid() / stride
-    i = wp.tid() - slot * stride
+    """Copy one word of four bytes: of one listed tree (``threads`` each), of one array (from its ``starts`` on)."""
+    slot = wp.tid() / threads
+    thread = wp.tid() - slot * threads
     tree = trees[slot]
-    if i < tree_size[tree] * width:
-        at = tree_first[tree] * width + i
-        rows_out[at] = rows[at]
+    n = wp.int32(0)
+    while thread >= starts[n + 1]:
+        n = n + 1
+    width = widths[n]
+    word = thread - starts[n]
+    body = word / width
+    if body < tree_size[tree]:
+        column = word - body * width
+        at = (tree_first[tree] + body * pitch) * width + column
+        there = (tree_first_there[tree] + body * pitch_there) * width + column
+        words = wp.array(ptr=addresses[n], shape=(at + 1,), dtype=wp.int32)
+        words_out = wp.array(ptr=addresses_out[n], shape=(there + 1,), dtype=wp.int32)
+        words_out[there] = words[at]

@@ -28,6 +28,10 @@ at the origin, moment about it). The inertia of a body or subtree about the body
     moment = J alpha + H a        force = H^T alpha + M a        with H = m [c]x for one body,
 
 and after elimination of its joint a body keeps only D = (J + metric)^-1, D J and D H.
+
+Bodies are numbered by where they lie: those of a tree ``pitch`` apart, from ``tree_first`` on, children behind parents.
+One after the other (pitch 1) suits a CPU; a GPU reads neighbouring trees at once if their bodies are neighbours. Sums
+over children are read and stored, not added in place: that would be an atomic operation, in a GPU's far cache.
 """
 
 import warp as wp
@@ -129,12 +133,12 @@ def blown(area: float, wind: wp.vec3):
 
 
 @wp.func
-def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int):
+def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int, pitch: int):
     """Fastest of some joint rates [rad/s]; NaN enters, and stays. (A function, since an adjoint does not repeat the
     loops of its kernel before it goes back, but calls functions.)
     """
     most = float(0.0)
-    for k in range(first, first + size):
+    for k in range(first, first + size * pitch, pitch):
         rate = wp.length(rates[k])
         if rate > most or rate != rate:
             most = rate
@@ -149,10 +153,11 @@ def fleeing(
     body_root: wp.array(dtype=wp.int32),
     first: int,
     size: int,
+    pitch: int,
 ):
     """Fastest of the floating roots [m/s]; NaN, be it in where one is, enters and stays."""
     most = float(0.0)
-    for k in range(first, first + size):
+    for k in range(first, first + size * pitch, pitch):
         if body_parent[k] < 0 and body_root[k] >= 0:
             speed = wp.length(speeds[k]) + 0.0 * wp.length(places[k])
             if speed > most or speed != speed:
@@ -163,6 +168,7 @@ def fleeing(
 @wp.kernel
 def place(
     # model
+    pitch: int,
     tree_first: wp.array(dtype=wp.int32),
     tree_size: wp.array(dtype=wp.int32),
     tree_pose: wp.array(dtype=wp.transform),
@@ -183,7 +189,7 @@ def place(
     """Put the bodies of one tree where its joints say, without moving anything."""
     tree = trees[wp.tid()]
     first = tree_first[tree]
-    for k in range(first, first + tree_size[tree]):
+    for k in range(first, first + tree_size[tree] * pitch, pitch):
         parent = body_parent[k]
         above = tree_pose[tree]
         motion = wp.spatial_vector()
@@ -209,6 +215,7 @@ def free(
     brisk: float,
     tension: float,
     gravity: wp.vec3,
+    pitch: int,
     tree_first: wp.array(dtype=wp.int32),
     tree_moving: wp.array(dtype=wp.int32),
     tree_pose: wp.array(dtype=wp.transform),
@@ -223,7 +230,7 @@ def free(
     body_drag: wp.array(dtype=float),
     joint_stiffness: wp.array(dtype=wp.vec3),
     joint_damping: wp.array(dtype=wp.vec3),
-    tie_first: wp.array(dtype=wp.int32),
+    tie_span: wp.array(dtype=wp.vec2i),
     tie_point: wp.array(dtype=wp.vec3),
     tie_stiffness: wp.array(dtype=float),
     tie_damping: wp.array(dtype=float),
@@ -267,13 +274,13 @@ def free(
 
     # outward: poses and velocities at the start of the tick, each body's own inertia and bias
     phi = tree_phi[tree]
-    if fastest(joint_qd, first, size) > brisk or tree_onset[tree] > 0:
+    if fastest(joint_qd, first, size, pitch) > brisk or tree_onset[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
     ahead = tension * (1.0 - phi) * dt
     reach = tension * phi * phi * dt * dt
 
-    for k in range(first, first + size):
+    for k in range(first, first + size * pitch, pitch):
         parent = body_parent[k]
         above = tree_pose[tree]
         motion = wp.spatial_vector()
@@ -327,12 +334,13 @@ def free(
         if area > 0.0:
             wind = tree_air[tree] - velocity - slip
             c = blown(area, wind)
-            J_out[k] += at_lever(dt * c, com) + reach * taut(com, c * wind)
-            H_out[k] += dt * c * wp.skew(com)
-            M_out[k] += dt * c * wp.identity(n=3, dtype=float)
-            bias_out[k] += wp.spatial_vector(-c * wind, -c * wp.cross(com + ahead * slip, wind))
-            drawn_out[k] += c * wind
-        for t in range(tie_first[k], tie_first[k + 1]):
+            J_out[k] = J_out[k] + at_lever(dt * c, com) + reach * taut(com, c * wind)
+            H_out[k] = H_out[k] + dt * c * wp.skew(com)
+            M_out[k] = M_out[k] + dt * c * wp.identity(n=3, dtype=float)
+            bias_out[k] = bias_out[k] + wp.spatial_vector(-c * wind, -c * wp.cross(com + ahead * slip, wind))
+            drawn_out[k] = drawn_out[k] + c * wind
+        ties = tie_span[k]
+        for t in range(ties[0], ties[1]):
             at = rotation * tie_point[t]
             stretch = wp.transform_get_translation(above) + lever + at - tie_anchor[t]
             tie = tie_stiffness[t]
@@ -340,15 +348,15 @@ def free(
             grip = phi * dt * (phi * dt * tie + damper)
             swing = wp.cross(omega, at)
             hold = tied(tie, damper, stretch, velocity + swing, phi, dt) - grip * wp.cross(omega, swing)
-            J_out[k] += at_lever(grip, at)
-            H_out[k] += grip * wp.skew(at)
-            M_out[k] += grip * wp.identity(n=3, dtype=float)
-            bias_out[k] += wp.spatial_vector(-hold, -wp.cross(at, hold))
-            drawn_out[k] += -tie * stretch
+            J_out[k] = J_out[k] + at_lever(grip, at)
+            H_out[k] = H_out[k] + grip * wp.skew(at)
+            M_out[k] = M_out[k] + grip * wp.identity(n=3, dtype=float)
+            bias_out[k] = bias_out[k] + wp.spatial_vector(-hold, -wp.cross(at, hold))
+            drawn_out[k] = drawn_out[k] + (-tie * stretch)
 
     # inward: eliminate each joint and hand what is left of the subtree to the parent
     for i in range(size):
-        k = first + size - 1 - i
+        k = first + (size - 1 - i) * pitch
         parent = body_parent[k]
         turning = wp.vec3()
         if parent >= 0:
@@ -383,20 +391,29 @@ def free(
             force = wp.spatial_top(bias) + wp.transpose(H) * Du + M_left * centripetal
             moment = wp.spatial_bottom(bias) + J * Du + H_left * centripetal + wp.cross(lever, force)
             drawn = drawn_out[k]
-            drawn_out[parent] += drawn
+            drawn_out[parent] = drawn_out[parent] + drawn
             M_arm = wp.transpose(crossed(M_left, lever))
             H_arm = crossed(H_left, lever)
-            J_out[parent] += reach * taut(lever, drawn) + J_left + crossed(M_arm, lever) - H_arm - wp.transpose(H_arm)
-            H_out[parent] += H_left - M_arm
-            M_out[parent] += M_left
-            bias_out[parent] += wp.spatial_vector(force, moment - ahead * wp.cross(wp.cross(turning, lever), drawn))
+            J_out[parent] = (
+                J_out[parent]
+                + reach * taut(lever, drawn)
+                + J_left
+                + crossed(M_arm, lever)
+                - H_arm
+                - wp.transpose(H_arm)
+            )
+            H_out[parent] = H_out[parent] + (H_left - M_arm)
+            M_out[parent] = M_out[parent] + M_left
+            bias_out[parent] = bias_out[parent] + wp.spatial_vector(
+                force, moment - ahead * wp.cross(wp.cross(turning, lever), drawn)
+            )
         else:
             lift_out[k] = wp.mat33()
             if body_root[k] >= 0:
                 lift_out[k] = wp.inverse(M - wp.transpose(H) * DH)
 
     # outward: accelerations, and the rates and velocities they lead to
-    for k in range(first, first + size):
+    for k in range(first, first + size * pitch, pitch):
         parent = body_parent[k]
         pushed = wp.spatial_vector()
         motion = wp.spatial_vector()
@@ -426,6 +443,7 @@ def free(
 @wp.kernel
 def response(
     # model
+    pitch: int,
     tree_first: wp.array(dtype=wp.int32),
     body_tree: wp.array(dtype=wp.int32),
     body_parent: wp.array(dtype=wp.int32),
@@ -464,8 +482,8 @@ def response(
     moment_f = wp.mat33()
     moment_m = wp.identity(n=3, dtype=float)
     path = int(body)
-    for i in range(last - first + 1):
-        k = last - i
+    for i in range((last - first) / pitch + 1):
+        k = last - i * pitch
         alpha_by_force_out[shift + k] = zero
         alpha_by_moment_out[shift + k] = zero
         a_by_force_out[shift + k] = zero
@@ -485,7 +503,7 @@ def response(
                 a_by_force_out[shift + k] = lift[k] * force_f
                 a_by_moment_out[shift + k] = lift[k] * force_m
 
-    for k in range(first, last + 1):
+    for k in range(first, last + 1, pitch):
         parent = body_parent[k]
         a_f = a_by_force_out[shift + k]
         a_m = a_by_moment_out[shift + k]
@@ -525,6 +543,7 @@ def response(
 def push(
     # model
     dt: float,
+    pitch: int,
     tree_first: wp.array(dtype=wp.int32),
     tree_moving: wp.array(dtype=wp.int32),
     body_parent: wp.array(dtype=wp.int32),
@@ -550,10 +569,10 @@ def push(
     tree = trees[wp.tid()]
     first = tree_first[tree]
     size = tree_moving[tree]
-    for k in range(first, first + size):
+    for k in range(first, first + size * pitch, pitch):
         spread_out[k] = body_wrench[k]
     for i in range(size):
-        k = first + size - 1 - i
+        k = first + (size - 1 - i) * pitch
         parent = body_parent[k]
         wrench = spread_out[k]
         moment = wp.spatial_bottom(wrench)
@@ -561,8 +580,8 @@ def push(
         if parent >= 0:
             force = wp.spatial_top(wrench) - wp.transpose(DH[k]) * moment
             moment = moment - wp.transpose(DJ[k]) * moment + wp.cross(lever[k], force)
-            spread_out[parent] += wp.spatial_vector(force, moment)
-    for k in range(first, first + size):
+            spread_out[parent] = spread_out[parent] + wp.spatial_vector(force, moment)
+    for k in range(first, first + size * pitch, pitch):
         parent = body_parent[k]
         above = wp.spatial_vector()
         if parent >= 0:
@@ -571,13 +590,13 @@ def push(
             wrench = spread_out[k]
             force = wp.spatial_top(wrench) - wp.transpose(DH[k]) * wp.spatial_bottom(wrench)
             above = wp.spatial_vector(lift[k] * force, wp.vec3())
-            joint_xd_free_out[k] += dt * (lift[k] * force)
+            joint_xd_free_out[k] = joint_xd_free_out[k] + dt * (lift[k] * force)
         alpha = wp.spatial_bottom(above)
         a = wp.spatial_top(above) + wp.cross(alpha, lever[k])
         relative = Du_out[k] - DJ[k] * alpha - DH[k] * a
         added_out[k] = wp.spatial_vector(a, alpha + relative)
-        body_acceleration_out[k] += added_out[k]
-        joint_qd_free_out[k] += dt * wp.quat_rotate_inv(axes[k], relative)
+        body_acceleration_out[k] = body_acceleration_out[k] + added_out[k]
+        joint_qd_free_out[k] = joint_qd_free_out[k] + dt * wp.quat_rotate_inv(axes[k], relative)
 
 
 @wp.kernel
@@ -586,6 +605,7 @@ def integrate(
     dt: float,
     limit: float,
     bound: float,
+    pitch: int,
     tree_first: wp.array(dtype=wp.int32),
     tree_moving: wp.array(dtype=wp.int32),
     body_parent: wp.array(dtype=wp.int32),
@@ -614,8 +634,8 @@ def integrate(
         return
     first = tree_first[tree]
     size = tree_moving[tree]
-    turning = fastest(joint_qd_free, first, size)
-    most = wp.length(wp.vec2(turning, fleeing(joint_x, joint_xd_free, body_parent, body_root, first, size)))
+    turning = fastest(joint_qd_free, first, size, pitch)
+    most = wp.length(wp.vec2(turning, fleeing(joint_x, joint_xd_free, body_parent, body_root, first, size, pitch)))
     tree_rate_out[tree] = most
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
     sound = most <= bound
@@ -625,7 +645,7 @@ def integrate(
     slower = float(1.0)
     if turning > limit:
         slower = 0.5 * limit / turning
-    for k in range(first, first + size):
+    for k in range(first, first + size * pitch, pitch):
         floats = body_parent[k] < 0 and body_root[k] >= 0
         if sound:
             rate = slower * joint_qd_free[k]
@@ -653,7 +673,7 @@ def held(
     air: wp.vec3,
     body_com: wp.array(dtype=wp.vec3),
     body_drag: wp.array(dtype=float),
-    tie_first: wp.array(dtype=wp.int32),
+    tie_span: wp.array(dtype=wp.vec2i),
     tie_point: wp.array(dtype=wp.vec3),
     tie_anchor: wp.array(dtype=wp.vec3),
     tie_stiffness: wp.array(dtype=float),
@@ -674,7 +694,8 @@ def held(
         wind = air - velocity - wp.cross(omega, com)
         force = blown(area, wind) * (wind - dt * (a + wp.cross(alpha, com)))
         wrench += wp.spatial_vector(force, wp.cross(com, force))
-    for t in range(tie_first[k], tie_first[k + 1]):
+    ties = tie_span[k]
+    for t in range(ties[0], ties[1]):
         at = wp.quat_rotate(wp.transform_get_rotation(pose), tie_point[t])
         stretch = wp.transform_get_translation(pose) + at - tie_anchor[t]
         tie = tie_stiffness[t]
@@ -705,6 +726,7 @@ def conserve(
     limit: float,
     bound: float,
     gravity: wp.vec3,
+    pitch: int,
     tree_first: wp.array(dtype=wp.int32),
     tree_moving: wp.array(dtype=wp.int32),
     body_tree: wp.array(dtype=wp.int32),
@@ -717,7 +739,7 @@ def conserve(
     body_inertia: wp.array(dtype=wp.vec3),
     body_product: wp.array(dtype=wp.vec3),
     body_drag: wp.array(dtype=float),
-    tie_first: wp.array(dtype=wp.int32),
+    tie_span: wp.array(dtype=wp.vec2i),
     tie_point: wp.array(dtype=wp.vec3),
     tie_stiffness: wp.array(dtype=float),
     tie_damping: wp.array(dtype=float),
@@ -747,7 +769,7 @@ def conserve(
     tree = body_tree[root]
     if not tree_rate[tree] <= bound:
         return
-    last = tree_first[tree] + tree_moving[tree]
+    last = tree_first[tree] + tree_moving[tree] * pitch
 
     # before the tick, about the root and against it: momentum, and what acted on it since
     here = wp.transform_get_translation(body_q[root])
@@ -758,7 +780,7 @@ def conserve(
     angular = wp.vec3()
     force = wp.vec3()
     moment = wp.vec3()
-    for k in range(root, last):
+    for k in range(root, last, pitch):
         if body_root[k] == root:
             arm = wp.vec3()
             velocity = wp.vec3()
@@ -775,7 +797,7 @@ def conserve(
             momentum = body_mass[k] * (velocity + wp.cross(omega, com))
             given = body_load[k] + body_wrench[k]
             given += held(
-                k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_first, tie_point, tie_anchor,
+                k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_span, tie_point, tie_anchor,
                 tie_stiffness, tie_damping, pose, body_qd[k], body_acceleration[k],
             )  # fmt: skip
             mass += body_mass[k]
@@ -795,7 +817,7 @@ def conserve(
     linear = wp.vec3()
     angular = wp.vec3()
     locked = wp.mat33()
-    for k in range(root, last):
+    for k in range(root, last, pitch):
         if body_root[k] == root:
             base = wp.transform(wp.vec3(), wp.quat_identity())
             motion = wp.spatial_vector()
@@ -850,6 +872,7 @@ def joint_wrench(
     # model
     dt: float,
     gravity: wp.vec3,
+    pitch: int,
     tree_first: wp.array(dtype=wp.int32),
     tree_moving: wp.array(dtype=wp.int32),
     body_tree: wp.array(dtype=wp.int32),
@@ -860,7 +883,7 @@ def joint_wrench(
     body_inertia: wp.array(dtype=wp.vec3),
     body_product: wp.array(dtype=wp.vec3),
     body_drag: wp.array(dtype=float),
-    tie_first: wp.array(dtype=wp.int32),
+    tie_span: wp.array(dtype=wp.vec2i),
     tie_point: wp.array(dtype=wp.vec3),
     tie_stiffness: wp.array(dtype=float),
     tie_damping: wp.array(dtype=float),
@@ -884,10 +907,10 @@ def joint_wrench(
     at = wp.transform_get_translation(body_q[body])
     force = wp.vec3()
     moment = wp.vec3()
-    last = tree_first[tree] + tree_moving[tree]
+    last = tree_first[tree] + tree_moving[tree] * pitch
     if body_parent[body] < 0 and body_root[body] >= 0:
         last = body  # nothing holds what has been cut off
-    for k in range(body, last):
+    for k in range(body, last, pitch):
         up = int(k)
         while up > body:
             up = body_parent[up]
@@ -902,7 +925,7 @@ def joint_wrench(
             own = body_mass[k] * (a - gravity)
             given = body_load[k] + body_wrench[k]
             given += held(
-                k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_first, tie_point, tie_anchor,
+                k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_span, tie_point, tie_anchor,
                 tie_stiffness, tie_damping, pose, body_qd[k], body_acceleration[k],
             )  # fmt: skip
             arm = wp.transform_get_translation(pose) - at

@@ -147,7 +147,8 @@ class Plants:
         self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
         self._moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
-        self._tie_first = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
+        ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
+        self._ties = np.stack([ends[:-1], ends[1:]], -1)
         self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
         self.memory, self.threads = memory, threads
         """Where arrays live, for NumPy and for kernels."""
@@ -402,7 +403,7 @@ class Plants:
         self._must_be_stepping(np.asarray(bodies))
         if n > self._capacity:
             self._record_response(max(2 * self._capacity, n, 16))
-        self._asked[:n] = bodies
+        self._asked[:n] = self.memory.at[bodies]
         self._asked[n] = -1
         self._respond(n)
         self.memory.wait()
@@ -443,7 +444,7 @@ class Plants:
             return 0
         tree = self.model.body_tree[self._roots]
         roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._stepped)]
-        self._floating[: len(roots)] = roots
+        self._floating[: len(roots)] = self.memory.at[roots]
         return len(roots)
 
     def advance(self, ticks: int) -> None:
@@ -519,18 +520,18 @@ class Plants:
         """
         n, device = len(bodies), self.memory.device
         out = wp.zeros(n, dtype=wp.spatial_vector, device=device)
-        asked = wp.array(np.asarray(bodies, np.int32), dtype=wp.int32, device=device)
+        asked = wp.array(self.memory.at[np.asarray(bodies)], dtype=wp.int32, device=device)
         if n:
             m = self.memory.arrays
             wp.launch(
                 plant.joint_wrench,
                 n,
                 inputs=[
-                    self.dt, wp.vec3(GRAVITY), m["tree_first"], m["tree_moving"], m["body_tree"], m["body_parent"],
-                    m["body_root"], m["body_mass"], m["body_com"], m["body_inertia"], m["body_product"],
-                    m["body_drag"], m["tie_first"], m["tie_point"], m["tie_stiffness"], m["tie_damping"], asked,
-                    m["phi_used"], m["tree_air"], m["tie_anchor"], m["body_q"], m["body_qd"], m["acceleration"],
-                    m["body_load"], m["wrench"],
+                    self.dt, wp.vec3(GRAVITY), self.memory.pitch, m["tree_first"], m["tree_moving"], m["body_tree"],
+                    m["body_parent"], m["body_root"], m["body_mass"], m["body_com"], m["body_inertia"],
+                    m["body_product"], m["body_drag"], m["tie_span"], m["tie_point"], m["tie_stiffness"],
+                    m["tie_damping"], asked, m["phi_used"], m["tree_air"], m["tie_anchor"], m["body_q"], m["body_qd"],
+                    m["acceleration"], m["body_load"], m["wrench"],
                 ],
                 outputs=[out],
                 device=device,
@@ -637,13 +638,14 @@ class Plants:
         """
         model, state, memory = self.model, self.state, self.memory
         kinds = {
-            wp.int32: {"tree_first": model.tree_first, "tree_size": model.tree_size, "tree_moving": self._moving,
+            wp.int32: {"tree_moving": self._moving,
                        "body_tree": model.body_tree, "body_parent": self._parent, "body_root": self._root,
-                       "tie_first": self._tie_first, "stepping": self._stepping, "subset": self._subset,
+                       "stepping": self._stepping, "subset": self._subset,
                        "onset": self._onset, "floating": self._floating},
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": self.tie_stiffness,
                     "tie_damping": self.tie_damping, "tree_phi": self.phi, "phi_used": self.phi_used,
                     "tree_rate": self.tree_rate},
+            wp.vec2i: {"tie_span": self._ties},
             wp.bool: {"tree_awake": state.tree_awake},
             wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
@@ -662,13 +664,14 @@ class Plants:
         often = ("body_load", "wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
         self._seldom: list[str] = []
         self._renewed = False
-        constants = {id(value) for value in vars(model).values()} | {id(self._tie_first)}
+        constants = {id(model.tree_pose), id(model.tie_point)}
+        memory.arrange(model.tree_first, model.tree_size)
         for dtype, arrays in kinds.items():
             for name, data in arrays.items():
                 if id(data) in constants:
                     memory.constant(name, data, dtype)
-                elif name.startswith(("body_", "joint_")) or name in made + often:
-                    memory.rows(name, data, dtype)
+                elif name.startswith(("body_", "joint_", "tie_span")) or name in made + often:
+                    memory.rows(name, data, dtype, points=name in ("body_parent", "body_root"))
                     self._seldom += [name] if name not in made + often else []
                 else:
                     memory.reach(name, data, dtype)
@@ -681,16 +684,16 @@ class Plants:
         }
         for dtype, names in scratch.items():
             for name in names:
-                memory.scratch(name, len(model.body_mass), dtype)
-        memory.scratch("idle_phi", len(model.tree_first), float)
-        a, largest = memory.arrays, int(model.tree_size.max(initial=1))
+                memory.scratch(name, dtype)
+        a = memory.arrays
+        a["idle_phi"] = wp.empty(len(model.tree_first), dtype=float, device=memory.device)
 
         def record(kernel: wp.Kernel, *inputs: object, **options: Any) -> Callable[..., None]:
             given = [a[value] if isinstance(value, str) else value for value in inputs]
             return bind(kernel, given, [], device=str(memory.device), **options)
 
         def carrier(trees: str, *names: str, back: bool = False) -> Callable[[int], None]:
-            return memory.carrier(names, trees, largest, back=back)
+            return memory.carrier(names, trees, back=back)
 
         self._carry_in = carrier("stepping", *often)
         self._carry_out_free = carrier("stepping", "body_q", "body_qd", "velocity_free", back=True)
@@ -705,9 +708,12 @@ class Plants:
         self._carry_out_kick = carrier("subset", "joint_xd_free", "joint_qd_free", back=True)
 
         gravity, dt = wp.vec3(GRAVITY), self.dt
-        tree, joint = ("tree_first", "tree_moving"), ("body_parent", "body_root", "body_offset", "body_rest")
+        tree, joint = (
+            (memory.pitch, "tree_first", "tree_moving"),
+            ("body_parent", "body_root", "body_offset", "body_rest"),
+        )
         body = ("body_mass", "body_com", "body_inertia", "body_product", "body_drag")
-        tie = ("tie_first", "tie_point", "tie_stiffness", "tie_damping")
+        tie = ("tie_span", "tie_point", "tie_stiffness", "tie_damping")
         where = ("joint_x", "joint_xd", "joint_q", "joint_qd")
         factors = ("axes", "lever", "D", "DJ", "DH", "lift")
         freed = ("joint_xd_free", "joint_qd_free")
@@ -728,7 +734,16 @@ class Plants:
             )  # fmt: skip
 
         self._place = record(
-            plant.place, "tree_first", "tree_size", "tree_pose", *joint, "subset", *where, "body_q", "body_qd"
+            plant.place,
+            memory.pitch,
+            "tree_first",
+            "tree_size",
+            "tree_pose",
+            *joint,
+            "subset",
+            *where,
+            "body_q",
+            "body_qd",
         )
         self._free = free(self.brisk, float(tension), "stepping", "phi_used", "acceleration", "velocity_free")
         self._push = push(dt, "wrench", "acceleration")
@@ -759,13 +774,13 @@ class Plants:
         self._capacity, memory = capacity, self.memory
         self._asked = memory.within_reach(np.full(capacity + 1, -1, np.int32))
         self._response = memory.within_reach(np.zeros((capacity, 6, capacity, 6), np.float32))
-        stride = int(self.model.tree_size.max())
+        stride = memory.span
         columns = [wp.empty(capacity * stride, dtype=wp.mat33, device=memory.device) for _ in range(4)]
         memory.reach("asked", self._asked, wp.int32)
         memory.reach("response", self._response, float)
         self._respond = self._bind(
-            plant.response, "tree_first", "body_tree", "body_parent", stride, "asked", "lever", "D", "DJ", "DH",
-            "lift", *columns, "response",
+            plant.response, memory.pitch, "tree_first", "body_tree", "body_parent", stride, "asked", "lever", "D", "DJ",
+            "DH", "lift", *columns, "response",
         )  # fmt: skip
 
 

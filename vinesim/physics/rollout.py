@@ -122,7 +122,7 @@ class Rollout:
         trees = len(model.tree_first)
         self._given = {
             "dt": dt, "brisk": brisk, "limit": limit, "bound": bound, "tension": float(tension),
-            "gravity": wp.vec3(GRAVITY),
+            "gravity": wp.vec3(GRAVITY), "pitch": 1,
         }  # fmt: skip
         self._arrays = {
             "trees": wp.array(np.arange(trees), dtype=wp.int32, device=self.device),
