@@ -34,6 +34,9 @@ BOUND = wp.constant(5)
 SKIN = wp.constant(wp.float64(0.002))
 """Contacts are seen from this gap on [m], and from as far as the two can come together in one tick."""
 
+HAIR = wp.constant(wp.float64(0.0002))
+"""What stands and other branches count when a tick brings them closer than this [m]."""
+
 AGREE = wp.constant(wp.float64(0.5))
 """Least cosine between the normals before and after a tick for which the contact moves on smoothly."""
 
@@ -313,6 +316,8 @@ def bound_trees(
     start_ahead_out: wp.array(dtype=wp.vec3),
     end_ahead_out: wp.array(dtype=wp.vec3),
     speed_out: wp.array(dtype=float),
+    shape_low_out: wp.array(dtype=wp.vec3),
+    shape_high_out: wp.array(dtype=wp.vec3),
     low_out: wp.array(dtype=wp.vec3),
     high_out: wp.array(dtype=wp.vec3),
 ):
@@ -348,10 +353,14 @@ def bound_trees(
         end = wp.transform_point(pose, shape_end[s])
         reach = wp.max(wp.length(shape_start[s]), wp.length(shape_end[s])) + shape_radius[s]
         speed = wp.length(wp.spatial_top(motion)) + reach * wp.length(wp.spatial_bottom(motion))
+        grown = wp.vec3(shape_radius[s] + speed * dt)
+        shape_low = wp.min(start, end) - grown
+        shape_high = wp.max(start, end) + grown
+        shape_low_out[s] = shape_low
+        shape_high_out[s] = shape_high
         if here(shape_when[s], fine):
-            grown = wp.vec3(shape_radius[s] + speed * dt)
-            low = wp.min(low, wp.min(start, end) - grown)
-            high = wp.max(high, wp.max(start, end) + grown)
+            low = wp.min(low, shape_low)
+            high = wp.max(high, shape_high)
         start_out[s] = start
         end_out[s] = end
         start_ahead_out[s] = ahead(dt, pose, motion, bend_out[body], start)
@@ -500,11 +509,14 @@ def meet(
     tree_high: wp.array(dtype=wp.vec3),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
+    body_qd_free: wp.array(dtype=wp.spatial_vector),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
     start_ahead: wp.array(dtype=wp.vec3),
     end_ahead: wp.array(dtype=wp.vec3),
     shape_speed: wp.array(dtype=float),
+    shape_low: wp.array(dtype=wp.vec3),
+    shape_high: wp.array(dtype=wp.vec3),
     xmat: wp.array(dtype=wp.mat33d),
     middle: wp.array(dtype=wp.vec3d),
     geom_velocity: wp.array(dtype=wp.vec3d),
@@ -563,7 +575,8 @@ def meet(
                 margin = SKIN + (wp.float64(shape_speed[s]) + geom_speed[g]) * dt
                 between = center - middle[g]
                 limit = bound + geom_radius[g] + margin
-                if wp.dot(between, between) < limit * limit:
+                touch = not apart(shape_low[s], shape_high[s], geom_low[g], geom_high[g])
+                if touch and wp.dot(between, between) < limit * limit:
                     rotation = xmat[geom_id[g]]
                     near = nearest(geom_kind[g], geom_size[g], rotation, middle[g], a, b)
                     gap = near[3] - radius
@@ -582,7 +595,8 @@ def meet(
                                 to_double(end_drawn[s]),
                             )  # fmt: skip
                             gap = gap - wp.min(drawn[3] - radius - SKIN, zero)
-                            wanted = gap + wp.min(come, zero) < SKIN
+                            freely = velocity_at(body_q[body], body_qd_free[body], point)
+                            wanted = gap + wp.min(wp.min(come, dt * wp.dot(normal, freely)), zero) < HAIR
                         if wanted:
                             later = nearest(
                                 geom_kind[g], geom_size[g], turn(dt * geom_spin[g], rotation),
@@ -651,11 +665,14 @@ def meet_branches(
     tree_high: wp.array(dtype=wp.vec3),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
+    body_qd_free: wp.array(dtype=wp.spatial_vector),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
     start_ahead: wp.array(dtype=wp.vec3),
     end_ahead: wp.array(dtype=wp.vec3),
     shape_speed: wp.array(dtype=float),
+    shape_low: wp.array(dtype=wp.vec3),
+    shape_high: wp.array(dtype=wp.vec3),
     # out
     found_out: wp.array(dtype=wp.int32),
     hit_shape_out: wp.array2d(dtype=wp.int32),
@@ -681,19 +698,14 @@ def meet_branches(
             low = wp.max(tree_low[tree], tree_low[other])
             high = wp.min(tree_high[tree], tree_high[other])
             for s in range(tree_shape[tree], tree_shape[tree + 1]):
-                grown = wp.vec3(shape_radius[s] + shape_speed[s] * float(dt))
-                s_low = wp.min(start[s], end[s]) - grown
-                s_high = wp.max(start[s], end[s]) + grown
+                s_low = shape_low[s] - wp.vec3(0.002)
+                s_high = shape_high[s] + wp.vec3(0.002)
                 within = not apart(s_low, s_high, low, high)
                 if other == tree:
                     within = shape_bunch[s] >= 0
                 if within and there(shape_when[s], tree_fine[tree], shape_bunch[s], bunch_attached):
                     for t in range(tree_shape[other], tree_shape[other + 1]):
-                        radius = shape_radius[s] + shape_radius[t]
-                        margin = radius + 0.002 + (shape_speed[s] + shape_speed[t]) * float(dt)
-                        between = 0.5 * (start[s] + end[s] - start[t] - end[t])
-                        limit = margin + 0.5 * (wp.length(end[s] - start[s]) + wp.length(end[t] - start[t]))
-                        pair = wp.length_sq(between) < limit * limit
+                        pair = not apart(s_low, s_high, shape_low[t], shape_high[t])
                         if pair and other == tree:
                             pair = not kin(shape_body[s], shape_body[t], body_parent)
                             if shape_bunch[t] >= 0:
@@ -703,6 +715,8 @@ def meet_branches(
                             b = to_double(end[s])
                             c = to_double(start[t])
                             d = to_double(end[t])
+                            radius = shape_radius[s] + shape_radius[t]
+                            margin = radius + 0.002 + (shape_speed[s] + shape_speed[t]) * float(dt)
                             near = crossing(a, b, c, d)
                             gap = near[3] - wp.float64(radius)
                             if near[3] < wp.float64(margin):
@@ -717,7 +731,9 @@ def meet_branches(
                                 push = velocity_at(body_q[shape_body[t]], body_qd[shape_body[t]], point)
                                 come = dt * wp.dot(normal, velocity - push)
                                 gap = gap - wp.min(drawn[3] - wp.float64(radius) - SKIN, zero)
-                                if gap + wp.min(come, zero) < SKIN:
+                                freely = velocity_at(body_q[shape_body[s]], body_qd_free[shape_body[s]], point)
+                                freely = freely - velocity_at(body_q[shape_body[t]], body_qd_free[shape_body[t]], point)
+                                if gap + wp.min(wp.min(come, dt * wp.dot(normal, freely)), zero) < HAIR:
                                     later = crossing(
                                         to_double(start_ahead[s]), to_double(end_ahead[s]), to_double(start_ahead[t]),
                                         to_double(end_ahead[t]),
