@@ -21,6 +21,7 @@ SPHERE = wp.constant(2)
 CAPSULE = wp.constant(3)
 ELLIPSOID = wp.constant(4)
 CYLINDER = wp.constant(5)
+BOX = wp.constant(6)
 
 # what is counted in one tick: awake trees, hits, hits without room, trees that are struck, plant bodies in contact,
 # and whether constraints of MuJoCo's own bind what is touched
@@ -46,6 +47,10 @@ ABRUPT = wp.constant(wp.float64(0.3))
 vec5d = wp.types.vector(length=5, dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
+FLAT = wp.constant(wp.float64(0.999))
+"""Least cosine between the normals at both ends of what runs along a face."""
+
+FACE_BISECTIONS = wp.constant(12)
 BLOCK = wp.constant(32)
 """So many things that do not move share one box, and are sorted out by one comparison."""
 
@@ -164,6 +169,45 @@ def nearest(kind: int, size: wp.vec3d, rotation: wp.mat33d, middle: wp.vec3d, a:
     n = distance(kind, size, start + t * along)
     normal = rotation * wp.vec3d(n[0], n[1], n[2])
     return vec5d(normal[0], normal[1], normal[2], n[3], t)
+
+
+@wp.func
+def close_to_flat(kind: int):
+    """Whether a segment can lie along this kind of primitive."""
+    return kind == BOX or kind == CAPSULE or kind == CYLINDER
+
+
+@wp.func
+def level(least: wp.vec4d, there: wp.vec4d):
+    """Whether a point lies along the same face as the closest one."""
+    agree = least[0] * there[0] + least[1] * there[1] + least[2] * there[2]
+    return agree > FLAT and there[3] < least[3] + SKIN
+
+
+@wp.func
+def along_face(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64):
+    """Both ends (0 to 1) of what runs along a primitive about its closest point; one place twice if it crosses it.
+
+    A segment that lies along a face needs two contacts: with one, it rocks about it from tick to tick.
+    """
+    half = wp.float64(0.5)
+    along = b - a
+    least = distance(kind, size, a + t * along)
+    ends = wp.vec2d(wp.float64(0.0), wp.float64(1.0))
+    for side in range(2):
+        if not level(least, distance(kind, size, a + ends[side] * along)):
+            outer = ends[side]
+            inner = t
+            for i in range(FACE_BISECTIONS):
+                middle = half * (outer + inner)
+                if level(least, distance(kind, size, a + middle * along)):
+                    inner = middle
+                else:
+                    outer = middle
+            ends[side] = inner
+    if (ends[1] - ends[0]) * wp.length(along) < wp.float64(2.0) * SKIN:
+        ends = wp.vec2d(t, t)
+    return ends
 
 
 @wp.func
@@ -579,10 +623,26 @@ def meet(
                 if touch and wp.dot(between, between) < limit * limit:
                     rotation = xmat[geom_id[g]]
                     near = nearest(geom_kind[g], geom_size[g], rotation, middle[g], a, b)
-                    gap = near[3] - radius
-                    if gap < margin:
+                    sides = int(0)  # noqa: RUF046
+                    ends = wp.vec2d(near[4], near[4])
+                    if near[3] - radius < margin:
+                        sides = 1
+                        if close_to_flat(geom_kind[g]):
+                            back = wp.transpose(rotation)
+                            ends = along_face(
+                                geom_kind[g], geom_size[g], back * (a - middle[g]), back * (b - middle[g]), near[4]
+                            )
+                            if ends[0] < ends[1]:
+                                sides = 2
+                    for side in range(sides):
+                        # two points of a side along a face are followed each for itself, a single one is looked for
+                        if sides == 2:
+                            p = a + ends[side] * (b - a)
+                            near = nearest(geom_kind[g], geom_size[g], rotation, middle[g], p, p)
+                        t = ends[side]
+                        gap = near[3] - radius
                         normal = wp.vec3d(near[0], near[1], near[2])
-                        point = a + near[4] * (b - a) - (radius + half * gap) * normal
+                        point = a + t * (b - a) - (radius + half * gap) * normal
                         # how the two come together if both go on as they go, and where they are when the tick ends
                         body = shape_body[s]
                         velocity = velocity_at(body_q[body], body_qd[body], point)
@@ -598,23 +658,28 @@ def meet(
                             freely = velocity_at(body_q[body], body_qd_free[body], point)
                             wanted = gap + wp.min(wp.min(come, dt * wp.dot(normal, freely)), zero) < HAIR
                         if wanted:
+                            from_a = to_double(start_ahead[s])
+                            from_b = to_double(end_ahead[s])
+                            if sides == 2:
+                                from_a = from_a + t * (from_b - from_a)
+                                from_b = from_a
                             later = nearest(
                                 geom_kind[g], geom_size[g], turn(dt * geom_spin[g], rotation),
-                                middle[g] + dt * geom_velocity[g], to_double(start_ahead[s]), to_double(end_ahead[s]),
+                                middle[g] + dt * geom_velocity[g], from_a, from_b,
                             )  # fmt: skip
                             normal_later = wp.vec3d(later[0], later[1], later[2])
                             bent = zero
                             if wp.dot(normal, normal_later) > AGREE:
                                 moved = dt * wp.length(velocity - push)
                                 bent = wp.clamp(later[3] - near[3] - come, -moved, moved)
-                                onto = to_double(start_ahead[s]) + later[4] * to_double(end_ahead[s] - start_ahead[s])
+                                onto = from_a + later[4] * (from_b - from_a)
                                 onto = onto - (later[3] - half * gap) * normal_later - dt * velocity
                                 normal = wp.normalize(normal + normal_later)
                                 point = half * (point + onto)
                             if gap + come + bent < zero and come < -ABRUPT * dt:
                                 onset = True
                             if found < slots:
-                                hit_shape_out[i, found] = s
+                                hit_shape_out[i, found] = 2 * s + side
                                 hit_other_out[i, found] = g
                                 hit_gap_out[i, found] = gap
                                 hit_room_out[i, found] = gap + bent
@@ -747,7 +812,7 @@ def meet_branches(
                                     if gap + come + bent < zero and come < -ABRUPT * dt:
                                         onset_out[i] = True
                                     if found < slots:
-                                        hit_shape_out[i, found] = s
+                                        hit_shape_out[i, found] = 2 * s
                                         hit_other_out[i, found] = -1 - t
                                         hit_gap_out[i, found] = gap
                                         hit_room_out[i, found] = gap + bent
@@ -811,7 +876,7 @@ def index(
         shape = hit_shape[hits[c]]
         other = hit_other[hits[c]]
         shape_out[c] = shape
-        body_out[c] = shape_body[shape]
+        body_out[c] = shape_body[shape // 2]
         other_body_out[c] = -1
         if other < 0:
             other_body_out[c] = shape_body[-1 - other]
