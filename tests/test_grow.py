@@ -93,3 +93,36 @@ def test_nonsense_is_refused_in_words():
     slack.add(-1, mass=1.0)
     with pytest.raises(ValueError, match="body 0 has joint stiffness"):
         slack.settle()
+
+
+def hung(clusters: bool = True) -> grow.Tree:
+    tree = beam(4)
+    stalk = tree.rod(
+        3, 0.06, (0.0022, 0.0022), CANE, 2, organ=Organ.PEDUNCLE, rest=frames.exp(np.array([0.0, np.pi / 2, 0.0]))
+    )
+    tree.bunch(stalk[-1], 0.6, count=90, seed=7, clusters=clusters, pull=40.0)
+    return tree
+
+
+def test_a_bunch_hung_on_a_tree_brings_its_clusters():
+    model = grow.assemble([hung(), hung()])
+    n = int(model.bunch_clusters[0])
+    assert model.tree_core.tolist() == [7, 7]
+    assert model.tree_size.tolist() == [7 + n, 7 + n]
+    assert model.bunch_cluster.tolist() == [7, 14 + n]
+    assert model.body_parent[7 : 7 + n].tolist() == [6, *range(7, 6 + n)]
+    assert model.body_parent[14 + n : 14 + 2 * n].tolist() == [13 + n, *range(14 + n, 13 + 2 * n)]
+    assert model.bunch_head_mass[0] + model.body_mass[7 : 7 + n].sum() == pytest.approx(0.6, rel=1e-6)
+    assert model.body_mass[6] == pytest.approx(0.6, rel=1e-6)
+    assert model.bunch_pull.tolist() == [40.0, 40.0]
+    assert 0.10 < model.bunch_length[0] < 0.2
+
+
+def test_a_bunch_with_clusters_weighs_once_when_it_settles():
+    fine, whole = hung(), hung(clusters=False)
+    for tree in (fine, whole):
+        tree.settle()
+    models = [grow.assemble([tree]) for tree in (fine, whole)]
+    assert len(models[1].body_mass) == 7
+    assert models[0].joint_settled[:7] == pytest.approx(models[1].joint_settled, abs=1e-5)
+    assert np.linalg.norm(frames.log(models[0].joint_settled[6].astype(float))) < 0.3

@@ -5,11 +5,11 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from touch_scenes import bar, bunch_scene, cane, grasp, gripper
+from touch_scenes import DOWN, bar, bunch_scene, cane, grasp, gripper
 
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.world.grow import assemble
+from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.ids import Organ
 from vinesim.world.values import Parting
 
@@ -211,3 +211,131 @@ def test_a_bunch_dropped_over_a_crate_ends_in_it():
     assert 0.0 < bunch[2] - crate[2] < 0.25
     assert np.abs(bunch[:2] - crate[:2]).max() < 0.3
     assert np.abs(physics.rigid.data.qvel).max() < 0.1
+
+
+def laden(clusters: bool = True, side: bool = True) -> Tree:
+    """A cane of 1 m with a bunch half way along, and a side shoot behind it that carries another."""
+    tree = Tree(frames.pose(np.array([0.0, 0.0, 1.6])))
+    wood, green = Wood(5e9, 900.0, 0.01), Wood(3e8, 1000.0, 0.05)
+    main = tree.rod(-1, 1.0, (0.006, 0.004), wood, 10)
+    for at in (main[4], main[8]) if side else (main[4],):
+        stalk = tree.rod(at, 0.06, (0.0022, 0.0022), green, 2, organ=Organ.PEDUNCLE, rest=DOWN)
+        tree.bunch(stalk[-1], 0.5, count=80, seed=3, clusters=clusters)
+    tree.settle()
+    return tree
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_a_cut_cane_falls_and_takes_its_bunch_along(fine):
+    model = assemble([laden()])
+    physics = Physics(model)
+    if fine:
+        physics.plants.wake(0)
+        physics.watch(model.forward(model.joint_settled)[model.bunch_body, :3], 0.1)
+    for _ in range(5):
+        physics.step()
+    assert physics.state.tree_fine[0] == fine
+    below = [6, 7, 8, 9, *range(13, 16), *range(int(model.bunch_cluster[1]), len(model.body_mass))]
+    moving = below if fine else below[:7]
+    before = physics.view().body_q.copy()
+    weight = 9.81 * physics.plants.body_mass[moving].sum()
+    physics.cut(6)
+    for _ in range(20):
+        physics.step()
+        if physics.partings:
+            (parting,) = physics.partings
+    assert (parting.body, parting.bunch, parting.cause) == (6, -1, "command")
+    assert parting.force[2] == pytest.approx(weight, rel=0.01)
+    fallen = (before - physics.view().body_q)[:, 2]
+    assert fallen[moving].mean() == pytest.approx(0.5 * 9.81 * 0.2**2, rel=0.1)
+    assert fallen[:5].max() < 1e-4  # and the rest springs up
+    assert physics.state.bunch_attached.all()
+    with pytest.raises(ValueError, match="cut already"):
+        physics.cut(6)
+    with pytest.raises(ValueError, match="no piece of wood"):
+        physics.cut(int(model.bunch_body[0]))
+
+
+def test_a_blade_cuts_the_piece_next_to_the_root_and_only_that():
+    """The mouth spans a joint of two pieces: one cut, which takes the further one along."""
+    model = assemble([laden()])
+    physics = Physics(model)
+    joint = physics.view().body_q[7, :3]
+    physics.add_robot(bar(joint + np.array([0.0, -0.5, -0.2])))
+    mouth = physics.blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.2])), np.array([0.03, 0.03, 0.03]))
+    mouth.close()
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.body, parting.bunch, parting.cause, parting.actor) == (6, -1, "blade", "bar")
+    assert physics.state.body_cut.tolist() == [body == 6 for body in range(len(model.body_mass))]
+
+
+def test_a_stalk_that_is_cut_by_command_lets_its_bunch_go():
+    model = assemble([laden()])
+    physics = Physics(model)
+    physics.cut(10)
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.body, parting.bunch) == (12, 0)
+    assert physics.rigid.loose == (0,)
+
+
+def test_a_fine_bunch_is_picked_as_the_compound_that_it_is():
+    """Its clusters swing; loose, it has their weight, middle and moments where they are, and their momentum."""
+    model = assemble([laden(side=False)])
+    physics = Physics(model)
+    parts = np.arange(model.bunch_cluster[0], model.bunch_cluster[0] + model.bunch_clusters[0])
+    everything = np.append(parts, model.bunch_body[0])
+    physics.watch(model.forward(model.joint_settled)[model.bunch_body, :3], 0.2)
+    physics.plants.wake(0)
+    physics.step()
+    physics.state.joint_qd[parts[0], 1] = 2.0
+    for _ in range(10):
+        physics.step()
+    assert physics.state.tree_fine[0]
+    q, qd = physics.view().body_q[everything].astype(float), physics.state.body_qd[everything].astype(float)
+    com = frames.rotate(q[:, 3:], physics.plants.body_com[everything].astype(float))
+    mass = physics.plants.body_mass[everything].astype(float)
+    middle = mass @ (q[:, :3] + com) / mass.sum()
+    before = mass @ (qd[:, :3] + np.cross(qd[:, 3:], com))
+    physics.pick(0)
+    world, data = physics.rigid.world, physics.rigid.data
+    after = momentum(physics, "loose/0")
+    body = world.body("loose/0").id
+    assert world.body_mass[body] == pytest.approx(0.5, rel=1e-6)
+    np.testing.assert_allclose(data.xipos[body], middle, atol=1e-6)
+    assert np.linalg.norm(before) > 0.02
+    # the clusters stop against their head within no time, and the stalk, which is still there then, feels it
+    np.testing.assert_allclose(after, before, atol=0.05 * np.linalg.norm(before))
+    shapes = physics.rigid.links()[0].shapes
+    assert len(shapes) == model.bunch_clusters[0]
+    for shape, part in zip(shapes, parts, strict=True):
+        at = frames.compose(physics.rigid.link_q()[0], shape.pose)[:3]
+        pose = physics.state.body_q[part].astype(float)
+        half = np.array([0.5 * model.body_length[part], 0.0, 0.0])
+        np.testing.assert_allclose(at, pose[:3] + frames.rotate(pose[3:], half), atol=1e-5)
+
+
+def test_a_fine_bunch_cut_in_the_grasp_stays_in_it():
+    """As the coarse one: its shapes go along as they are held."""
+    tree = laden(side=False)
+    model = assemble([tree])
+    pose = model.forward(model.joint_settled)[model.bunch_body[0]]
+    middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[0], 0.0, 0.0]))
+    physics = Physics(model)
+    physics.add_robot(gripper(middle))
+    for tick in range(290):
+        physics.rigid.command("grip", grasp(0.01 * tick)[0])
+        physics.step()
+    assert physics.state.tree_fine[0]
+    squeeze = physics.rigid.read("grip")[3][2:].copy()
+    physics.pick(0)
+    fingers, place = [], []
+    for _ in range(200):
+        physics.step()
+        fingers.append(physics.rigid.read("grip")[3][2:].copy())
+        place.append(physics.rigid.bunch_pose(0)[:3] - physics.rigid.link_pose("grip", "hand")[:3])
+
+    assert np.abs(np.array(fingers) / squeeze - 1.0).max() < 0.015
+    # two fingers of equal force let it wander between them, but it does not sink
+    assert np.abs(np.array(place)[:, 2] - place[0][2]).max() < 5e-5

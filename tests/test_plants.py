@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from clustered import clustered, momenta, moving
 
 from vinesim import frames
 from vinesim.physics.plants import ONSET, Plants
@@ -222,3 +223,306 @@ def test_bad_state_and_options_are_refused() -> None:
         Plants(model, State.at_rest(model), phi=0.4)
     with pytest.raises(ValueError, match=r"use State\.at_rest"):
         Plants(model, State.at_rest(canes(2)))
+
+
+# ---- coarse and fine
+
+
+@pytest.fixture
+def fruit() -> Plants:
+    """Three canes with clustered bunches and one plain."""
+    model = clustered(3)
+    return Plants(model, State.at_rest(model))
+
+
+def beyond(plants: Plants, joint: int) -> np.ndarray:
+    """The moving bodies that a joint carries."""
+    bodies = moving(plants, plants.model.body_tree[[joint]])
+    up = bodies.copy()
+    while (up > joint).any():
+        up = np.where(up > joint, plants.model.body_parent[up], up)
+    return bodies[up == joint]
+
+
+def stir(plants: Plants, rate: float = 2.0) -> None:
+    """Random rates in every joint that moves."""
+    rng, state = np.random.default_rng(3), plants.state
+    plants.wake(np.arange(len(plants.model.tree_first)))
+    bodies = moving(plants, np.arange(len(plants.model.tree_first)))
+    state.joint_q[bodies] = frames.multiply(frames.exp(rng.normal(size=(len(bodies), 3)) * 0.1), state.joint_q[bodies])
+    state.joint_qd[bodies] = rng.normal(size=(len(bodies), 3)) * rate
+    plants.kinematics()
+
+
+def test_clusters_of_a_coarse_tree_ride(fruit: Plants) -> None:
+    model, state = fruit.model, fruit.state
+    stir(fruit)
+    still = state.joint_q.copy()
+    step(fruit, 20)
+    fruit.kinematics()
+    riding = np.setdiff1d(np.arange(len(still)), moving(fruit, np.arange(3)))
+    assert len(riding) == 15
+    np.testing.assert_array_equal(state.joint_q[riding], still[riding])
+    np.testing.assert_allclose(state.body_q, model.forward(state.joint_q), atol=3e-6)
+    cluster, bunch = model.bunch_cluster[1], model.bunch_body[1]
+    offset = state.body_q[cluster, :3] - state.body_q[bunch, :3]
+    velocity = state.body_qd[bunch, :3] + np.cross(state.body_qd[bunch, 3:], offset)
+    np.testing.assert_allclose(state.body_qd[cluster], [*velocity, *state.body_qd[bunch, 3:]], atol=1e-5)
+
+
+def test_refining_goes_on_with_pose_velocity_and_momentum(fruit: Plants) -> None:
+    state, model = fruit.state, fruit.model
+    stir(fruit)
+    step(fruit, 5)
+    fruit.kinematics()
+    pose, speed = state.body_q.copy(), state.body_qd.copy()
+    joints = np.arange(*model.bodies_of(1).indices(99))[:-5]
+    before = [momenta(fruit, beyond(fruit, j), pose[j, :3].astype(float)) for j in joints]
+    fruit.refine(np.array([1, 2]))
+    fruit.refine(1)
+    assert state.tree_fine.tolist() == [False, True, True]
+    np.testing.assert_array_equal(state.body_q, pose)
+    np.testing.assert_array_equal(state.body_qd, speed)
+    for joint, (linear, angular, center, energy) in zip(joints, before, strict=True):
+        after = momenta(fruit, beyond(fruit, joint), pose[joint, :3].astype(float))
+        np.testing.assert_allclose(after[0], linear, atol=2e-6 * np.abs(linear).max())
+        np.testing.assert_allclose(after[1], angular, atol=2e-6 * np.abs(angular).max())
+        np.testing.assert_allclose(after[2], center, atol=1e-6)
+        assert after[3] == pytest.approx(energy, rel=2e-6)
+
+
+def test_coarsening_keeps_pose_and_momentum_and_never_adds_energy(fruit: Plants) -> None:
+    """A bunch keeps its angular momentum about its origin; no other tree feels anything."""
+    state, model = fruit.state, fruit.model
+    fruit.refine(np.arange(3))
+    stir(fruit, 4.0)
+    pose, joint_q = state.body_q.copy(), state.joint_q.copy()
+    bunches = model.bunch_body[1:]
+    before = [momenta(fruit, beyond(fruit, j), pose[j, :3].astype(float)) for j in bunches]
+    energy = [momenta(fruit, moving(fruit, np.array([i])), np.zeros(3))[3] for i in (1, 2)]
+    other = state.joint_qd[model.bodies_of(0)].copy()
+    fruit.coarsen(np.array([1, 2]))
+    assert state.tree_fine.tolist() == [True, False, False]
+    np.testing.assert_array_equal(state.body_q, pose)
+    np.testing.assert_array_equal(state.joint_q, joint_q)
+    np.testing.assert_array_equal(state.joint_qd[model.bodies_of(0)], other)
+    for joint, (_, angular, center, _) in zip(bunches, before, strict=True):
+        after = momenta(fruit, beyond(fruit, joint), pose[joint, :3].astype(float))
+        np.testing.assert_allclose(after[1], angular, atol=2e-6 * np.abs(angular).max())
+        np.testing.assert_allclose(after[2], center, atol=1e-6)
+    for i in (0, 1):
+        assert momenta(fruit, moving(fruit, np.array([i + 1])), np.zeros(3))[3] < energy[i]
+
+
+def test_energy_never_grows_whatever_the_clusters_do() -> None:
+    model = clustered(1)
+    for seed in range(20):
+        plants = Plants(model, State.at_rest(model))
+        rng = np.random.default_rng(seed)
+        plants.refine(0)
+        plants.state.joint_q[:] = frames.exp(rng.normal(size=(len(model.body_mass), 3)))
+        plants.state.joint_qd[-5:] = rng.normal(size=(5, 3)) * 10.0
+        plants.kinematics(0)
+        energy = momenta(plants, moving(plants, np.array([0])), np.zeros(3))[3]
+        plants.coarsen(0)
+        assert momenta(plants, moving(plants, np.array([0])), np.zeros(3))[3] < energy
+
+
+def test_fine_and_coarse_hang_the_same() -> None:
+    """A fine tree comes to rest, is coarsened, and stays: nothing moves by 0.1 mm, nor does it as its twin."""
+    model = clustered(2)
+    plants = Plants(model, State.at_rest(model))
+    plants.refine(0)
+    stir(plants, 1.0)
+    for _ in range(100):  # stop it at every turning point, or nearly
+        step(plants, 12)
+        plants.state.joint_qd[:] = 0.0
+    plants.kinematics()
+    pose = plants.state.body_q[:, :3].copy()
+    size = int(model.tree_size[0])
+    tips = pose[[7, size + 7]]
+    np.testing.assert_allclose(tips[1] - tips[0], [0.0, 0.5, 0.0], atol=1e-4)
+    plants.coarsen(0)
+    plants.refine(1)
+    step(plants, 300)
+    plants.kinematics()
+    np.testing.assert_allclose(plants.state.body_q[:, :3][[7, size + 7]], tips, atol=1e-4)
+    np.testing.assert_allclose(plants.state.body_q[:size, :3], pose[:size], atol=1e-4)
+
+
+@pytest.mark.parametrize("at", [0, 10])
+def test_a_cut_tree_that_coarsens_keeps_all_momentum(at: int) -> None:
+    """The whole tree, or the bunch alone."""
+    model = clustered(1)
+    plants = Plants(model, State.at_rest(model))
+    plants.refine(0)
+    stir(plants)
+    plants.cut(at)
+    linear, angular, _, energy = momenta(plants, beyond(plants, at), np.zeros(3))
+    plants.coarsen(0)
+    after = momenta(plants, beyond(plants, at), np.zeros(3))
+    np.testing.assert_allclose(after[0], linear, atol=2e-6 * np.abs(linear).max())
+    np.testing.assert_allclose(after[1], angular, atol=2e-6 * np.abs(angular).max())
+    assert after[3] < energy
+
+
+def test_sleepers_refine_in_their_sleep_and_plain_trees_ignore_it(plants: Plants, fruit: Plants) -> None:
+    plants.refine(np.arange(4))
+    plants.coarsen(2)
+    assert not plants.state.tree_fine.any()
+    fruit.refine(np.array([0]))
+    assert len(fruit.awake) == 0
+    fruit.wake(0)
+    step(fruit, 3)
+    fruit.rest(0)
+    fruit.coarsen(0)
+    assert len(fruit.awake) == 0
+
+
+def test_a_touch_on_what_rides_is_refused(fruit: Plants) -> None:
+    fruit.wake(0)
+    fruit.free()
+    cluster = int(fruit.model.bunch_cluster[0])
+    with pytest.raises(ValueError, match=rf"body {cluster} is touched, but tree 0 is coarse .* or refine the tree"):
+        fruit.commit(np.array([cluster]), np.zeros((1, 6)))
+    fruit.refine(0)
+    fruit.free()
+    assert fruit.response(np.array([cluster])).any()
+
+
+def test_a_picked_bunch_stays_light_however_it_is_seen(fruit: Plants) -> None:
+    body = int(fruit.model.bunch_body[0])
+    inertia = fruit.body_inertia[body].copy()
+    fruit.reweigh(body, 0.001)
+    np.testing.assert_allclose(fruit.body_inertia[body], inertia * 0.002, rtol=1e-5)
+    fruit.refine(0)
+    bodies = [body, *range(fruit.model.bunch_cluster[0], fruit.model.bunch_cluster[0] + 5)]
+    assert fruit.body_mass[bodies].sum() == pytest.approx(0.001, rel=1e-5)
+    fruit.reweigh(body, 0.002)
+    fruit.coarsen(0)
+    assert fruit.body_mass[body] == pytest.approx(0.002, rel=1e-5)
+    np.testing.assert_allclose(fruit.body_inertia[body], inertia * 0.004, rtol=1e-5)
+
+
+def test_a_fine_state_is_taken_over() -> None:
+    model = clustered(1)
+    state = State.at_rest(model)
+    state.tree_fine[0] = True
+    plants = Plants(model, state)
+    assert plants.body_mass[model.bunch_body[0]] == pytest.approx(0.05)
+    plants.wake(0)
+    plants.free()
+    assert plants.response(model.bunch_cluster[:1]).any()
+
+
+# ---- cutting
+
+
+def test_cutting_leaves_pose_velocity_and_numbers(plants: Plants) -> None:
+    stir(plants)
+    state = plants.state
+    plants.rest(1)
+    pose, speed = state.body_q.copy(), state.body_qd.copy()
+    plants.cut(7)
+    assert plants.awake.tolist() == [0, 1, 2, 3]
+    assert np.flatnonzero(state.body_cut).tolist() == [7]
+    plants.kinematics()
+    np.testing.assert_allclose(state.body_q, pose, atol=1e-6)
+    np.testing.assert_allclose(state.body_qd, speed, atol=1e-6)
+    step(plants, 50)
+    plants.kinematics()
+    drop = state.body_q[5:10, 2] - pose[5:10, 2]
+    assert (drop[2:] < -1.0).all()
+    assert np.abs(drop[:2]).max() < 0.01
+    assert not plants.joint_wrench(np.array([7])).any()
+    plants.rest(1)
+    assert not state.joint_xd.any()
+
+
+def test_a_stump_moves_as_if_it_had_grown_that_way() -> None:
+    """What is left of a cane after a cut is, bit for bit, a cane that never had more."""
+    whole, short = canes(1), canes(1)
+    plants = Plants(whole, State.at_rest(whole))
+    plants.wake(0)
+    plants.state.joint_qd[:, 1] = 1.0
+    plants.kinematics()
+    plants.cut(3)
+    short = Model(**{name: getattr(whole, name).copy() for name in Model.dims()})
+    for name, dim in Model.dims().items():
+        if dim.shape[0] == "body":
+            setattr(short, name, getattr(whole, name)[:3].copy())
+    short.tree_size[:] = short.tree_core[:] = 3
+    state = State.at_rest(short)
+    state.joint_q[:], state.joint_qd[:] = plants.state.joint_q[:3], plants.state.joint_qd[:3]
+    twin = Plants(short, state)
+    twin.wake(0)
+    for _ in range(100):
+        step(plants)
+        step(twin)
+    np.testing.assert_array_equal(plants.state.joint_q[:3], state.joint_q)
+
+
+def test_cuts_of_cuts_of_roots_and_of_bunches(fruit: Plants) -> None:
+    state, model = fruit.state, fruit.model
+    fruit.wake(np.arange(3))
+    fruit.cut(4)
+    fruit.cut(2)  # nearer to the root, after the other
+    bunch, size = int(model.bunch_body[1]), int(model.tree_size[0])
+    fruit.cut(bunch)
+    fruit.cut(2 * size)  # a whole tree
+    step(fruit, 30)
+    fruit.refine(1)
+    step(fruit, 30)
+    fruit.kinematics()
+    fallen = state.body_q[:, 2] < 1.5
+    first = fruit.model.tree_first
+    assert not fallen[:2].any()
+    assert fallen[2:size].all()  # the bunch's stalk was on piece 4
+    at_one = np.arange(first[1], first[2])
+    hanging = np.isin(at_one, [bunch, *range(model.bunch_cluster[1], model.bunch_cluster[1] + 5)])
+    np.testing.assert_array_equal(fallen[at_one], hanging)
+    assert fallen[2 * size :].all()
+    again = Plants(model, state)  # the cuts are in the state
+    np.testing.assert_array_equal(again.joint_stiffness, fruit.joint_stiffness)
+    step(fruit)
+    before = state.copy()
+    fruit.kinematics()
+    pose = state.body_q.copy()
+    for name in State.dims():
+        getattr(state, name)[:] = getattr(before, name)
+    again.kinematics()
+    np.testing.assert_array_equal(state.body_q, pose)
+
+
+def test_what_cannot_be_cut_is_refused_in_words(fruit: Plants) -> None:
+    fruit.cut(3)
+    with pytest.raises(ValueError, match="body 3 of tree 0 has been cut off already"):
+        fruit.cut(3)
+    with pytest.raises(ValueError, match=r"body 99 cannot be cut off: there are 48, counted from 0"):
+        fruit.cut(99)
+    cluster = int(fruit.model.bunch_cluster[0])
+    with pytest.raises(ValueError, match=rf"body {cluster} of tree 0 is a berry cluster; cut off its bunch"):
+        fruit.cut(cluster)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"tree_core": 0}, r"tree 1: tree_core 0 of 16 bodies; give 1 to tree_size \(all\)"),
+        ({"tree_core": 17}, r"tree 1: tree_core 17 of 16 bodies"),
+        ({"tree_core": 10}, r"body 26 of tree 1 is behind its core, but no bunch's cluster"),
+        ({"tree_core": 12}, r"bunch 1: clusters 27 to 31 are not behind the core of a tree"),
+        ({"bunch_cluster": 30}, r"bunch 1: clusters 30 to 34 are not behind the core"),
+        ({"bunch_cluster": 11}, r"bunch 1: clusters 11 to 15 are also bunch 0's; give each bunch its own"),
+        ({"bunch_body": 25}, r"bunch 1: cluster 27 hangs on body 26; hang it on the bunch, body 25"),
+        ({"bunch_head_mass": 0.0}, r"bunch 1: its head has mass 0.0 kg"),
+        ({"bunch_head_mass": 0.2}, r"bunch 1: head and clusters weigh 0.65 kg, its body 0.5 kg"),
+    ],
+)
+def test_wrong_clusters_are_refused_in_words(change: dict[str, float], says: str) -> None:
+    model = clustered(2)
+    state = State.at_rest(model)
+    for name, value in change.items():
+        getattr(model, name)[1] = value
+    with pytest.raises(ValueError, match=says):
+        Plants(model, state)

@@ -119,6 +119,67 @@ def test_a_picked_bunch_leaves_the_vine_and_rides_on_its_link(model, primitives)
     assert (primitives.upper.numpy()[_of(primitives, Organ.BUNCH, bunch), 2] > 0).all()
 
 
+def _bent(model, bunch: int) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of all bodies when the second cluster of a bunch is turned, and the bodies that this moves."""
+    joint_q = model.joint_settled.copy()
+    turned = int(model.bunch_cluster[bunch]) + 1
+    joint_q[turned] = frames.multiply(frames.exp(np.array([0.1, 0.3, -0.2])), joint_q[turned])
+    last = int(model.bunch_cluster[bunch] + model.bunch_clusters[bunch])
+    return model.forward(joint_q), np.arange(turned, last)
+
+
+def _berries(primitives: Primitives, bunch: int, shown: bool = True) -> np.ndarray:
+    mine = _of(primitives, Organ.BUNCH, bunch)
+    mine = mine[primitives.shapes.kind.numpy()[mine] == 1]
+    return mine[primitives.upper.numpy()[mine, 2] > -1e4] if shown else mine
+
+
+def test_berries_ride_on_their_clusters(model, primitives) -> None:
+    """Turn one cluster: it and those below take their berries along, the others stay; as many as before."""
+    bunch = 5
+    before = primitives.shapes.a.numpy()[_berries(primitives, bunch)].copy()
+    body_q, moved = _bent(model, bunch)
+    tree = int(model.body_tree[model.bunch_body[bunch]])
+    primitives.update(dataclasses.replace(still_view(model), body_q=body_q, moved=np.array([tree])))
+    mine = _berries(primitives, bunch)
+    after = primitives.shapes.a.numpy()[mine]
+    assert len(after) == model.bunch_berries[bunch]
+    on_moved = np.isin(primitives._carrier.numpy()[mine], moved)
+    assert 3 < on_moved.sum() < len(mine) - 3
+    shift = np.linalg.norm(after[:, :3] - before[:, :3], axis=1)
+    assert shift[~on_moved].max() < 1e-6
+    assert shift[on_moved].min() > 5e-4
+    assert np.array_equal(after[:, 3], before[:, 3])
+    # what the generator weighed is what is drawn on it
+    for body in moved:
+        share = (after[:, 3] ** 3)[primitives._carrier.numpy()[mine] == body].sum() / (after[:, 3] ** 3).sum()
+        stem = 0.03 / (1 + model.bunch_clusters[bunch])
+        weight = model.body_mass[body] / model.body_mass[model.bunch_body[bunch]]
+        assert 0.97 * share + stem == pytest.approx(weight, abs=2e-3)
+
+
+def test_a_picked_bunch_keeps_the_shape_it_had(model, primitives) -> None:
+    bunch = 5
+    body_q, _ = _bent(model, bunch)
+    tree = int(model.body_tree[model.bunch_body[bunch]])
+    view = dataclasses.replace(still_view(model), body_q=body_q, moved=np.array([tree]))
+    primitives.update(view)
+    before = primitives.shapes.a.numpy()[_berries(primitives, bunch)].copy()
+    attached = view.bunch_attached.copy()
+    attached[bunch] = False
+    link = seeing.thing(name=f"bunch/{bunch}", organ=Organ.BUNCH, index=bunch)
+    loose = body_q[model.bunch_body[bunch]][None]
+    primitives.update(dataclasses.replace(view, bunch_attached=attached, links=(link,), link_q=loose))
+    after = primitives.shapes.a.numpy()[_berries(primitives, bunch)]
+    assert np.abs(after - before).max() < 2e-6
+    # someone comes, everything is laid out anew while the stub's clusters are elsewhere: the loose one keeps its shape
+    others = (link, seeing.thing(seeing.shape("sphere", 0.1)))
+    still = dataclasses.replace(still_view(model), bunch_attached=attached, links=others, moved=np.array([tree]))
+    primitives.update(dataclasses.replace(still, link_q=np.concatenate([loose, loose])))
+    after = primitives.shapes.a.numpy()[_berries(primitives, bunch)]
+    assert np.abs(after - before).max() < 2e-6
+
+
 def test_links_come_move_and_go(model, primitives) -> None:
     view, plants = still_view(model), primitives.count
     link = seeing.thing(seeing.shape("sphere", 0.1, at=(0.0, 0.0, 0.5)), index=2)

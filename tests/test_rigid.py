@@ -439,7 +439,8 @@ def loose(shapes: int, mass: float = 0.6) -> rigid_module.Loose:
     end = start.copy()
     end[-1, 0] += 0.03
     inertia = np.array([6e-4, 1.5e-3, 1.4e-3])
-    return rigid_module.Loose(mass, np.array([0.07, 2e-3, 0.0]), inertia, start, end, 0.04 - 0.001 * np.arange(shapes))
+    radius, product = 0.04 - 0.001 * np.arange(shapes), np.array([1e-5, -3e-5, 4e-5])
+    return rigid_module.Loose(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
 
 
 @pytest.mark.parametrize("shapes", [1, 5, rigid_module.LUMPS])

@@ -15,6 +15,7 @@ from vinesim.physics.rigid import Rigid
 from vinesim.physics.step import Physics
 from vinesim.physics.touching import Touching, shapes_of
 from vinesim.world.grow import assemble
+from vinesim.world.ids import Organ
 
 KINDS = {
     "sphere": (2, (0.05, 0.0, 0.0)),
@@ -122,7 +123,7 @@ def test_segment_along_a_face_touches_in_its_middle():
 def test_spheres_of_a_bunch_fill_its_spheroid_and_no_more():
     model, body, _ = bunch_scene()
     shapes = shapes_of(model)
-    of = shapes.bunch == 0
+    of = (shapes.bunch == 0) & (model.body_organ[shapes.body] == Organ.BUNCH)
     assert (shapes.body[of] == body).all()
     assert (np.diff(shapes.body) >= 0).all()
     x, r = shapes.start[of, 0], shapes.radius[of]
@@ -320,7 +321,7 @@ def test_rigid_groups_join_what_a_constraint_couples():
 def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "rigid", "touching", "plants", "touching", "plants", "rigid", "guard", "parting", "sleep",
+        "rigid", "touching", "detail", "plants", "touching", "plants", "rigid", "guard", "parting", "sleep",
     ]  # fmt: skip
     physics.plants.wake(1)
     physics.state.joint_qd[physics.model.bodies_of(1).start, 1] = 0.5

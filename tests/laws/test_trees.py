@@ -7,6 +7,7 @@ import hashlib
 import mujoco
 import numpy as np
 import pytest
+from clustered import fall, momenta
 
 from vinesim import frames
 from vinesim.physics.oracle import compile_plants, copy_state
@@ -276,3 +277,155 @@ def digest_of_a_run() -> str:
 
 def test_two_runs_are_equal_bit_for_bit() -> None:
     assert digest_of_a_run() == digest_of_a_run()
+
+
+# ---- what has been cut off
+
+
+def cane(**wood: float) -> Tree:
+    tree = Tree(frames.pose(np.array([0.0, 0.0, 3.0])))
+    tree.rod(-1, 1.0, (0.004, 0.003), Wood(**{"modulus": 2e9, "density": 800.0, "damping": 0.01} | wood), 12)
+    return tree
+
+
+def spun(tree: Tree, rng: np.random.Generator, body: int = 0, **options: float) -> Plants:
+    """A tree cut at a body, bent, every joint turning and the whole of it spinning and thrown."""
+    model = assemble([tree])
+    plants = awake(model, State.at_rest(model), **options)
+    state = plants.state
+    plants.cut(body)
+    turn = frames.exp(rng.normal(size=(len(state.joint_q), 3)) * [0.0, 0.03, 0.03])
+    state.joint_q[:] = frames.normalize(frames.multiply(turn, state.joint_q))
+    state.joint_qd[:] = rng.normal(size=state.joint_qd.shape) * [0.0, 0.3, 0.3]
+    state.joint_qd[body] = [1.0, 4.0, -3.0]
+    state.joint_xd[body] = [1.0, -0.5, 2.0]
+    return plants
+
+
+@pytest.mark.parametrize("phi", [0.5, 0.55, 1.0])
+@pytest.mark.parametrize("kind", ["cane", "fork", "fast"])
+def test_a_cut_cane_keeps_its_momentum(kind: str, phi: float) -> None:
+    """Spinning, bending, falling for 2 s: momentum less m g t, angular momentum about the centre of mass, the path of
+    that centre: 1e-4."""
+    rng = np.random.default_rng(19)
+    body = 0 if kind == "cane" else 3
+    plants = spun(cane() if kind == "cane" else forked(rng), rng, body, phi=phi)
+    if kind == "fast":
+        plants.state.joint_qd[body] *= 4.0
+    off = np.flatnonzero(plants._root == body)
+    plants.kinematics()
+    linear, _, start, energy = momenta(plants, off, np.zeros(3))
+    angular = momenta(plants, off, start)[1]
+    mass = plants.body_mass[off].sum()
+
+    def spring() -> float:
+        return 0.5 * float((plants.joint_stiffness * frames.log(plants.state.joint_q.astype(float)) ** 2)[off].sum())
+
+    energy += spring()
+    worst = np.zeros(3)
+    for tick in range(1, 201):
+        plants.free()
+        plants.commit()
+        plants.kinematics()
+        now, _, center, _ = momenta(plants, off, np.zeros(3))
+        spin = momenta(plants, off, center)[1]
+        path = start + linear / mass * tick * DT + fall(tick * DT)
+        error = now - linear - mass * GRAVITY * tick * DT, spin - angular, center - path
+        worst = np.maximum(worst, np.linalg.norm(error, axis=1))
+    assert worst[0] < 1e-4 * np.linalg.norm(linear)
+    assert worst[1] < 1e-4 * np.linalg.norm(angular)
+    assert worst[2] < 1e-4
+    own = momenta(plants, off, np.zeros(3))[3] - 0.5 * mass * ((now / mass) ** 2).sum() + spring()
+    assert own < energy - 0.5 * mass * ((linear / mass) ** 2).sum()  # spinning and bending lose energy only
+
+
+@pytest.mark.parametrize("phi", [0.55, 1.0])
+def test_response_of_a_cut_tree_is_that_of_a_free_joint(phi: float) -> None:
+    """Against MuJoCo's inertia with a free joint where the cut is; what stands and what fell do not feel each other."""
+    rng = np.random.default_rng(23)
+    plants = spun(forked(rng, isotropic=False), rng, 0, phi=phi, tension=False, brisk=np.inf)
+    model, state = plants.model, plants.state
+    plants.cut(6)
+    plants.free()
+    touched = np.array([5, 0, 9, 6], np.int32)
+    seen = plants.response(touched)
+
+    spec = mujoco.MjSpec()
+    made: list[mujoco.MjsBody] = []
+    for body in range(len(model.body_mass)):
+        parent = int(plants._parent[body])
+        pose = state.body_q[body] if parent < 0 else frames.pose(model.body_offset[body], model.body_rest[body])
+        child = (spec.worldbody if parent < 0 else made[parent]).add_body(
+            pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[body]), ipos=model.body_com[body],
+            inertia=model.body_inertia[body], explicitinertial=True,
+        )  # fmt: skip
+        child.add_joint(type=mujoco.mjtJoint.mjJNT_FREE if parent < 0 else mujoco.mjtJoint.mjJNT_BALL)
+        made.append(child)
+    peer = spec.compile()
+    data = mujoco.MjData(peer)
+    for body, at in enumerate(peer.jnt_qposadr):
+        if plants._parent[body] >= 0:
+            data.qpos[at : at + 4] = frames.to_wxyz(state.joint_q[body])
+    mujoco.mj_forward(peer, data)
+    np.testing.assert_allclose(data.xpos[1:], state.body_q[:, :3], atol=1e-5)
+    inertia = np.zeros((peer.nv, peer.nv))
+    mujoco.mj_fullM(peer, data, inertia)
+    stiffness = model.joint_stiffness.astype(float)
+    damping = np.maximum(model.joint_damping - (2 * phi - 1) * DT * stiffness, 0.0)
+    used = float(plants.phi_used[0])
+    metric = used * DT * (used * DT * stiffness + np.maximum(damping, 0.0))
+    assert used == pytest.approx(phi)
+    axes = frames.matrix(state.joint_q.astype(float))
+    for body, at in enumerate(peer.jnt_dofadr):
+        if plants._parent[body] >= 0:
+            inertia[at : at + 3, at : at + 3] += axes[body].T @ np.diag(metric[body]) @ axes[body]
+    jacobian = np.zeros((len(touched), 6, peer.nv))
+    for row, body in zip(jacobian, touched, strict=True):
+        mujoco.mj_jacBody(peer, data, row[:3], row[3:], int(body) + 1)
+    flat = jacobian.reshape(-1, peer.nv)
+    truth = (flat @ np.linalg.solve(inertia, flat.T)).reshape(seen.shape)
+    np.testing.assert_allclose(seen, truth, rtol=0, atol=1e-4 * np.abs(truth).max())
+    assert seen[1, :3, 1, :3].any()  # the root moves
+    apart = plants._root[touched]
+    assert sorted(set(apart.tolist())) == [0, 6] or sorted(set(apart.tolist())) == [0]
+    for u in range(4):
+        for t in range(4):
+            assert seen[u, :, t].any() == (apart[u] == apart[t])
+
+
+def test_a_push_on_a_cut_cane_moves_it_as_predicted() -> None:
+    """Impulses go over into momentum, and velocities are those that ``response`` foretold."""
+    rng = np.random.default_rng(29)
+    plants = spun(cane(), rng, 4)
+    plants.state.joint_q[5:] = [0.0, 0.0, 0.0, 1.0]
+    plants.state.joint_qd[:] *= 0.1
+    off = np.flatnonzero(plants._root == 4)
+    plants.kinematics()
+    linear, angular, center, _ = momenta(plants, off, np.zeros(3))
+    plants.free()
+    touched, wrench = np.array([6, 4, 10]), rng.normal(size=(3, 6)) * [0.1, 0.1, 0.1, 1e-5, 1e-5, 1e-5]
+    at = plants.state.body_q[touched, :3].astype(float)
+    foretold = plants.velocity_free[touched] + np.einsum("uitj,tj->ui", plants.response(touched), wrench * DT)
+    plants.commit(touched, wrench)
+    plants.kinematics()
+    after = momenta(plants, off, np.zeros(3))
+    force = plants.body_mass[off].sum() * GRAVITY + wrench[:, :3].sum(0)
+    np.testing.assert_allclose(after[0], linear + DT * force, atol=1e-6)
+    twist = (np.cross(at - center, wrench[:, :3]) + wrench[:, 3:]).sum(0)
+    spin = momenta(plants, off, after[2])[1] - (angular - np.cross(center, linear))
+    np.testing.assert_allclose(spin, DT * twist, atol=2e-7)
+    np.testing.assert_allclose(plants.state.body_qd[touched], foretold, atol=0.05)  # the poses have moved on
+
+
+def test_a_violently_cut_tree_calms_down() -> None:
+    rng = np.random.default_rng(31)
+    for body in (0, 2, 7):
+        plants = spun(forked(rng, beta=0.004), rng, body)
+        plants.state.joint_qd[:] = frames.normalize(rng.normal(size=plants.state.joint_qd.shape)) * 20.0
+        rates = []
+        for _ in range(1000):
+            plants.free()
+            plants.commit()
+            rates.append(np.linalg.norm(np.delete(plants.state.joint_qd, body, 0), axis=1).max())
+            assert rates[-1] < 100.0
+        assert np.mean(rates[-100:]) < 2.0

@@ -15,13 +15,38 @@ def _plants() -> Iterator[Measurement]:
     return plants()
 
 
+def _contact() -> Iterator[Measurement]:
+    from vinesim.physics.bench_contact import contact
+
+    return contact()
+
+
+def _tick() -> Iterator[Measurement]:
+    from vinesim.physics.bench_contact import tick
+
+    return tick()
+
+
+def _asleep() -> Iterator[Measurement]:
+    from vinesim.physics.bench_asleep import asleep
+    from vinesim.robot.description import load
+
+    return asleep(load("vinebot").spec("robot"))
+
+
 def _camera() -> Iterator[Measurement]:
     from vinesim.sensors.bench_camera import camera
 
     return camera()
 
 
-BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {"plants": _plants, "camera": _camera}
+BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
+    "plants": _plants,
+    "contact": _contact,
+    "tick": _tick,
+    "asleep": _asleep,
+    "camera": _camera,
+}
 
 
 class NoSuchBench(ValueError):

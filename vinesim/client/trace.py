@@ -18,6 +18,9 @@ class Trace:
         """``rest_q`` [7]: pose of the bunch's body before anybody touched it."""
         self.bunch = bunch
         self.body = int(model.bunch_body[bunch])
+        clusters = int(model.bunch_cluster[bunch]) + np.arange(model.bunch_clusters[bunch])
+        self.bodies = frozenset([self.body, *clusters.tolist()])
+        """Its own body, and its berry clusters, which are what a hand meets."""
         self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
         self._rest = self._centre(rest_q)
         self._clock = np.zeros(capacity)

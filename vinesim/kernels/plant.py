@@ -273,19 +273,24 @@ def free(
         slip = wp.cross(omega, com)
         drag = dt * wp.max(wp.length_sq(omega) - brisk * brisk, 0.0)
         burden = 1.0 + dt * drag
-        force = mass * (wp.cross(omega, slip) + drag * (velocity + slip) - gravity)
+        pace = velocity + slip
         weight = mass * gravity
-        if body_root[k] >= 0:
-            weight = wp.vec3()  # what falls is not drawn out by its weight
+        drawing = weight
+        root = body_root[k]
+        if root >= 0:  # what falls is not drawn out by its weight, nor held back in its fall
+            pace = pace - joint_xd[root]
+            weight = burden * weight
+            drawing = wp.vec3()
+        force = mass * (wp.cross(omega, slip) + drag * pace) - weight
         moment = (
             wp.cross(omega, inertia * omega)
             + wp.cross(com, force)
             + drag * (inertia * omega)
-            - ahead * wp.cross(slip, weight)
+            - ahead * wp.cross(slip, drawing)
         )
         bias_out[k] = wp.spatial_vector(force, moment) - load
-        drawn_out[k] = weight + wp.spatial_top(load) + wp.spatial_top(body_wrench[k])
-        J_out[k] = burden * (inertia + at_lever(mass, com)) + reach * taut(com, weight)
+        drawn_out[k] = drawing + wp.spatial_top(load) + wp.spatial_top(body_wrench[k])
+        J_out[k] = burden * (inertia + at_lever(mass, com)) + reach * taut(com, drawing)
         H_out[k] = burden * mass * wp.skew(com)
         M_out[k] = burden * mass * wp.identity(n=3, dtype=float)
 
@@ -579,15 +584,16 @@ def integrate(
     first = tree_first[tree]
     last = first + tree_moving[tree]
     fastest = float(0.0)
+    falling = float(0.0)
     for k in range(first, last):
         square = wp.length_sq(joint_qd_free[k])
-        if body_parent[k] < 0 and body_root[k] >= 0:
-            square += wp.length_sq(joint_xd_free[k])
         if square > fastest or square != square:  # NaN enters, and stays
             fastest = square
-    tree_rate_out[tree] = wp.sqrt(fastest)
+        if body_parent[k] < 0 and body_root[k] >= 0:
+            falling = wp.max(falling, wp.length_sq(joint_xd_free[k]))
+    tree_rate_out[tree] = wp.sqrt(fastest + falling)
     tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
-    sound = fastest <= bound * bound
+    sound = fastest + falling <= bound * bound
     phi = tree_phi[tree]
     # a tree beyond limit is slowed as a whole and well below it: holding back single joints would feed energy into the
     # others, and a loaded cane would thrash at the limit for ever
@@ -598,12 +604,14 @@ def integrate(
         floats = body_parent[k] < 0 and body_root[k] >= 0
         if sound:
             rate = slower * joint_qd_free[k]
-            mean = (1.0 - phi) * joint_qd[k] + phi * rate
+            share = phi
+            if floats:  # no spring turns it: nothing to be had from phi but error
+                share = 0.5
+                joint_x_out[k] = joint_x[k] + 0.5 * dt * (joint_xd[k] + joint_xd_free[k])
+                joint_xd_out[k] = joint_xd_free[k]
+            mean = (1.0 - share) * joint_qd[k] + share * rate
             joint_qd_out[k] = rate
             joint_q_out[k] = wp.normalize(exponential(dt * mean) * joint_q[k])
-            if floats:
-                joint_x_out[k] = joint_x[k] + dt * ((1.0 - phi) * joint_xd[k] + phi * joint_xd_free[k])
-                joint_xd_out[k] = joint_xd_free[k]
         else:
             joint_qd_out[k] = wp.vec3()
             if floats:
@@ -651,10 +659,22 @@ def held(
     return wrench
 
 
+@wp.func
+def least_change(inertia: wp.mat33, momentum: wp.vec3, missing: wp.vec3, dt: float):
+    """The x of the least change of pose, momentum x dt times x, and of rate, inertia / dt times x, that adds what is
+    missing to an angular momentum. A rate counts by what it turns in a tick, so a thin rod is rather turned than spun.
+    """
+    stiff = inertia / dt
+    A = stiff * stiff + (wp.dot(momentum, momentum) * wp.identity(n=3, dtype=float) - wp.outer(momentum, momentum))
+    x = wp.inverse(wp.mat33d(A)) * wp.vec3d(missing)
+    return wp.vec3(x) / dt
+
+
 @wp.kernel
 def conserve(
     # model
     dt: float,
+    limit: float,
     bound: float,
     gravity: wp.vec3,
     tree_first: wp.array(dtype=wp.int32),
@@ -684,12 +704,14 @@ def conserve(
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
     body_acceleration: wp.array(dtype=wp.spatial_vector),
-    joint_q: wp.array(dtype=wp.quat),
+    lever: wp.array(dtype=wp.vec3),
     # out
+    earlier_out: wp.array(dtype=wp.spatial_vector),
     later_q_out: wp.array(dtype=wp.transform),
     later_qd_out: wp.array(dtype=wp.spatial_vector),
     joint_x_out: wp.array(dtype=wp.vec3),
     joint_xd_out: wp.array(dtype=wp.vec3),
+    joint_q_out: wp.array(dtype=wp.quat),
     joint_qd_out: wp.array(dtype=wp.vec3),
 ):
     """Give one floating component the momentum and the path of its centre of mass that outer forces leave it."""
@@ -710,12 +732,19 @@ def conserve(
     moment = wp.vec3()
     for k in range(root, last):
         if body_root[k] == root:
+            arm = wp.vec3()
+            velocity = wp.vec3()
+            if k > root:  # not from world positions and velocities, whose digits go into the fall
+                above = body_parent[k]
+                arm = wp.spatial_top(earlier_out[above]) + lever[k]
+                velocity = wp.spatial_bottom(earlier_out[above])
+                velocity += wp.cross(wp.spatial_bottom(body_qd[above]), lever[k])
+            earlier_out[k] = wp.spatial_vector(arm, velocity)
             pose = body_q[k]
             omega = wp.spatial_bottom(body_qd[k])
             rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
             com = rotation * body_com[k]
-            arm = wp.transform_get_translation(pose) - here
-            momentum = body_mass[k] * (wp.spatial_top(body_qd[k]) - pace + wp.cross(omega, com))
+            momentum = body_mass[k] * (velocity + wp.cross(omega, com))
             given = body_load[k] + body_wrench[k]
             given += held(
                 k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_first, tie_point, tie_anchor,
@@ -740,18 +769,18 @@ def conserve(
     locked = wp.mat33()
     for k in range(root, last):
         if body_root[k] == root:
-            above = wp.transform(wp.vec3(), wp.quat_identity())
+            base = wp.transform(wp.vec3(), wp.quat_identity())
             motion = wp.spatial_vector()
             if k > root:
-                above = later_q_out[body_parent[k]]
+                base = later_q_out[body_parent[k]]
                 motion = later_qd_out[body_parent[k]]
             turning = wp.spatial_bottom(motion)
-            axes = wp.transform_get_rotation(above) * body_rest[k]
-            lever = wp.quat_rotate(wp.transform_get_rotation(above), body_offset[k])
-            arm = wp.transform_get_translation(above) + lever
-            turned_by = axes * joint_q[k]
+            axes = wp.transform_get_rotation(base) * body_rest[k]
+            reach = wp.quat_rotate(wp.transform_get_rotation(base), body_offset[k])
+            arm = wp.transform_get_translation(base) + reach
+            turned_by = axes * joint_q_out[k]
             omega = turning + wp.quat_rotate(axes, joint_qd_out[k])
-            velocity = wp.spatial_top(motion) + wp.cross(turning, lever)
+            velocity = wp.spatial_top(motion) + wp.cross(turning, reach)
             later_q_out[k] = wp.transform(arm, turned_by)
             later_qd_out[k] = wp.spatial_vector(velocity, omega)
             rotation = wp.quat_to_matrix(turned_by)
@@ -763,9 +792,28 @@ def conserve(
             angular += wp.cross(arm + com_k, momentum) + inertia * omega
             locked += inertia + at_lever(body_mass[k], arm + com_k)
     com = lean / mass
-    turn = wp.inverse(locked - at_lever(mass, com)) * (spin - angular + wp.cross(com, linear))
-    joint_qd_out[root] = joint_qd_out[root] + turn
-    joint_xd_out[root] = pace + (goal - linear) / mass - wp.cross(turn, com)
+    angular = angular - wp.cross(com, linear)
+    locked = locked - at_lever(mass, com)
+    twist = wp.quat_identity()
+    rate = joint_qd_out[root]
+    turn = wp.vec3()
+    for _ in range(3):  # Newton: angular momentum and inertia turn along
+        frame = wp.quat_to_matrix(twist)
+        inertia = frame * locked * wp.transpose(frame)
+        own = frame * angular + inertia * turn
+        least = least_change(inertia, own, spin - own, dt)
+        added = exponential(dt * wp.cross(own, least))
+        twist = added * twist
+        turn = wp.quat_rotate(added, turn) + inertia * least / dt
+    rate = wp.quat_rotate(twist, rate) + turn
+    square = wp.length_sq(rate)
+    if square > limit * limit:
+        turn = turn + rate * (limit / wp.sqrt(square) - 1.0)
+        rate = rate * (limit / wp.sqrt(square))
+    com = wp.quat_rotate(twist, com)
+    joint_q_out[root] = wp.normalize(twist * joint_q_out[root])
+    joint_qd_out[root] = rate
+    joint_xd_out[root] = pace + (goal - wp.quat_rotate(twist, linear)) / mass - wp.cross(turn, com)
     joint_x_out[root] = joint_x_out[root] + (path - moved - com)
 
 

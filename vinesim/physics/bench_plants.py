@@ -5,14 +5,14 @@ The scene: canes of 16 bodies (1 m, 8 mm, 5 GPa, 800 kg/m^3), each with a bunch 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from threading import Thread
 
 import mujoco
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.bench_scenes import interleaved
 from vinesim.physics.oracle import compile_plants
 from vinesim.physics.plants import Plants
 from vinesim.world.grow import Tree, Wood, assemble
@@ -22,8 +22,6 @@ from vinesim.world.state import State
 from vinesim.world.values import Measurement
 
 CANES = 64
-BUNCHES = 10_000
-TOUCHED = 20
 
 
 def cane(side: float) -> Tree:
@@ -57,19 +55,8 @@ def steps(plants: Plants, count: int) -> None:
         plants.commit()
 
 
-def interleaved(*works: Callable[[], None], rounds: int = 9) -> list[float]:
-    """Median seconds of each work, all taking turns so that the machine's moods hit all alike."""
-    seconds = np.zeros((rounds, len(works)))
-    for row in seconds:
-        for i, work in enumerate(works):
-            start = time.perf_counter()
-            work()
-            row[i] = time.perf_counter() - start
-    return np.median(seconds, axis=0).tolist()
-
-
 def plants() -> Iterator[Measurement]:
-    """64 canes awake on one thread and on two; ten thousand bunches asleep with twenty awake."""
+    """64 canes awake, touched by nobody, on one thread and on two."""
     ticks = 40
     model = vineyard(CANES)
     whole = ready(model, CANES)
@@ -96,9 +83,3 @@ def plants() -> Iterator[Measurement]:
     name = f"MuJoCo {mujoco.mj_versionString()} discrete"
     yield Measurement("plants", f"{CANES} canes awake, one thread", one, "ms/tick", name, theirs, theirs / one)
     yield Measurement("plants", f"{CANES} canes awake, two threads", two, "ms/tick", name, theirs, theirs / two)
-
-    few = ready(vineyard(TOUCHED), TOUCHED)
-    many = ready(vineyard(BUNCHES), TOUCHED)
-    alone, among = (1e3 * s / ticks for s in interleaved(lambda: steps(few, ticks), lambda: steps(many, ticks)))
-    case = f"{BUNCHES} bunches asleep, {TOUCHED} awake"
-    yield Measurement("plants", case, among, "ms/tick", f"only the {TOUCHED}", alone, alone / among)

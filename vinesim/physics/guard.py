@@ -51,8 +51,14 @@ class Guard:
         room = max(KEPT - len(self._faults), 0)
         self._faults += [Fault(plants.tick, *what) for what in zip(stopped.tolist(), rates, strict=True)][:room]
         bodies = plants.bodies_of(stopped)
-        unsound = bodies[~np.isfinite(state.joint_q[bodies]).all(-1)]  # somebody wrote a bad pose: no good one is left
+        length = np.square(state.joint_q[bodies], dtype=float).sum(-1)
+        unsound = bodies[~(abs(length - 1.0) < 0.01)]  # somebody wrote a bad pose: no good one is left
         state.joint_q[unsound] = plants.model.joint_settled[unsound]
+        cut = bodies[state.body_cut[bodies]]
+        state.joint_xd[cut] = 0.0
+        lost = cut[~np.isfinite(state.joint_x[cut]).all(-1)]
+        if len(lost):
+            state.joint_x[lost] = plants.model.forward(plants.model.joint_settled)[lost, :3]  # where it grew
         loads = plants.body_load[bodies]
         plants.body_load[bodies] = np.where(np.isfinite(loads), loads, 0.0)
         plants.rest(stopped)

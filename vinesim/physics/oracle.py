@@ -1,4 +1,4 @@
-"""The same plants as a MuJoCo model: the peer that tests and benchmarks hold our solver against.
+"""The same plants, or the whole scene, in MuJoCo: the peer that tests and benchmarks hold our solver against.
 
 MuJoCo's ball joint has one stiffness for all axes, so each joint takes its first bending stiffness; for an exact
 comparison build trees whose springs are isotropic.
@@ -10,9 +10,12 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.rigid import _FIXED, FRICTION, Rigid, _attach, _scene
+from vinesim.physics.touching import shapes_of
 from vinesim.world.grow import GRAVITY
 from vinesim.world.model import Model
 from vinesim.world.state import State
+from vinesim.world.values import RobotSpec
 
 
 def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None = None) -> mujoco.MjModel:
@@ -26,7 +29,12 @@ def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
     spec.memory = 1 << 28
-    damping = model.joint_damping[:, 1] if damping is None else damping
+    _grow(spec, model, model.joint_damping[:, 1] if damping is None else damping)
+    return spec.compile()
+
+
+def _grow(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[mujoco.MjsBody]:
+    """Add all trees to a world; ``damping`` [body] N m s/rad. Returns MuJoCo's bodies, without geoms."""
     made: list[mujoco.MjsBody] = []
     for body in range(len(model.body_mass)):
         parent = int(model.body_parent[body])
@@ -34,16 +42,67 @@ def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None
         if parent < 0:
             pose = frames.compose(model.tree_pose[model.body_tree[body]].astype(float), pose)
         child = (spec.worldbody if parent < 0 else made[parent]).add_body(
-            name=str(body), pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[body]),
+            name=f"plant/{body}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[body]),
             ipos=model.body_com[body], inertia=model.body_inertia[body], explicitinertial=True,
         )  # fmt: skip
         child.add_joint(
-            type=mujoco.mjtJoint.mjJNT_BALL,
-            stiffness=float(model.joint_stiffness[body, 1]),
+            name=f"plant/{body}", type=mujoco.mjtJoint.mjJNT_BALL, stiffness=float(model.joint_stiffness[body, 1]),
             damping=float(damping[body]),
-        )
+        )  # fmt: skip
         made.append(child)
-    return spec.compile()
+    return made
+
+
+class Whole:
+    """A scene of plants and robots wholly in MuJoCo: one world, ball joints, a capsule or spheres for every body.
+
+    Robots meet plants; plants do not meet each other (they may in ours: that is work the peer is spared). ``rigid``
+    takes commands as ever. The scheme of ``discrete`` adds dt K of damping, which is taken off, down to nothing.
+    """
+
+    def __init__(self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01) -> None:
+        self.rigid = mine = Rigid(model, dt=dt)
+        for robot in robots:
+            mine.add_robot(robot)
+        spec = _scene(model, dt)
+        spec.memory = 1 << 29
+        spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        for robot in mine._robots.values():
+            _attach(spec, robot)
+        made = _grow(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
+        shapes = shapes_of(model)
+        for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
+            kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
+            if (start != end).any():
+                kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
+            made[body].add_geom(
+                type=kind, size=[float(radius), 0, 0], contype=_FIXED, conaffinity=0, mass=0.0,
+                friction=[FRICTION, 0.005, 0.0001], solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
+            )  # fmt: skip
+        world = spec.compile()
+        data = mujoco.MjData(world)
+        for j in range(mine.world.njnt):
+            joint = mine.world.joint(j)
+            if joint.name.split("/")[0].split(":")[0] in mine.robots:
+                data.joint(joint.name).qpos[:] = mine.data.joint(j).qpos
+        for body, q in enumerate(model.joint_settled):
+            data.joint(f"plant/{body}").qpos[:] = frames.to_wxyz(q)
+        mine.world, mine.data, mine._contact = world, data, np.zeros(world.nv)  # robots now live in the whole world
+        for robot in mine._robots.values():
+            mine._locate(robot)
+        self.world, self.data = world, data
+
+    def step(self) -> None:
+        """One tick of everything."""
+        self.rigid._servo()
+        mujoco.mj_step(self.world, self.data)
+        self.rigid._fresh = False
+
+    def touching(self) -> int:
+        """Contacts of the last tick between plants and robots."""
+        bodies = self.world.geom_bodyid[self.data.contact.geom]
+        is_plant = np.array([self.world.body(i).name.startswith("plant/") for i in range(self.world.nbody)])
+        return int((is_plant[bodies].sum(1) == 1).sum())
 
 
 def copy_state(state: State, data: mujoco.MjData) -> None:

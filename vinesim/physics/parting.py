@@ -20,8 +20,8 @@ from vinesim.world.values import Parting
 
 STUB = 1e-3
 """What stays of a bunch on the tree [kg]."""
-BRISK = 20.0
-"""[m/s^2] Gravity, and what turning adds to the acceleration of a bunch's middle over that of its stalk."""
+WEIGHT = 9.81
+"""[N/kg]"""
 PATIENCE = 3
 """[tick] A peduncle parts when it has been strained too much for so long: one tick's peak is not a pull."""
 
@@ -89,12 +89,10 @@ class Partings:
         lever = 2.0 * model.bunch_length[touched[on]]
         push = wrench[:, :3].sum(1)
         np.add.at(hands, touched[on], np.stack([push, wrench[:, 3:].sum(1) + lever * push], 1))
-        motion, mass = plants.acceleration[bodies], plants.body_mass[bodies]
-        force = hands[bunches, 0] + mass * (np.abs(motion[:, :3]).sum(1) + BRISK)
-        rate = plants.state.body_qd[bodies, 3:]
-        whirl = np.abs(motion[:, 3:]).sum(1) + (rate * rate).sum(1)
-        # weight and inertia act at the centre of mass, within the bunch's length
-        moment = hands[bunches, 1] + (force - hands[bunches, 0] + mass * whirl) * model.bunch_length[bunches]
+        own = model.body_mass[bodies] * (self._shaken(bunches) + WEIGHT)
+        force = hands[bunches, 0] + own
+        # weight and inertia act within the bunch's length
+        moment = hands[bunches, 1] + 2.0 * own * model.bunch_length[bunches]
         strained = (force > model.bunch_pull[bunches]) | (moment > model.bunch_bend[bunches])
         carried = np.zeros((len(bunches), 6))
         if strained.any():
@@ -106,6 +104,23 @@ class Partings:
         for i in np.flatnonzero(self._strained[bunches] >= PATIENCE):
             bunch = int(bunches[i])
             self._pick(bunch, "pull" if pulled[i] >= bent[i] else "bend", self._toucher(bunch), carried[i])
+
+    def _shaken(self, bunches: np.ndarray) -> np.ndarray:
+        """More than any part of these bunches accelerates [k] m/s^2; of fine trees every cluster is asked."""
+        plants, model = self.plants, self.plants.model
+        bodies = model.bunch_body[bunches]
+        fine = np.flatnonzero(plants.state.tree_fine[model.body_tree[bodies]] & (model.bunch_clusters[bunches] > 0))
+        count = model.bunch_clusters[bunches[fine]]
+        start = np.cumsum(count) - count
+        clusters = np.repeat(model.bunch_cluster[bunches[fine]] - start, count) + np.arange(count.sum())
+        asked = np.concatenate([bodies, clusters])
+        motion, rate = plants.acceleration[asked], plants.state.body_qd[asked, 3:]
+        turning = np.abs(motion[:, 3:]).sum(1) + (rate * rate).sum(1)
+        shaken = np.abs(motion[:, :3]).sum(1) + turning * model.body_length[asked]
+        most = shaken[: len(bodies)]
+        if len(fine):
+            most[fine] = np.maximum(most[fine], np.maximum.reduceat(shaken[len(bodies) :], start))
+        return most
 
     def _close(self) -> None:
         """Cut what lies in the mouths that are closing."""
@@ -136,6 +151,7 @@ class Partings:
         one, other = (-blade.half - start) / along, (blade.half - start) / along
         enter, leave = np.minimum(one, other).max(1), np.maximum(one, other).min(1)
         caught = near[(enter <= leave) & (leave >= 0.0) & (enter <= 1.0)]
+        caught = caught[~self.plants.state.body_cut[caught]]
         inside = np.zeros(len(self._wood), bool)
         inside[caught] = True
         return caught[~self._below(caught, inside)]
@@ -166,17 +182,25 @@ class Partings:
         tree = int(model.body_tree[body])
         plants.wake(tree)
         plants.kinematics(np.array([tree]))
-        shapes = self.touching.shapes
-        of = (shapes.bunch == bunch) & (shapes.body == body)
+        shapes, state = self.touching.shapes, plants.state
+        # as touched so far, its clusters where they are: what holds it must not feel the difference
+        here = (shapes.bunch == bunch) & (shapes.when != (1 if state.tree_fine[tree] else 2))
+        of = np.flatnonzero(here & (model.body_organ[shapes.body] == int(Organ.BUNCH)))
+        plants.coarsen(tree)
+        local = frames.compose(frames.inverse(state.body_q[body].astype(float)), state.body_q[shapes.body[of]])
+        start, end = (
+            local[:, :3] + frames.rotate(local[:, 3:], at[of].astype(float)) for at in (shapes.start, shapes.end)
+        )
         loose = Loose(
-            mass=float(plants.body_mass[body]), com=plants.model.body_com[body].astype(float),
-            inertia=plants.body_inertia[body].astype(float), start=shapes.start[of].astype(float),
-            end=shapes.end[of].astype(float), radius=shapes.radius[of].astype(float),
+            mass=float(plants.body_mass[body]), com=plants.body_com[body].astype(float),
+            inertia=plants.body_inertia[body].astype(float), product=plants.body_product[body].astype(float),
+            start=start, end=end, radius=shapes.radius[of].astype(float),
         )  # fmt: skip
         self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], plants.state.body_qd[body])
         plants.state.bunch_attached[bunch] = False
         self._strained[bunch] = 0
         plants.reweigh(body, STUB)
+        plants.body_drag[body] = 0.0
         self._tell(body, bunch, cause, actor, carried)
 
     def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
@@ -205,6 +229,6 @@ class Partings:
         """Who presses hardest on a bunch, nobody if none does."""
         pushes: dict[str, float] = {}
         for contact in self.touching.contacts:
-            if self._bunch_of[contact.body] == bunch:
+            if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")

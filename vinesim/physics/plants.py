@@ -159,6 +159,7 @@ class Plants:
         self.state.joint_xd[bodies] = 0.0
         self.velocity_free[bodies] = 0.0
         self.acceleration[bodies] = 0.0
+        self._wrench[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._onset[trees] = 0
         self.kinematics(trees)
@@ -188,9 +189,10 @@ class Plants:
     def coarsen(self, trees: np.ndarray | int) -> None:
         """Freeze the clusters of these trees' bunches where they are: each bunch becomes one compound.
 
-        Nothing changes its pose. The clusters' motion against their bunch ends in a plastic impact, which every joint
-        of the tree takes part in: momentum is conserved, kinetic energy never grows. Acting within no time it leaves
-        the springs aside.
+        Nothing changes its pose. The clusters' motion against their bunch ends in a plastic impact that lasts a tick.
+        A bunch keeps its angular momentum about its origin; what its joint must take sets the rest of the tree moving,
+        against springs as in any tick (free of them, a light peduncle would be flung about). A floating tree keeps all
+        momentum. Kinetic energy does not grow, as the scheme counts it: with the rates squared times the metric.
         """
         trees = self._with_clusters(trees, fine=True)
         if len(trees) == 0:
@@ -208,11 +210,15 @@ class Plants:
             axes = state.body_q[bodies, 3:].astype(float)
             self._impulse[bodies, :3] = frames.rotate(axes, impulse[:, :3])
             self._impulse[bodies, 3:] = frames.rotate(axes, impulse[:, 3:])
+            springs = self.joint_stiffness[bodies], self.joint_damping[bodies]
+            self.joint_stiffness[bodies], self.joint_damping[bodies] = 0.0, 0.0
             self._subset[: len(trees)] = trees
-            self._loose_joints(len(trees))
+            self._solve(len(trees))
+            self.joint_stiffness[bodies], self.joint_damping[bodies] = springs
+            moving = _spans(self.model.tree_first[trees], self.model.tree_core[trees])
+            self._joint_qd_free[moving], self._joint_xd_free[moving] = state.joint_qd[moving], state.joint_xd[moving]
             self._kick(len(trees))
             self._impulse[bodies] = 0.0
-            moving = _spans(self.model.tree_first[trees], self.model.tree_core[trees])
             state.joint_qd[moving] = self._joint_qd_free[moving]
             roots = moving[state.body_cut[moving]]
             state.joint_xd[roots] = self._joint_xd_free[roots]
@@ -510,11 +516,11 @@ class Plants:
             wp.quat: ("axes",),
             wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "lift"),
             wp.transform: ("later_q",),
-            wp.spatial_vector: ("bias", "spread", "added", "later_qd", "locked_acceleration", "locked_velocity"),
+            wp.spatial_vector: ("bias", "spread", "added", "earlier", "later_qd", "idle_acceleration", "idle_velocity"),
         }
         for dtype, names in scratch.items():
             a |= {name: wp.empty(len(model.body_mass), dtype=dtype, device="cpu") for name in names}
-        a["locked_phi"] = wp.empty(len(model.tree_first), dtype=float, device="cpu")
+        a["idle_phi"] = wp.empty(len(model.tree_first), dtype=float, device="cpu")
 
         def record(kernel: wp.Kernel, *inputs: object) -> Callable[[int], None]:
             return bind(kernel, [a[value] if isinstance(value, str) else value for value in inputs], [])
@@ -527,12 +533,12 @@ class Plants:
         factors = ("axes", "lever", "D", "DJ", "DH", "lift")
         freed = ("joint_xd_free", "joint_qd_free")
 
-        def free(dt: float, trees: str, wrench: str, phi: str, acceleration: str, velocity: str) -> Callable:
+        def free(brisk: float, tension: float, trees: str, phi: str, acceleration: str, velocity: str) -> Callable:
             return record(
-                plant.free, dt, self.brisk, float(tension), gravity, *tree, "tree_pose", *joint, *body,
-                "joint_stiffness", "joint_damping", *tie, trees, "tree_phi", "onset", "tree_air", "tie_anchor",
-                "body_load", wrench, *where, "body_q", "body_qd", phi, "axes", "lever", "J", "H", "M", "bias", "drawn",
-                "D", "DJ", "DH", "Du", "lift", acceleration, *freed, velocity,
+                plant.free, dt, brisk, tension, gravity, *tree, "tree_pose", *joint, *body, "joint_stiffness",
+                "joint_damping", *tie, trees, "tree_phi", "onset", "tree_air", "tie_anchor", "body_load", "wrench",
+                *where, "body_q", "body_qd", phi, "axes", "lever", "J", "H", "M", "bias", "drawn", "D", "DJ", "DH",
+                "Du", "lift", acceleration, *freed, velocity,
             )  # fmt: skip
 
         def push(dt: float, wrench: str, acceleration: str) -> Callable:
@@ -544,19 +550,19 @@ class Plants:
         self._place = record(
             plant.place, "tree_first", "tree_size", "tree_pose", *joint, "subset", *where, "body_q", "body_qd"
         )
-        self._free = free(dt, "stepping", "wrench", "phi_used", "acceleration", "velocity_free")
+        self._free = free(self.brisk, float(tension), "stepping", "phi_used", "acceleration", "velocity_free")
         self._push = push(dt, "wrench", "acceleration")
-        # an impact: within no time springs do nothing, and wrenches are impulses
-        self._loose_joints = free(0.0, "subset", "impulse", "locked_phi", "locked_acceleration", "locked_velocity")
-        self._kick = push(1.0, "impulse", "locked_acceleration")
+        # an impact: factors of inertia and springs alone, and wrenches that are impulses
+        self._solve = free(math.inf, 0.0, "subset", "idle_phi", "idle_acceleration", "idle_velocity")
+        self._kick = push(1.0, "impulse", "idle_acceleration")
         self._integrate = record(
             plant.integrate, dt, self.limit, self.bound, *tree, "body_parent", "body_root", "stepping", "tree_awake",
             "phi_used", *where, *freed, "tree_rate", "onset", *where,
         )  # fmt: skip
         self._conserve = record(
-            plant.conserve, dt, self.bound, gravity, *tree, "body_tree", *joint, *body, *tie, "floating", "phi_used",
-            "tree_rate", "tree_air", "tie_anchor", "body_load", "wrench", "body_q", "body_qd", "acceleration",
-            "joint_q", "later_q", "later_qd", "joint_x", "joint_xd", "joint_qd",
+            plant.conserve, dt, self.limit, self.bound, gravity, *tree, "body_tree", *joint, *body, *tie, "floating",
+            "phi_used", "tree_rate", "tree_air", "tie_anchor", "body_load", "wrench", "body_q", "body_qd",
+            "acceleration", "lever", "earlier", "later_q", "later_qd", *where,
         )  # fmt: skip
         self._bind = record
 

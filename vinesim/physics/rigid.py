@@ -95,7 +95,9 @@ class Loose:
     mass: float
     com: np.ndarray
     inertia: np.ndarray
-    """[3] kg m^2 about the centre of mass."""
+    """[3] kg m^2 about the centre of mass: moments xx, yy, zz."""
+    product: np.ndarray
+    """[3] kg m^2: entries yz, zx, xy."""
     start: np.ndarray
     """[shape, 3] m; a capsule reaches from here to ``end``, a sphere has both in one place."""
     end: np.ndarray
@@ -816,7 +818,10 @@ def _drop(spec: mujoco.MjSpec, loose: Loose) -> None:
     """A bunch as a free body of round shapes, hard enough not to creep out of a gripper."""
     if not 0 < len(loose.radius) <= LUMPS:
         raise ValueError(f"a bunch of {len(loose.radius)} shapes; a loose one has 1 to {LUMPS}")
-    body = spec.worldbody.add_body(mass=loose.mass, ipos=loose.com, inertia=loose.inertia, explicitinertial=True)
+    yz, zx, xy = loose.product
+    body = spec.worldbody.add_body(
+        mass=loose.mass, ipos=loose.com, fullinertia=[*loose.inertia, xy, zx, yz], explicitinertial=True
+    )
     body.add_freejoint()
     for start, end, radius in zip(loose.start, loose.end, loose.radius, strict=True):
         kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vinesim.physics.detail import Detail
 from vinesim.physics.guard import Guard
 from vinesim.physics.parting import Blade, Partings
 from vinesim.physics.plants import Plants
@@ -32,6 +33,7 @@ class Physics:
         self.touching = Touching(model, self.plants, self.rigid)
         self.parting = Partings(self.plants, self.rigid, self.touching)
         self._picking = picking
+        self.detail = Detail(self.plants)
         self.sleep = Sleep(self.plants)
         self.guard = Guard(self.plants)
         self.partings: tuple[Parting, ...] = ()
@@ -42,6 +44,7 @@ class Physics:
         self.stages: tuple[tuple[str, Callable[[], None]], ...] = (
             ("rigid: predict without plants", self.rigid.prep),
             ("touching: wake what is near", self.touching.find),
+            ("detail: berries move where somebody is near", self._refine),
             ("plants: predict without contacts", self.plants.free),
             ("touching: solve the contacts of both", self.touching.solve),
             ("plants: move, pushed by them", self._commit),
@@ -116,6 +119,10 @@ class Physics:
         self.parting.cut(body)
         self._body_q = None
 
+    def watch(self, points: np.ndarray, radius: float) -> None:
+        """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`Detail.watch`."""
+        self.detail.watch(points, radius)
+
     def blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
         """Give a robot's link a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
 
@@ -127,6 +134,9 @@ class Physics:
         return blade
 
     # ------------------------------------------------------------------ stages that only hand over
+
+    def _refine(self) -> None:
+        self.detail.update(self.touching.near)
 
     def _commit(self) -> None:
         self.plants.commit(self.touching.bodies, self.touching.wrenches)

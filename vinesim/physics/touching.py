@@ -48,7 +48,7 @@ class Shapes:
     body: np.ndarray
     """[shape]"""
     bunch: np.ndarray
-    """[shape] the bunch it belongs to, -1 for wood."""
+    """[shape] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left is in nobody's way."""
     when: np.ndarray
     """[shape] 0: always there; 1: while its tree is coarse; 2: while it is fine (see ``State.tree_fine``)."""
     start: np.ndarray
@@ -72,6 +72,7 @@ def shapes_of(model: Model) -> Shapes:
         for i, (first, count) in enumerate(zip(model.bunch_cluster, model.bunch_clusters, strict=True))
         for k in range(count)
     }
+    stalk_of = model.bunch_of().tolist()
     lengths, radii = model.body_length.tolist(), model.body_radius.mean(1).tolist()
     for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
         if b in of_body:
@@ -88,7 +89,7 @@ def shapes_of(model: Model) -> Shapes:
             inset = min(thick, half)
             parts.append((b, of_cluster[b], 2, inset, length - inset, thick))
         else:
-            parts.append((b, -1, 0, 0.0, length, thick))
+            parts.append((b, stalk_of[b], 0, 0.0, length, thick))
     body, bunch, when, start, end, radius = (np.array(column) for column in zip(*parts, strict=True))
     along = np.array([1.0, 0.0, 0.0], np.float32)
     return Shapes(

@@ -17,7 +17,7 @@ from vinesim import frames
 from vinesim.kernels import shade, shapes
 from vinesim.sensors import textures
 from vinesim.world import leaves
-from vinesim.world.berries import VARIETIES, berries
+from vinesim.world.berries import VARIETIES, berries, piece_of
 from vinesim.world.ids import Organ, label
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -116,7 +116,7 @@ def _canes(model: Model, still: int) -> _Batch:
     seed = rng.uniform(size=len(model.tree_first))
     organ, tree = model.body_organ[bodies], model.body_tree[bodies]
     index = tree.copy()
-    bunch_of = _bunch_of_peduncle(model)[bodies]
+    bunch_of = model.bunch_of()[bodies]
     index = np.where(bunch_of >= 0, bunch_of, index)
     # shoots ripen from the base: green towards the tip, brown where the wood is thick
     green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
@@ -137,19 +137,6 @@ def _canes(model: Model, still: int) -> _Batch:
         carrier=bodies,
         group=tree,
     )
-
-
-def _bunch_of_peduncle(model: Model) -> np.ndarray:
-    """Which bunch hangs on each piece of peduncle, -1 for every other body [body]."""
-    owner = np.full(len(model.body_organ), -1, np.int32)
-    body = model.body_parent[model.bunch_body]
-    bunch = np.arange(len(body))
-    while len(body):
-        here = (body >= 0) & (model.body_organ[body] == int(Organ.PEDUNCLE))
-        body, bunch = body[here], bunch[here]
-        owner[body] = bunch
-        body = model.body_parent[body]
-    return owner
 
 
 def _foliage(model: Model) -> list[_Batch]:
@@ -211,8 +198,10 @@ def _foliage(model: Model) -> list[_Batch]:
     return [blade, petiole, node]
 
 
-def _bunch(model: Model, bunch: int, carrier: int, group: int) -> list[_Batch]:
-    """Berries and rachis of one bunch on a carrier whose frame is the bunch's body frame."""
+def _bunch(model: Model, bunch: int, place: np.ndarray, carrier: np.ndarray, group: int) -> list[_Batch]:
+    """Berries and rachis of one bunch, each in its piece: head, first cluster, ... of poses ``place`` [piece, 7] on
+    ``carrier`` [piece]. A bunch without clusters is one piece.
+    """
     number = int(model.bunch_variety[bunch])
     variety = VARIETIES[number]
     one = berries(
@@ -228,34 +217,54 @@ def _bunch(model: Model, bunch: int, carrier: int, group: int) -> list[_Batch]:
     colour = colour + np.array([0.10, 0.05, 0.01]) * (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(
         0.5 * rng.normal(size=(n, 1)), 0.0, 1.0
     )
+    pieces = len(carrier)
+    length = float(model.bunch_length[bunch]) / pieces
+    on_berry = piece_of(one.position, float(model.bunch_length[bunch]), pieces)
+
+    def placed(points: np.ndarray, piece: np.ndarray) -> np.ndarray:
+        """Points [k, 3] of the bunch's frame, as drawn, on their carriers."""
+        along = (length * piece)[:, None] * np.array([1.0, 0.0, 0.0])
+        return place[piece, :3] + frames.rotate(place[piece, 3:], points - along)
+
     away = np.hypot(*one.position[:, 1:].T)
     depth = np.clip(0.35 + 0.65 * away / max(np.quantile(away, 0.8), 1e-6), 0.0, 1.0)
     name = label(Organ.BUNCH, bunch)
-    common = {"organ": int(Organ.BUNCH), "label": name, "carrier": carrier, "group": group, "bunch": bunch}
+    common = {"organ": int(Organ.BUNCH), "label": name, "group": group, "bunch": bunch}
+    turn = place[on_berry, 3:]
+    crowding = _crowding(one.position, one.radius, one.neighbours)
     fruit = _batch(
         SPHEROID,
-        _columns(one.position, one.radius),
-        b=_columns(one.axis, variety.elongation),
+        _columns(placed(one.position, on_berry), one.radius),
+        b=_columns(frames.rotate(turn, one.axis), variety.elongation),
         c=_columns(rng.uniform(size=n), depth, 0.0, 0.0),
-        d=_crowding(one.position, one.radius, one.neighbours),
+        d=_columns(frames.rotate(turn, crowding[:, :3]), crowding[:, 3]),
         material=int(shade.BERRY),
         tint=colour,
+        carrier=carrier[on_berry],
         **common,
     )
     start, end = one.rachis[:, :-1].reshape(-1, 3), one.rachis[:, 1:].reshape(-1, 3)
     steps = one.rachis.shape[1] - 1
     taper = np.tile(np.linspace(0.0028, 0.0013, steps), len(one.rachis))
+    middle = piece_of(0.5 * (start + end), float(model.bunch_length[bunch]), pieces)
     rachis = _batch(
-        CONE, _columns(start, taper), b=_columns(end, 0.9 * taper), material=int(shade.STEM), tint=_STEM, **common
+        CONE,
+        _columns(placed(start, middle), taper),
+        b=_columns(placed(end, middle), 0.9 * taper),
+        material=int(shade.STEM),
+        tint=_STEM,
+        carrier=carrier[middle],
+        **common,
     )
     berry_end = one.position - one.axis * (one.radius * variety.elongation * 0.95)[:, None]
     loose = np.linalg.norm(berry_end - one.foot, axis=1) > 0.002
     pedicel = _batch(
         CONE,
-        _columns(one.foot, 0.0010)[loose],
-        b=_columns(berry_end, 0.0014)[loose],
+        _columns(placed(one.foot, on_berry), 0.0010)[loose],
+        b=_columns(placed(berry_end, on_berry), 0.0014)[loose],
         material=int(shade.STEM),
         tint=_STEM,
+        carrier=carrier[on_berry][loose],
         **common,
     )
     return [b for b in (fruit, rachis, pedicel) if len(b)]
@@ -377,25 +386,38 @@ def _nothing(still: int) -> _Batch:
 # ---- robots, boxes, people -------------------------------------------------------------------------------------------
 
 
-def _rigid(model: Model, links: tuple[Link, ...], first: int, groups: int) -> list[_Batch]:
-    """Shapes of all links; carriers and groups count on from the given numbers."""
+def _pieces(model: Model, bunch: int) -> np.ndarray:
+    """Bodies that carry one bunch's berries [piece]: its own, then its clusters."""
+    first, count = int(model.bunch_cluster[bunch]), int(model.bunch_clusters[bunch])
+    return np.append(model.bunch_body[bunch], np.arange(first, first + count))
+
+
+def _rigid(
+    model: Model, links: tuple[Link, ...], first: int, groups: int, shape: dict[int, np.ndarray]
+) -> list[_Batch]:
+    """Shapes of all links; carriers and groups count on from the given numbers.
+
+    ``shape`` has the poses [piece, 7] of each picked bunch's pieces in its frame.
+    """
     batches: list[_Batch] = []
     for k, link in enumerate(links):
         if link.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
-            batches += [dataclasses.replace(b, bunch=-1) for b in _bunch(model, link.index, first + k, groups + k)]
+            place = shape[link.index]
+            mine = _bunch(model, link.index, place, np.full(len(place), first + k), groups + k)
+            batches += [dataclasses.replace(b, bunch=-1) for b in mine]
             continue
         material = _RIGID.get(link.organ, int(shade.PAINT))
         name = label(link.organ, link.index)
-        for shape in link.shapes:
+        for piece in link.shapes:
             common = {
                 "material": material,
-                "tint": np.asarray(shape.rgba[:3]) ** 2.2,
+                "tint": np.asarray(piece.rgba[:3]) ** 2.2,
                 "organ": int(link.organ),
                 "label": name,
                 "carrier": first + k,
                 "group": groups + k,
             }
-            batches.append(_rigid_shape(shape, common))
+            batches.append(_rigid_shape(piece, common))
     return batches
 
 
@@ -469,17 +491,20 @@ class Primitives:
         trees = len(model.tree_first)
         batches = [_canes(model, bodies), *_foliage(model)]
         for bunch, body in enumerate(model.bunch_body):
-            batches += _bunch(model, bunch, int(body), int(model.body_tree[body]))
+            pieces = _pieces(model, bunch)
+            own = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(pieces), 1))
+            batches += _bunch(model, bunch, own, pieces, int(model.body_tree[body]))
         self._tree_batches = len(batches)
         batches += [b for b in (_fixed(model, bodies), _meadow(low, high, grass, bodies)) if b is not None]
         self._plants = [b for b in batches if len(b)] or [_nothing(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
+        self._picked: dict[int, np.ndarray] = {}
         self._moved = np.zeros(0, np.int64)
         outline, hull = textures.outlines()
         self._outline, self._hull = wp.array(outline, device=device), wp.array(hull, dtype=wp.vec2, device=device)
-        self._rest = State.at_rest(model).body_q
+        self._rest = self._body_q = State.at_rest(model).body_q
         self.version = 0
         """Counts changes of any pose."""
         self.built = 0
@@ -505,7 +530,7 @@ class Primitives:
 
     def _build(self, links: tuple[Link, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
-        rigid = _rigid(self.model, links, self._still + 1, 0)
+        rigid = _rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links))
         batches = self._plants + rigid
         first_rigid = len(self._plants)
         pieces: dict[str, list[np.ndarray]] = {
@@ -595,6 +620,15 @@ class Primitives:
         self.plant_count = total - sum(len(b) for b in rigid)
         self.built += 1
 
+    def _shapes_of_picked(self, links: tuple[Link, ...]) -> dict[int, np.ndarray]:
+        """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
+        picked = {}
+        for bunch in (link.index for link in links if link.organ == Organ.BUNCH):
+            q = np.asarray(self._body_q[_pieces(self.model, bunch)], float)
+            picked[bunch] = self._picked.get(bunch, frames.compose(frames.inverse(q[0]), q))
+        self._picked = picked
+        return picked
+
     def _bake(self, low: np.ndarray, high: np.ndarray) -> None:
         """Share of the sky that every primitive and the ground see through the leaves, in the shape at rest."""
         self._pose(np.arange(len(self.cluster_first)))
@@ -651,6 +685,7 @@ class Primitives:
         before). Whoever skips views must gather it from all of them.
         """
         if view.links is not self._links:
+            self._body_q = view.body_q
             self._build(view.links)
             everything = True
         else:

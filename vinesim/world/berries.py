@@ -87,6 +87,49 @@ def hull(count: np.ndarray, seed: np.ndarray) -> np.ndarray:
     return np.stack([_tables()[0][which, count], _tables()[1][which]], -1)
 
 
+def piece_of(position: np.ndarray, length: float, pieces: int) -> np.ndarray:
+    """Which of the equal pieces of a rachis of this length points [..., 3] belong to; 0 is at the peduncle."""
+    return np.clip((position[..., 0] * (pieces / length)).astype(int), 0, pieces - 1)
+
+
+def spread(count: np.ndarray, seed: np.ndarray, pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How berries weigh on equal pieces of their rachis: bunches [n] cut into ``pieces`` [n], for unit mass and length.
+
+    Share of the mass [n, most], centre of mass [n, most, 3] and moments of inertia about it [n, most, 3], axes of the
+    bunch's body; zero behind the last piece.
+    """
+    which = _prototype(count, seed)
+    position, radius = _packed()
+    number, most = np.arange(MOST), int(np.max(pieces, initial=1))
+    count, pieces = np.asarray(count), np.asarray(pieces)
+    length = _tables()[0][which, count]
+    position, radius = position[which] / length[:, None, None], radius[which] / length[:, None]
+    weight = np.where(number < count[:, None], radius**3, 0.0)
+    weight = weight / weight.sum(1, keepdims=True)
+    piece = np.clip((position[..., 0] * pieces[:, None]).astype(int), 0, pieces[:, None] - 1)
+    flat = (np.arange(len(count))[:, None] * most + piece).ravel()
+
+    def gathered(value: np.ndarray) -> np.ndarray:
+        return np.bincount(flat, value.ravel(), len(count) * most).reshape(len(count), most)
+
+    share = gathered(weight)
+    some = np.where(share > 0.0, share, 1.0)[..., None]
+    centre = np.stack([gathered(weight * position[..., axis]) for axis in range(3)], -1) / some
+    square = np.stack([gathered(weight * position[..., axis] ** 2) for axis in range(3)], -1)
+    square = square - share[..., None] * centre * centre
+    own = gathered(0.4 * weight * radius * radius)[..., None]  # a ball's 2/5 m r^2
+    return share, centre, square.sum(-1, keepdims=True) - square + own
+
+
+@functools.cache
+def _packed() -> tuple[np.ndarray, np.ndarray]:
+    """Positions [prototype, MOST, 3] and radii [prototype, MOST]; rounded as :func:`_tables` is."""
+    position, radius = np.zeros((len(prototypes()), MOST, 3)), np.zeros((len(prototypes()), MOST))
+    for i, bunch in enumerate(prototypes()):
+        position[i, : len(bunch.radius)], radius[i, : len(bunch.radius)] = bunch.position, bunch.radius
+    return position.round(3), radius.round(3)
+
+
 def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
     """Number of the prototype: the next larger count, its shape by seed."""
     if np.min(count) < 1 or np.max(count) > MOST:

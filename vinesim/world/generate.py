@@ -37,7 +37,8 @@ Draw = Callable[..., np.ndarray]
 """Random numbers [shoot, ...] of the shape asked for, each shoot's from the stream of its vine."""
 
 _SIDE = slice(PIECES, PIECES + SIDE_PIECES)
-_SLOTS = PIECES + SIDE_PIECES + BUNCHES * (STALK_PIECES + 1)
+_CORE = PIECES + SIDE_PIECES + BUNCHES * (STALK_PIECES + 1)
+_SLOTS = _CORE + BUNCHES * grow.CLUSTERS
 _CLEAR = 0.02
 """Least gap between a bunch and its neighbours, poles and trunks [m]."""
 _UPRIGHT = 0.6
@@ -50,6 +51,12 @@ def _stalk(which: int) -> slice:
     return slice(first, first + STALK_PIECES + 1)
 
 
+def _clusters(which: int) -> slice:
+    """Slots of one bunch's berry clusters."""
+    first = _CORE + which * grow.CLUSTERS
+    return slice(first, first + grow.CLUSTERS)
+
+
 def generate(scene: Scene) -> Model:
     """The model of a scene; the same scene gives the same bits."""
     parts = vine.load(scene.plants)
@@ -57,7 +64,7 @@ def generate(scene: Scene) -> Model:
     shoots = _draw_shoots(scene, parts, wood)
     bodies = _bodies(scene, parts, shoots)
     leaf = _leaves(scene, parts, shoots, bodies)
-    model = _model(scene, parts, wood, shoots, bodies, leaf)
+    model = _model(scene, parts, wood, shoots, bodies, leaf, _ties(scene, parts, shoots, bodies))
     return grow.settle(model).check()
 
 
@@ -427,6 +434,10 @@ class _Bodies:
     inertia: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
+    drag: np.ndarray
+    """Drag area Cd A [m^2]."""
+    head: dict[str, np.ndarray]
+    """[shoot, BUNCHES] mass, com, inertia of what of a bunch is no cluster."""
 
 
 def _bodies(scene: Scene, parts: vine.Vine, s: _Shoots) -> _Bodies:
@@ -436,7 +447,9 @@ def _bodies(scene: Scene, parts: vine.Vine, s: _Shoots) -> _Bodies:
         present=np.ones(shape, bool), parent=np.zeros(shape, int), organ=np.full(shape, int(Organ.CANE)),
         origin=np.zeros((*shape, 3)), turn=np.zeros((*shape, 4)), length=np.zeros(shape), radius=np.zeros((*shape, 2)),
         mass=np.zeros(shape), com=np.zeros((*shape, 3)), inertia=np.zeros((*shape, 3)),
-        stiffness=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)),
+        stiffness=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)), drag=np.zeros(shape),
+        head={"mass": np.zeros((count, BUNCHES)), "com": np.zeros((count, BUNCHES, 3)),
+              "inertia": np.zeros((count, BUNCHES, 3))},
     )  # fmt: skip
     cane, stalk = parts.cane, parts.peduncle
 
@@ -468,22 +481,47 @@ def _bodies(scene: Scene, parts: vine.Vine, s: _Shoots) -> _Bodies:
         _rod(b, pieces, s.stalk[:, k], radius, modulus, stalk.density.value, stalk.damping.value, s.roll[:, k], parent)
         b.organ[:, pieces] = int(Organ.PEDUNCLE)
 
-        bunch = slots.stop - 1
-        mass, long, wide = (s.fruit[name][:, k] for name in ("mass", "length", "radius"))
-        b.organ[:, bunch] = int(Organ.BUNCH)
-        b.parent[:, bunch] = bunch - 1
-        b.origin[:, bunch] = s.stalk[:, k, -1]
-        b.turn[:, bunch] = frames.aligned(s.hang[:, k], s.roll[:, k])
-        b.length[:, bunch] = long
-        b.radius[:, bunch] = wide[:, None]
-        b.mass[:, bunch] = mass
-        b.com[:, bunch, 0] = 0.45 * long  # a cone's would be 0.25, a cylinder's 0.5
-        across = mass / 5.0 * (wide * wide + 0.25 * long * long)
-        b.inertia[:, bunch] = np.stack([mass / 5.0 * 2.0 * wide * wide, across, across], -1)
-        b.stiffness[:, bunch] = b.stiffness[:, bunch - 1]
-        b.damping[:, bunch] = b.damping[:, bunch - 1]
+        _bunch(parts, s, b, k)
         b.present[:, slots] = s.bunch[:, k, None]
+    across = b.radius.sum(-1) * b.length  # of wood seen from the side
+    b.drag[:, :_CORE] += np.where(b.organ == int(Organ.BUNCH), 0.0, cane.drag.value * across)[:, :_CORE]
     return b
+
+
+def _bunch(parts: vine.Vine, s: _Shoots, b: _Bodies, k: int) -> None:
+    """Fill the slots of the bunch at the end of stalk ``k`` and of its clusters."""
+    bunch, clusters = _stalk(k).stop - 1, _clusters(k)
+    b.present[:, clusters] = False
+    has = np.flatnonzero(s.bunch[:, k])
+    if len(has) == 0:
+        return
+    mass, long, wide, count, seed = (s.fruit[name][has, k] for name in ("mass", "length", "radius", "count", "seed"))
+    pieces = grow.bunch_pieces(mass, long, wide, count, seed, parts.rachis, parts.bunch.stem_share.value)
+    b.mass[has, bunch], b.com[has, bunch], b.inertia[has, bunch] = pieces.compound()
+    for name, head in b.head.items():
+        head[has, k] = getattr(pieces, name)[:, 0]
+    b.organ[:, bunch] = b.organ[:, clusters] = int(Organ.BUNCH)
+    b.parent[:, bunch] = bunch - 1
+    b.origin[:, bunch] = s.stalk[:, k, -1]
+    b.turn[:, bunch] = frames.aligned(s.hang[:, k], s.roll[:, k])
+    b.length[has, bunch], b.radius[has, bunch] = long, wide[:, None]
+    b.stiffness[:, bunch], b.damping[:, bunch] = b.stiffness[:, bunch - 1], b.damping[:, bunch - 1]
+    # the wind takes hold of the bunch as a whole
+    b.drag[has, bunch] = parts.bunch.drag.value * 0.5 * np.pi * wide * long
+
+    most = pieces.mass.shape[1] - 1
+    number = np.arange(1, most + 1)
+    slots = np.arange(clusters.start, clusters.start + most)
+    at = np.ix_(has, slots)
+    b.present[at] = number < pieces.count[:, None]
+    b.parent[at] = np.where(number == 1, bunch, slots - 1)
+    b.turn[at] = b.turn[has, bunch, None]
+    along = frames.rotate(b.turn[has, bunch], np.array([1.0, 0.0, 0.0])) * pieces.length[:, None]
+    b.origin[at] = b.origin[has, bunch, None] + number[:, None] * along[:, None]
+    b.length[at] = pieces.length[:, None]
+    for name in ("radius", "mass", "com", "inertia", "stiffness"):
+        getattr(b, name)[at] = getattr(pieces, name)[:, 1:]
+    b.damping[at] = parts.rachis.damping.value * pieces.stiffness[:, 1:]
 
 
 def _rod(
@@ -555,6 +593,7 @@ def _leaves(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str,
 
     weight = np.where(present, leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink), 0.0)
     _load(b, slot, weight, blade)
+    np.add.at(b.drag, (np.broadcast_to(pick, slot.shape), slot), np.where(present, leaf.drag.value * area, 0.0))
     return {
         "present": present, "slot": slot, "base": base, "pose": pose, "area": area, "age": np.clip(age, 0.0, 1.0)
     }  # fmt: skip
@@ -567,7 +606,7 @@ def _load(b: _Bodies, slot: np.ndarray, weight: np.ndarray, where: np.ndarray) -
     np.add.at(mass, (pick, slot), weight)
     np.add.at(first, (pick, slot), weight[..., None] * where)
     np.add.at(second, (pick, slot), weight[..., None] * _lever(where))
-    b.mass, b.com = mass, first / mass[..., None]
+    b.mass, b.com = mass, first / np.where(mass > 0.0, mass, 1.0)[..., None]  # none in slots that are left out
     b.inertia = second - mass[..., None] * _lever(b.com)
 
 
@@ -577,10 +616,63 @@ def _lever(p: np.ndarray) -> np.ndarray:
     return square.sum(-1, keepdims=True) - square
 
 
+# ---- ties ----------------------------------------------------------------------------------------------------------
+
+
+def _ties(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str, np.ndarray]:
+    """Where shoots pass wires closely: over the net they are tied to it or lie on it, in a hedge wires hold them.
+
+    A taut wire pushed aside half way between two posts gives way with 4 tension / span.
+    """
+    layout, trellis, tendone = scene.layout, parts.trellis, scene.training == "tendone"
+    start, end = s.points[:, :-1], s.points[:, 1:]
+    spacing = np.array([layout.vine_spacing, layout.row_spacing])
+    low, high = -0.5 * spacing, (np.array([layout.vines, layout.rows]) - 0.5) * spacing
+    if tendone:
+        lines = [
+            (axis, low[axis], d / max(round(d / trellis.tendone_wire_spacing.value), 1))
+            for axis, d in enumerate(spacing)
+        ]
+    else:
+        lines = [(2, layout.height, trellis.vsp_wire_spacing.value)]
+    crossings = []
+    for axis, first, step in lines:
+        share, found = _crossing(start[..., axis], end[..., axis], first, step)
+        point = start + share[..., None] * (end - start)
+        found &= (point[..., :2] >= low).all(-1) & (point[..., :2] <= high).all(-1)
+        apart = point[..., 2] - layout.height
+        if not tendone:
+            wire = np.round(apart / step)
+            found &= (wire >= 1) & (wire <= trellis.vsp_wires.value)
+            apart = point[..., 1] - layout.row_spacing * np.round(point[..., 1] / layout.row_spacing)
+        crossings.append((share, found & (np.abs(apart) < trellis.tie_reach.value)))
+    share, tied = (np.stack(values, -1) for values in zip(*crossings, strict=True))
+    shoot, slot, which = np.nonzero(tied)
+    along = share[shoot, slot, which] * b.length[shoot, slot]
+    stiffness = 4.0 * trellis.wire_tension.value / layout.vine_spacing
+    return {
+        "shoot": shoot, "slot": slot, "point": along[:, None] * [1.0, 0.0, 0.0],
+        "anchor": start[shoot, slot] + share[shoot, slot, which, None] * (end - start)[shoot, slot],
+        "stiffness": np.full(len(slot), stiffness),
+        "damping": np.full(len(slot), trellis.tie_damping.value * stiffness),
+    }  # fmt: skip
+
+
+def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where pieces from ``start`` to ``end`` [...] cross one of parallel lines: share of their length, and whether."""
+    low, high = (start - first) / step, (end - first) / step
+    line = np.maximum(np.floor(low), np.floor(high))
+    found = np.floor(low) != np.floor(high)
+    return np.where(found, (line - low) / np.where(found, high - low, 1.0), 0.0), found
+
+
 # ---- the model -----------------------------------------------------------------------------------------------------
 
 
-def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, leaf: dict[str, np.ndarray]) -> Model:
+def _model(
+    scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, leaf: dict[str, np.ndarray],
+    ties: dict[str, np.ndarray],
+) -> Model:  # fmt: skip
     """Leave out what is masked, number the rest, and make drawn world poses relative."""
     size = b.present.sum(1)
     first = np.cumsum(size) - size
@@ -596,10 +688,10 @@ def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, 
 
     model = Model.allocate(
         tree=len(size), body=int(size.sum()), bunch=int(s.bunch.sum()), leaf=int(shown.sum()),
-        fixed=len(wood.fixed["fixed_start"]), tie=0, box=len(scene.boxes),
+        fixed=len(wood.fixed["fixed_start"]), tie=len(ties["slot"]), box=len(scene.boxes),
     )  # fmt: skip
     model.tree_first[:], model.tree_size[:], model.tree_vine[:] = first, size, s.vine
-    model.tree_core[:] = size
+    model.tree_core[:] = b.present[:, :_CORE].sum(1)
     model.tree_pose[:] = frames.pose(b.origin[:, 0], b.turn[:, 0])
 
     parent = b.parent[has]
@@ -609,7 +701,7 @@ def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, 
     base = np.where(root[:, None], model.tree_pose[tree], frames.pose(b.origin, b.turn)[tree, np.maximum(parent, 0)])
     drawn = frames.compose(frames.inverse(base), frames.pose(b.origin, b.turn)[has])
     model.body_offset[:], model.body_rest[:] = drawn[:, :3], frames.normalize(drawn[:, 3:])
-    for name in ("organ", "mass", "com", "inertia", "length", "radius"):
+    for name in ("organ", "mass", "com", "inertia", "length", "radius", "drag"):
         getattr(model, f"body_{name}")[:] = getattr(b, name)[has]
     model.joint_stiffness[:], model.joint_damping[:] = b.stiffness[has], b.damping[has]
 
@@ -618,6 +710,15 @@ def _model(scene: Scene, parts: vine.Vine, wood: _Wood, s: _Shoots, b: _Bodies, 
     model.bunch_berries[:] = fruit["count"]
     for name in ("length", "radius", "seed", "variety", "pull"):
         getattr(model, f"bunch_{name}")[:] = fruit[name]
+    model.bunch_bend[:] = parts.peduncle.bend_strength.value * np.pi / 4.0 * fruit["thick"] ** 3
+    model.bunch_cluster[:] = np.stack([number[:, _clusters(k).start] for k in range(BUNCHES)], 1)[s.bunch]
+    model.bunch_clusters[:] = np.stack([b.present[:, _clusters(k)].sum(1) for k in range(BUNCHES)], 1)[s.bunch]
+    for name, head in b.head.items():
+        getattr(model, f"bunch_head_{name}")[:] = head[s.bunch]
+
+    model.tie_body[:] = number[ties["shoot"], ties["slot"]]
+    for name in ("point", "anchor", "stiffness", "damping"):
+        getattr(model, f"tie_{name}")[:] = ties[name]
 
     model.leaf_body[:] = carrier
     model.leaf_base[:], model.leaf_pose[:], model.leaf_age[:] = (

@@ -12,11 +12,16 @@ from typing import Any
 import numpy as np
 
 from vinesim import frames
+from vinesim.world import berries, vine
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 """[m/s^2], world axes."""
+
+
+CLUSTERS = 8
+"""Most berry clusters of a bunch."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -33,14 +38,86 @@ class Wood:
     """Shear modulus G [Pa]; E / 2.6 (Poisson 0.3) unless given."""
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Pieces:
+    """Bunches [n] cut across their rachis into a chain of pieces of equal length: the head first, then clusters.
+
+    Frames stand on the rachis where a piece begins, axes as the bunch's.
+    """
+
+    count: np.ndarray
+    """[n] pieces; fields are zero behind the last."""
+    length: np.ndarray
+    """[n] of one piece [m]"""
+    mass: np.ndarray
+    """[n, most]"""
+    com: np.ndarray
+    """[n, most, 3]"""
+    inertia: np.ndarray
+    """[n, most, 3]"""
+    radius: np.ndarray
+    """[n, most, 2] of the bunch's hull where a piece begins and ends."""
+    stiffness: np.ndarray
+    """[n, most, 3] of the joint where a piece begins; the head's is the peduncle's."""
+
+    def compound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mass [n], centre of mass [n, 3] and moments of inertia [n, 3] of whole bunches, in the head's frame."""
+        along = self.length[:, None] * np.arange(self.mass.shape[1])
+        centre = self.com + along[..., None] * [1.0, 0.0, 0.0]
+        mass = self.mass.sum(1)
+        com = (self.mass[..., None] * centre).sum(1) / mass[:, None]
+        arm = centre - com[:, None]
+        square = arm * arm
+        inertia = self.inertia + self.mass[..., None] * (square.sum(-1, keepdims=True) - square)
+        return mass, com, inertia.sum(1)
+
+
+def bunch_pieces(
+    mass: np.ndarray, length: np.ndarray, radius: np.ndarray, berry_count: np.ndarray, seed: np.ndarray,
+    rachis: vine.Rachis, stem_share: float,
+) -> Pieces:  # fmt: skip
+    """Cut bunches [n] into pieces that weigh what their own berries and stems weigh; four clusters to eight."""
+    count = np.clip(np.round(length / rachis.piece.value).astype(int), 5, 1 + CLUSTERS)
+    share, com, inertia = berries.spread(berry_count, seed, count)
+    number = np.arange(share.shape[1])
+    here = number < count[:, None]
+    h = length / count
+    juice, stem = mass * (1.0 - stem_share), np.where(here, (mass * stem_share / count)[:, None], 0.0)
+    fruit = juice[:, None] * share
+    com = com * length[:, None, None] - (h[:, None] * number)[..., None] * [1.0, 0.0, 0.0]
+    inertia = juice[:, None, None] * inertia * (length * length)[:, None, None]
+    # a rod along the axis joins the berries
+    middle = np.where(here, 0.5 * h[:, None], 0.0)[..., None] * [1.0, 0.0, 0.0]
+    total = np.where(here, fruit + stem, 1.0)[..., None]
+    both = np.where(here[..., None], (fruit[..., None] * com + stem[..., None] * middle) / total, 0.0)
+    for m, at in ((fruit, com), (stem, middle)):
+        square = (at - both) ** 2
+        inertia = inertia + m[..., None] * (square.sum(-1, keepdims=True) - square)
+    inertia = inertia + (stem * (h * h / 12.0)[:, None])[..., None] * [0.0, 1.0, 1.0]
+    half = 0.5 * length[:, None]
+    edges = np.stack([number, number + 1], -1) * h[:, None, None]
+    hull = radius[:, None, None] * np.sqrt(np.maximum(1.0 - (edges / half[..., None] - 1.0) ** 2, 0.0))
+    thick = 0.5 * rachis.diameter.at(number / count[:, None])
+    _, _, stiffness = section(h[:, None], thick, thick, rachis.modulus.value, 1.0, False)
+    return Pieces(
+        count, h, np.where(here, fruit + stem, 0.0), both, np.where(here[..., None], inertia, 0.0),
+        np.where(here[..., None], hull, 0.0), np.where(here[..., None], stiffness, 0.0),
+    )  # fmt: skip
+
+
 class Tree:
-    """One tree while it grows: a list of bodies, parents before children. Bodies are numbered from 0, the root."""
+    """One tree while it grows: a list of bodies, parents before children. Bodies are numbered from 0, the root.
+
+    Berry clusters stand apart: :func:`assemble` numbers them behind all other bodies of their tree.
+    """
 
     def __init__(self, pose: np.ndarray, vine: int = -1) -> None:
         """``pose`` [7]: where the root's joint frame sits in the world."""
         self.pose = np.asarray(pose, float)
         self.vine = vine
         self.bodies: list[dict[str, Any]] = []
+        self.clusters: list[dict[str, Any]] = []
+        """Bodies behind the core, bunch by bunch; ``parent`` None is the cluster before."""
         self.bunches: list[dict[str, Any]] = []
         self.leaves: list[dict[str, Any]] = []
 
@@ -104,10 +181,69 @@ class Tree:
             numbers.append(parent)
         return numbers
 
+    def bunch(
+        self,
+        parent: int,
+        mass: float,
+        *,
+        count: int = 90,
+        seed: int = 0,
+        variety: int = 0,
+        rest: Any = frames.IDENTITY,
+        offset: Any = None,
+        stiffness: Any = None,
+        damping: Any = None,
+        clusters: bool = True,
+        parts: vine.Vine | None = None,
+        **fields: Any,
+    ) -> int:
+        """Hang a bunch of ``count`` berries on a piece of peduncle and return its body's number.
+
+        It has the size that its berries need, and unless told otherwise clusters, and the joint of the piece it hangs
+        on. ``parts`` gives the rachis (``data/plants/vine.toml`` unless given); ``fields`` are further ``bunch_``
+        fields of the :class:`Model`.
+        """
+        parts = vine.load("vine") if parts is None else parts
+        above = self.bodies[parent]
+        berry = berries.VARIETIES[variety]
+        share = parts.bunch.stem_share.value
+        size = berry.volume_radius * np.cbrt(mass * (1.0 - share) / (count * berry.mass))
+        length, radius = berries.hull(np.array(count), np.array(seed)) * size
+        one = bunch_pieces(*(np.array([value]) for value in (mass, length, radius, count, seed)), parts.rachis, share)
+        whole, com, inertia = (value[0] for value in one.compound())
+        offset = (above["length"], 0.0, 0.0) if offset is None else offset
+        body = self.add(
+            parent, offset=offset, rest=rest, organ=int(Organ.BUNCH), mass=whole, com=com, inertia=inertia,
+            length=length, radius=(radius, radius),
+            stiffness=above["stiffness"] if stiffness is None else stiffness,
+            damping=above["damping"] if damping is None else damping,
+        )  # fmt: skip
+        bunch = {
+            "body": body, "length": length, "radius": radius, "berries": count, "seed": seed, "variety": variety,
+            **fields,
+        }  # fmt: skip
+        if clusters:
+            n = int(one.count[0]) - 1
+            bunch |= {
+                "clusters": n, "head_mass": one.mass[0, 0], "head_com": one.com[0, 0],
+                "head_inertia": one.inertia[0, 0],
+            }  # fmt: skip
+            for i in range(1, n + 1):
+                self.clusters.append({
+                    "parent": None if i > 1 else body, "offset": np.array([one.length[0], 0.0, 0.0]),
+                    "rest": frames.IDENTITY, "organ": int(Organ.BUNCH), "mass": one.mass[0, i], "com": one.com[0, i],
+                    "inertia": one.inertia[0, i], "length": one.length[0], "radius": one.radius[0, i],
+                    "stiffness": one.stiffness[0, i], "damping": parts.rachis.damping.value * one.stiffness[0, i],
+                })  # fmt: skip
+        self.bunches.append(bunch)
+        return body
+
     def settle(self) -> None:
         """Choose rest rotations so that the shape drawn so far is the equilibrium under gravity: see :func:`settle`."""
         model = settle(assemble([self]))
-        for body, rest, settled in zip(self.bodies, model.body_rest, model.joint_settled, strict=True):
+        for body, rest, settled in zip(
+            [*self.bodies, *self.clusters], model.body_rest, model.joint_settled, strict=True
+        ):
             body["rest"], body["settled"] = rest.astype(float), settled.astype(float)
 
 
@@ -140,6 +276,7 @@ def settle(model: Model) -> Model:
 
     The spring must carry the weight hanging below each joint, so it is turned by theta = torque / stiffness (in joint
     axes), and ``joint_settled`` turns it back: drawn = rest * settled. Writes both fields and returns the model.
+    A bunch with clusters weighs what its head and they weigh.
     """
     if not (model.joint_stiffness > 0.0).all():
         body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
@@ -149,8 +286,12 @@ def settle(model: Model) -> Model:
     drawn = frames.normalize(model.body_rest.astype(float))
     world = model.forward(np.broadcast_to(frames.IDENTITY, drawn.shape))
     depth, parent = model.depth(), model.body_parent
-    force = model.body_mass[:, None].astype(float) * GRAVITY
-    moment = np.cross(frames.rotate(world[:, 3:], model.body_com.astype(float)), force)
+    mass, com = model.body_mass.astype(float), model.body_com.astype(float)
+    fine = model.bunch_clusters > 0
+    mass[model.bunch_body[fine]] = model.bunch_head_mass[fine]
+    com[model.bunch_body[fine]] = model.bunch_head_com[fine]
+    force = mass[:, None] * GRAVITY
+    moment = np.cross(frames.rotate(world[:, 3:], com), force)
     for level in range(int(depth.max(initial=0)), 0, -1):
         here = np.flatnonzero(depth == level)
         above = parent[here]
@@ -172,7 +313,7 @@ def assemble(trees: list[Tree], **others: np.ndarray) -> Model:
     """One :class:`Model` of all trees; ``others`` are whole arrays of the rest (``fixed_start=...``)."""
     counts = {
         "tree": len(trees),
-        "body": sum(len(t.bodies) for t in trees),
+        "body": sum(len(t.bodies) + len(t.clusters) for t in trees),
         "bunch": sum(len(t.bunches) for t in trees),
         "leaf": sum(len(t.leaves) for t in trees),
         "fixed": len(others.get("fixed_start", ())),
@@ -182,13 +323,14 @@ def assemble(trees: list[Tree], **others: np.ndarray) -> Model:
     model = Model.allocate(**counts)
     first = bunch = leaf = 0
     for number, tree in enumerate(trees):
-        model.tree_first[number], model.tree_size[number] = first, len(tree.bodies)
-        model.tree_core[number] = len(tree.bodies)
+        size, core = len(tree.bodies) + len(tree.clusters), len(tree.bodies)
+        model.tree_first[number], model.tree_size[number], model.tree_core[number] = first, size, core
         model.tree_pose[number], model.tree_vine[number] = tree.pose, tree.vine
-        for i, body in enumerate(tree.bodies):
+        for i, body in enumerate([*tree.bodies, *tree.clusters]):
             at = first + i
+            parent = i - 1 if body["parent"] is None else body["parent"]
             model.body_tree[at] = number
-            model.body_parent[at] = first + body["parent"] if body["parent"] >= 0 else -1
+            model.body_parent[at] = first + parent if parent >= 0 else -1
             for key in ("organ", "offset", "rest", "mass", "com", "inertia", "length", "radius"):
                 if key in body:
                     getattr(model, f"body_{key}")[at] = body[key]
@@ -198,12 +340,15 @@ def assemble(trees: list[Tree], **others: np.ndarray) -> Model:
         for fields in tree.bunches:
             for key, value in fields.items():
                 getattr(model, f"bunch_{key}")[bunch] = value + first if key == "body" else value
+            if fields.get("clusters", 0):
+                model.bunch_cluster[bunch] = first + core
+                core += fields["clusters"]
             bunch += 1
         for fields in tree.leaves:
             for key, value in fields.items():
                 getattr(model, f"leaf_{key}")[leaf] = value + first if key == "body" else value
             leaf += 1
-        first += len(tree.bodies)
+        first += size
     for name, value in others.items():
         target = getattr(model, name)
         target[:] = np.asarray(value).reshape(target.shape)

@@ -63,6 +63,7 @@ class Cane(_Part, frozen=True, kw_only=True):
     lateral_share: Annotated[Number, "1"]
     lateral_length: Annotated[Range, "m"]
     lateral_diameter: Annotated[Number, "m"]
+    drag: Annotated[Number, "1"]
 
 
 class Peduncle(_Part, frozen=True, kw_only=True):
@@ -74,6 +75,7 @@ class Peduncle(_Part, frozen=True, kw_only=True):
     density: Annotated[Number, "kg/m^3"]
     damping: Annotated[Number, "s"]
     pull: Annotated[Range, "N"]
+    bend_strength: Annotated[Number, "Pa"]
 
 
 class Bunch(_Part, frozen=True, kw_only=True):
@@ -84,6 +86,16 @@ class Bunch(_Part, frozen=True, kw_only=True):
     mass_range: Annotated[Range, "kg"]
     length_range: Annotated[Range, "m"]
     stem_share: Annotated[Number, "1"]
+    drag: Annotated[Number, "1"]
+
+
+class Rachis(_Part, frozen=True, kw_only=True):
+    """The stem inside a bunch, from the peduncle down, with the berries that lean on each other around it."""
+
+    piece: Annotated[Number, "m"]
+    diameter: Annotated[Range, "m"]
+    modulus: Annotated[Number, "Pa"]
+    damping: Annotated[Number, "s"]
 
 
 class Leaf(_Part, frozen=True, kw_only=True):
@@ -94,6 +106,7 @@ class Leaf(_Part, frozen=True, kw_only=True):
     mass_per_area: Annotated[Number, "kg/m^2"]
     petiole: Annotated[Range, "m"]
     petiole_mass: Annotated[Number, "kg"]
+    drag: Annotated[Number, "1"]
 
 
 class Arm(_Part, frozen=True, kw_only=True):
@@ -122,6 +135,9 @@ class Trellis(_Part, frozen=True, kw_only=True):
     tendone_wire_spacing: Annotated[Number, "m"]
     vsp_wire_spacing: Annotated[Number, "m"]
     vsp_wires: Annotated[Number, "1"]
+    wire_tension: Annotated[Number, "N"]
+    tie_reach: Annotated[Number, "m"]
+    tie_damping: Annotated[Number, "s"]
 
 
 class Vine(_Part, frozen=True, kw_only=True):
@@ -130,6 +146,7 @@ class Vine(_Part, frozen=True, kw_only=True):
     cane: Cane
     peduncle: Peduncle
     bunch: Bunch
+    rachis: Rachis
     leaf: Leaf
     arm: Arm
     trunk: Trunk
