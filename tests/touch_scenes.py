@@ -21,7 +21,10 @@ DOWN = frames.aligned(np.array([0.0, 0.0, -1.0]))
 def cane(
     at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0, pieces: int = 16
 ) -> Tree:
-    """A cane of 1 m in 16 pieces (or more, without a bunch), level when drawn; ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm."""
+    """A cane of 1 m in pieces (16 if it has a bunch), level when drawn.
+
+    ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm.
+    """
     tree = Tree(frames.pose(np.array(at, float), frames.yaw(heading)))
     wood = Wood(5e9, 800.0, beta, shear=2.5e9)  # G = E/2 makes torsion as stiff as bending, as MuJoCo's ball wants
     last = tree.rod(-1, 1.0, (radius, radius), wood, pieces)[-1]
