@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
-from touch_scenes import bar, bunch_scene, cane, grasp, gripper
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from touch_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 
 from vinesim import frames
 from vinesim.kernels import contact
@@ -14,7 +16,9 @@ from vinesim.physics import touching as touching_module
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.step import Physics
 from vinesim.physics.touching import Touching, shapes_of
-from vinesim.world.grow import assemble
+from vinesim.world.grow import Tree, Wood, assemble
+from vinesim.world.ids import Organ
+from vinesim.world.model import Model
 from vinesim.world.ids import Organ
 
 KINDS = {
@@ -112,6 +116,87 @@ def test_distance_grows_along_its_normal_and_is_negative_inside(kind):
     if kind in ("box", "ellipsoid"):
         inside = (np.abs(points) < size).all(1) if kind == "box" else ((points / size) ** 2).sum(1) < 1.0
         assert ((found[:, 3] < 0.0) == inside).all()
+
+
+numbers = st.floats(-0.2, 0.2, allow_nan=False, width=32)
+points = st.tuples(numbers, numbers, numbers)
+
+
+def true_distance(kind: str, p: np.ndarray) -> np.ndarray:
+    """Signed distance of points [n, 3], straight from the definition; the ellipsoid's only on and outside of it."""
+    size = np.array(KINDS[kind][1])
+    if kind == "sphere":
+        return np.linalg.norm(p, axis=1) - size[0]
+    if kind == "capsule":
+        return np.linalg.norm(p - np.clip(p[:, 2:], -size[1], size[1]) * [0, 0, 1], axis=1) - size[0]
+    if kind == "box":
+        beyond = np.abs(p) - size
+        return np.where((beyond < 0).all(1), beyond.max(1), np.linalg.norm(np.maximum(beyond, 0), axis=1))
+    across, along = np.hypot(p[:, 0], p[:, 1]) - size[0], np.abs(p[:, 2]) - size[1]
+    inside = (across < 0) & (along < 0)
+    return np.where(inside, np.maximum(across, along), np.hypot(np.maximum(across, 0), np.maximum(along, 0)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(kind=st.sampled_from(["sphere", "capsule", "cylinder", "box"]), start=points, end=points)
+def test_distance_of_a_segment_is_the_least_of_its_points(kind, start, end):
+    a, b = np.array(start, float), np.array(end, float)
+    along = np.linspace(0.0, 1.0, 2001)[:, None]
+    truth = true_distance(kind, a + along * (b - a)).min()
+    step = np.linalg.norm(b - a) / 2000
+    mine = closest(kind, a[None], b[None])[0]
+    assert truth - step - 1e-9 <= mine[3] <= truth + 1e-9 or mine[3] == pytest.approx(truth, abs=step + 1e-9)
+    assert np.linalg.norm(mine[:3]) == pytest.approx(1.0, abs=1e-9)
+
+
+@settings(max_examples=100, deadline=None)
+@given(start=points, end=points)
+def test_distance_of_a_segment_and_an_ellipsoid_has_its_sign_and_is_close_near_it(start, end):
+    size = np.array(KINDS["ellipsoid"][1])
+    a, b = np.array(start, float), np.array(end, float)
+    p = a + np.linspace(0.0, 1.0, 2001)[:, None] * (b - a)
+    mine = closest("ellipsoid", a[None], b[None])[0]
+    depth = (np.linalg.norm(p / size, axis=1) - 1.0).min()
+    if abs(depth) > 2e-3:
+        assert np.sign(mine[3]) == np.sign(depth)
+    if 0.0 < mine[3] < 0.01:  # the way to the surface along its normal
+        polar, around = np.meshgrid(np.linspace(0, np.pi, 181), np.linspace(0, 2 * np.pi, 361))
+        sphere = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
+        surface = (size * sphere).reshape(-1, 3)
+        nearest = min(np.linalg.norm(surface - x, axis=1).min() for x in p[::20])
+        assert mine[3] == pytest.approx(nearest, abs=0.003)
+
+
+@wp.kernel
+def _crossing(
+    # in
+    a: wp.array(dtype=wp.vec3d),
+    b: wp.array(dtype=wp.vec3d),
+    c: wp.array(dtype=wp.vec3d),
+    d: wp.array(dtype=wp.vec3d),
+    # out
+    found_out: wp.array(dtype=contact.vec6d),
+):
+    """Normal, distance and places where two segments are closest."""
+    i = wp.tid()
+    found_out[i] = contact.crossing(a[i], b[i], c[i], d[i])
+
+
+@settings(max_examples=150, deadline=None)
+@given(a=points, b=points, c=points, d=points)
+def test_distance_of_two_segments_is_the_least_of_their_points(a, b, c, d):
+    ends = [np.array([x], float) for x in (a, b, c, d)]
+    found = wp.zeros(1, dtype=contact.vec6d, device="cpu")
+    wp.launch(
+        _crossing, 1, inputs=[wp.array(x, dtype=wp.vec3d, device="cpu") for x in ends], outputs=[found], device="cpu"
+    )
+    mine = found.numpy()[0]
+    t = np.linspace(0.0, 1.0, 301)[:, None]
+    one, other = (x + t * (y - x) for x, y in (ends[:2], ends[2:]))
+    truth = np.linalg.norm(one[:, None] - other[None], axis=-1).min()
+    step = (np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(ends[3] - ends[2])) / 600
+    assert truth - step - 1e-7 <= mine[3] <= truth + 1e-7
+    assert np.linalg.norm(mine[:3]) == pytest.approx(1.0, abs=1e-9)
 
 
 def test_segment_along_a_face_touches_in_its_middle():
@@ -358,3 +443,219 @@ def test_a_copy_touches_only_trees_of_which_its_owner_tells():
     physics.touching.told[20] = True
     physics.step()
     assert {tree for tree, _ in physics.touched} == {20}
+
+
+# ---------------------------------------------------------------------- what stands, branches, clusters
+
+
+POLE = {"fixed_radius": [[0.03, 0.03]], "fixed_organ": [int(Organ.POLE)], "fixed_index": [0]}
+
+
+def test_what_stands_neither_wakes_a_tree_nor_keeps_it_awake():
+    model = assemble([cane((0.0, 0.0, 0.01))], fixed_start=[[0.5, 0.04, 0.0]], fixed_end=[[0.5, 0.04, 2.0]], **POLE)
+    physics = Physics(model)
+    for _ in range(20):
+        physics.step()
+    assert len(physics.plants.awake) == 0
+    physics.plants.wake(0)
+    for _ in range(60):
+        physics.step()
+    assert len(physics.plants.awake) == 0
+    assert physics.touching.near.tolist() == []
+
+
+def test_a_swinging_cane_stops_at_a_pole():
+    model = assemble([cane((0.0, 0.0, 1.0))], fixed_start=[[0.8, 0.1, 0.0]], fixed_end=[[0.8, 0.1, 2.0]], **POLE)
+    furthest = {}
+    for standing in (True, False):
+        physics = Physics(model if standing else assemble([cane((0.0, 0.0, 1.0))]))
+        physics.plants.wake(0)
+        physics.state.joint_qd[0, 2] = 3.0
+        furthest[standing] = 0.0
+        met = set()
+        for _ in range(40):
+            physics.step()
+            met |= {(c.actor, c.link) for c in physics.contacts}
+            furthest[standing] = max(furthest[standing], float(physics.view().body_q[12, 1]))
+        assert met == ({("world", "fixed/0")} if standing else set())
+    assert furthest[False] > 0.12
+    assert furthest[True] < 0.08
+
+
+def clustered() -> Model:
+    """A cane with a bunch of two clusters at its tip."""
+    tree = Tree(frames.pose(np.array([0.0, 0.0, 1.0])))
+    last = tree.rod(-1, 0.4, (0.006, 0.006), Wood(5e9, 800.0, 0.02), 4)[-1]
+    down = frames.aligned(np.array([0.0, 0.0, -1.0]))
+    bunch = tree.add(
+        last, offset=(0.1, 0, 0), rest=down, organ=int(Organ.BUNCH), mass=0.3, com=(0.08, 0, 0), length=0.16,
+        radius=(0.04, 0.04), inertia=(3e-4, 8e-4, 8e-4), stiffness=np.full(3, 0.3), damping=np.full(3, 0.02),
+    )  # fmt: skip
+    parts = [
+        tree.add(
+            bunch, offset=(0.02 + 0.07 * i, 0, 0), organ=int(Organ.BUNCH), mass=0.14, com=(0.035, 0, 0), length=0.07,
+            radius=(0.03, 0.03), inertia=(1e-4, 1e-4, 1e-4), stiffness=np.full(3, 0.1), damping=np.full(3, 0.01),
+        )
+        for i in range(2)
+    ]  # fmt: skip
+    tree.bunches.append({"body": bunch, "length": 0.16, "radius": 0.04, "berries": 60})
+    model = assemble([tree])
+    model.tree_core[0] -= len(parts)
+    model.bunch_cluster[0], model.bunch_clusters[0] = parts[0], len(parts)
+    model.bunch_head_mass[0], model.bunch_head_com[0], model.bunch_head_inertia[0] = 0.02, (0.01, 0, 0), (1e-5,) * 3
+    whole = 0.02 * 0.01 + 0.14 * (0.055 + 0.125)
+    model.bunch_head_com[0] = (0.01, 0.0, 0.0)
+    model.body_com[bunch] = (whole / 0.3, 0.0, 0.0)
+    return model
+
+
+def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fine():
+    model = clustered()
+    shapes, bunch = shapes_of(model), int(model.bunch_body[0])
+    assert (shapes.bunch == 0).sum() == (shapes.when > 0).sum()
+    assert set(shapes.body[shapes.when == 1]) == {bunch}
+    assert set(shapes.body[shapes.when == 2]) == {bunch + 1, bunch + 2}
+    assert (np.diff(shapes.body) >= 0).all()
+    met = {}
+    for fine in (False, True):
+        physics = Physics(model)
+        hand = physics.rigid.link_pose if False else None
+        assert hand is None
+        if fine:
+            physics.plants.refine(0)
+        at = physics.state.body_q[bunch, :3] + np.array([0.0, -0.075, -0.06])
+        physics.add_robot(bar(at, damping=200.0))
+        physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
+        seen = set()
+        stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+        for _ in range(40):
+            for stage in stages:
+                stage()
+            seen |= {c.body for c in physics.contacts}
+            physics._commit()
+            physics._finish()
+        met[fine] = seen
+    assert bunch in met[False]
+    assert met[False].isdisjoint({bunch + 1, bunch + 2})
+    assert met[True] & {bunch + 1, bunch + 2}
+    assert bunch not in met[True]
+
+
+# ---------------------------------------------------------------------- laws of every contact, in scenes by chance
+
+
+def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
+    """A few canes about the origin and two bodies that fly among them."""
+    rng = np.random.default_rng(seed)
+    trees = [
+        cane(
+            (rng.uniform(-0.2, 0.2), 0.15 * i, rng.uniform(0.8, 1.2)), radius=float(rng.uniform(0.003, 0.008)),
+            beta=float(rng.uniform(0.0, 0.03)), heading=float(rng.uniform(-0.5, 0.5)),
+            bunch=float(rng.choice([0.0, 0.4])),
+        )
+        for i in range(4)
+    ]  # fmt: skip
+    physics = Physics(assemble(trees), picking=False)
+    if options:
+        Touching.__init__(physics.touching, physics.model, physics.plants, physics.rigid, **options)
+    physics.add_robot(bar((rng.uniform(0.3, 0.9), -0.2, 1.0), damping=float(rng.choice([0.0, 300.0]))))
+    physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
+    speed = rng.uniform(0.3, 3.0)
+    physics.rigid.command("bar", np.zeros(1), np.array([speed]))
+    physics.rigid.data.qvel[physics.rigid._robots["bar"].v] = speed
+    physics.rigid.push("probe", "rod", np.array([0.0, 0.0, -rng.uniform(2.0, 30.0)]))
+    return physics, ["bar", "probe"]
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**31))
+def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed):
+    physics, robots = scene_by_chance(seed)
+    touching, rigid = physics.touching, physics.rigid
+    pressed = 0
+    for _ in range(60):
+        physics.step()
+        n = touching.count
+        if n == 0:
+            continue
+        pressed += 1
+        impulse = touching._impulse[: 3 * n].reshape(n, 3)
+        assert (impulse[:, 0] >= 0.0).all()
+        rub = np.linalg.norm(impulse[:, 1:], axis=1)
+        assert (rub <= touching._friction[:n] * impulse[:, 0] * (1.0 + 1e-9) + 1e-15).all()
+        # what plants feel, summed over bodies; what others feel, contact by contact
+        outside = [c for c in physics.contacts if c.actor != "plants"]
+        np.testing.assert_allclose(
+            touching.wrenches[:, :3].sum(0), -sum((c.force for c in outside), np.zeros(3)), atol=1e-9
+        )
+        for name in robots:
+            base = rigid._robots[name].base_v[:2]
+            on_robot = sum((c.force for c in outside if c.actor == name), np.zeros(3))
+            np.testing.assert_allclose(touching.force[base], on_robot[:2], atol=1e-9)
+    assert pressed > 0
+    assert np.isfinite(physics.state.joint_qd).all()
+
+
+def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axis: np.ndarray) -> np.ndarray:
+    """Least distance [tree] of the shapes of each tree and a capsule on a robot's link, from many points of both."""
+    touching, model = physics.touching, physics.model
+    body_q = model.forward(physics.state.joint_q)[touching.shapes.body]
+    t = np.linspace(0.0, 1.0, 9)[:, None, None]
+    along = touching.shapes.start + t * (touching.shapes.end - touching.shapes.start)
+    points = body_q[:, :3] + frames.rotate(body_q[:, 3:], along.astype(float))
+    pose = physics.rigid.link_pose(name, link)
+    turn = frames.rotate(pose[3:], axis)
+    apart = points - pose[:3]
+    apart -= np.clip(apart @ turn, -half, half)[..., None] * turn
+    gap = (np.linalg.norm(apart, axis=-1) - touching.shapes.radius - radius).min(0)
+    least = np.full(len(model.tree_first), np.inf)
+    np.minimum.at(least, model.body_tree[touching.shapes.body], gap)
+    return least
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**31))
+def test_waking_is_never_late(seed):
+    """However a bar flies through a vineyard, at the end of every tick it touches no tree that sleeps."""
+    rng = np.random.default_rng(seed)
+    model = assemble([cane((1.2 * (i % 3), 0.25 * (i // 3), 1.0), radius=0.005) for i in range(24)])
+    physics = Physics(model)
+    physics.add_robot(bar((rng.uniform(0.0, 3.0), rng.uniform(-1.0, 1.0), rng.uniform(0.8, 1.2)), damping=2000.0))
+    speed, woken, touched = 0.0, set(), 0
+    for tick in range(120):
+        if tick % 20 == 0:
+            speed = float(rng.uniform(-5.0, 5.0))
+            physics.rigid.drive_base("bar", (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), rng.uniform(-2.0, 2.0)))
+        physics.rigid.command("bar", np.zeros(1), np.array([speed]))
+        asleep = ~physics.state.tree_awake.copy()
+        physics.step()
+        still = asleep & ~physics.state.tree_awake
+        gap = gaps(physics, "bar", "bar", 0.03, 0.3, np.array([0.0, 0.0, 1.0]))
+        assert gap[still].min(initial=np.inf) > 0.0
+        touched += int((gap < 0.002).any())
+        woken |= set(physics.plants.awake.tolist())
+    assert touched == 0 or woken
+
+
+def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
+    """Many canes in one place about one bar: what is left out is said in words, twice the same."""
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, heading=1e-4 * i) for i in range(170)])
+
+    def run() -> tuple:
+        physics = Physics(model)
+        Touching.__init__(physics.touching, model, physics.plants, physics.rigid, capacity=100, branches=False)
+        for i in range(15):
+            physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
+        physics.plants.wake(np.arange(170))
+        for stage in (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve):
+            stage()
+        t = physics.touching
+        return t.count, t.dropped, t.complaint, t._gap[:100].copy(), t.bodies.tobytes() + t.wrenches.tobytes(), t
+
+    count, dropped, complaint, gap, result, touching = run()
+    assert count == 100
+    assert count + dropped > 10_000 or dropped > 2000
+    assert f"{dropped} of {count + dropped} contacts" in complaint
+    everything = np.sort(touching._hit_gap[:170].ravel()[np.flatnonzero(touching._slot < touching._found[:170, None])])
+    np.testing.assert_array_equal(np.sort(gap), everything[:100])
+    assert run()[4] == result

@@ -18,11 +18,16 @@ from vinesim.world.values import Drive, RobotSpec
 DOWN = frames.aligned(np.array([0.0, 0.0, -1.0]))
 
 
-def cane(at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0) -> Tree:
-    """A cane of 1 m in 16 pieces, level when drawn; ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm."""
+def cane(
+    at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0, pieces: int = 16
+) -> Tree:
+    """A cane of 1 m in pieces (16 if it has a bunch), level when drawn.
+
+    ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm.
+    """
     tree = Tree(frames.pose(np.array(at, float), frames.yaw(heading)))
     wood = Wood(5e9, 800.0, beta, shear=2.5e9)  # G = E/2 makes torsion as stiff as bending, as MuJoCo's ball wants
-    last = tree.rod(-1, 1.0, (radius, radius), wood, 16)[-1]
+    last = tree.rod(-1, 1.0, (radius, radius), wood, pieces)[-1]
     if bunch:
         mass, stiffness = 800.0 * np.pi * 0.002**2 * 0.04, 1e9 * np.pi * 0.002**4 / 4 / 0.04
         across = mass * (0.04**2 / 12 + 0.002**2 / 4)
@@ -68,15 +73,22 @@ GRIPPER = f"""<robot name="gripper"><link name="base_footprint">{_inertial(50)}<
 </robot>"""
 
 
-def gripper(bunch: np.ndarray, name: str = "grip", effort: float = 40.0) -> RobotSpec:
-    """Two box fingers, open about the point ``bunch`` [3]; drives: shift (y), lift (z), both fingers."""
+def gripper(bunch: np.ndarray, name: str = "grip", effort: float = 40.0, mimic: bool = False) -> RobotSpec:
+    """Two box fingers, open about the point ``bunch`` [3]; drives: shift (y), lift (z), both fingers.
+
+    ``mimic``: the right finger is not driven, it copies the left one.
+    """
     drives = (
         Drive("shift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
         Drive("lift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
         Drive("close_left", 4000.0, 80.0, effort, 5.0, -1.0, 1.0),
         Drive("close_right", 4000.0, 80.0, effort, 5.0, -1.0, 1.0),
     )
-    return RobotSpec(name, 0, GRIPPER, "base_footprint", frames.pose(bunch), drives, np.zeros(4))
+    urdf = GRIPPER
+    if mimic:
+        drives = drives[:3]
+        urdf = urdf.replace('<child link="right"/>', '<child link="right"/><mimic joint="close_left"/>')
+    return RobotSpec(name, 0, urdf, "base_footprint", frames.pose(bunch), drives, np.zeros(len(drives)))
 
 
 BAR = f"""<robot name="bar"><link name="base_footprint">{_inertial(50)}</link>
@@ -89,6 +101,24 @@ def bar(at, name: str = "bar", stiffness: float = 0.0, damping: float = 0.0) -> 
     """An upright bar of 3 kg that slides along y; without gains it coasts."""
     drives = (Drive("sweep", stiffness, damping, 1000.0, 5.0, -5.0, 5.0),)
     return RobotSpec(name, 1, BAR, "base_footprint", frames.pose(np.array(at, float)), drives, np.zeros(1))
+
+
+def probe(at, name: str = "probe", mass: float = 3.0, drives: tuple[Drive, ...] | None = None) -> RobotSpec:
+    """A level rod of 20 cm along y that moves along x (drive ``along``) and up and down (``press``).
+
+    Unless told otherwise ``along`` is held and ``press`` coasts.
+    """
+    urdf = f"""<robot name="probe"><link name="base_footprint">{_inertial(500)}</link>
+<link name="carriage">{_inertial(1)}</link><link name="rod">{_inertial(mass)}
+<collision><origin rpy="1.5707963267948966 0 0"/><geometry><cylinder radius="0.02" length="0.2"/></geometry></collision>
+</link>
+{_slide("along", "base_footprint", "carriage", "1 0 0")}{_slide("press", "carriage", "rod", "0 0 1")}</robot>"""
+    if drives is None:
+        drives = (
+            Drive("along", 5000.0, 300.0, 1000.0, 5.0, -5.0, 5.0),
+            Drive("press", 0.0, 2.0, 1000.0, 5.0, -5.0, 5.0),
+        )
+    return RobotSpec(name, 2, urdf, "base_footprint", frames.pose(np.array(at, float)), drives, np.zeros(2))
 
 
 class Whole:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from touch_scenes import Whole, bar, bunch_scene, cane, grasp, gripper
+from touch_scenes import Whole, bar, bunch_scene, cane, grasp, gripper, probe
 
 from vinesim import frames
 from vinesim.physics.step import Physics
+from vinesim.physics.touching import STIFFNESS, Touching
 from vinesim.world.grow import assemble
+from vinesim.world.ids import Organ
+from vinesim.world.values import Drive
 
 FINGERS = ("left", "right")
 
@@ -19,6 +22,29 @@ def middle_of(pose: np.ndarray) -> np.ndarray:
 
 def force_on(physics: Physics, link: str) -> np.ndarray:
     return sum((c.force for c in physics.contacts if c.link == link), np.zeros(3))
+
+
+def with_contacts(physics: Physics, **options) -> Physics:
+    """The same physics, its contacts made with other options."""
+    Touching.__init__(physics.touching, physics.model, physics.plants, physics.rigid, **options)
+    return physics
+
+
+def ramp(t: float, start: float, end: float) -> float:
+    return float(np.clip((t - start) / (end - start), 0.0, 1.0))
+
+
+def energy(physics: Physics) -> float:
+    """Kinetic energy, weight and springs of all plants [J]."""
+    physics.refresh()
+    model, q, v = physics.model, physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
+    com = frames.rotate(q[:, 3:], model.body_com.astype(float))
+    velocity = v[:, :3] + np.cross(v[:, 3:], com)
+    spin = frames.rotate(frames.conjugate(q[:, 3:]), v[:, 3:])
+    bent = frames.log(physics.state.joint_q.astype(float))
+    moving = model.body_mass * (velocity**2).sum(1) + (model.body_inertia * spin**2).sum(1)
+    springs = (model.joint_stiffness * bent**2).sum(1)
+    return float((0.5 * moving + 0.5 * springs + 9.81 * model.body_mass * (q[:, 2] + com[:, 2])).sum())
 
 
 def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
@@ -214,6 +240,283 @@ def test_a_fast_sweep_agrees_with_hard_contacts_in_quarters_of_a_millisecond():
     impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
     assert impulse[0] == pytest.approx(impulse[1], rel=0.01)
     assert peak[0] == pytest.approx(peak[1], rel=0.05)
+
+
+@pytest.mark.parametrize(("pull", "effort"), [(20.0, 40.0), (40.0, 40.0), (60.0, 60.0)])
+def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
+    model, body, middle = bunch_scene()
+    spec = gripper(middle, effort=effort)
+    ours, oracle = Physics(model, picking=False), Whole(model, spec)
+    ours.add_robot(spec)
+    held, force, off = [], [], 0.0
+    for tick in range(450):
+        t = 0.01 * tick
+        grip = 0.05 * ramp(t, 0.3, 0.8)
+        for rigid in (ours.rigid, oracle.rigid):
+            rigid.command("grip", np.array([0.0, 0.05 * ramp(t, 1.0, 2.0), grip, grip]))
+            rigid.push("grip", "hand", np.array([0.0, 0.0, -pull * ramp(t, 2.5, 3.0)]))
+        ours.step()
+        oracle.step()
+        mine = middle_of(ours.view().body_q[body])
+        held.append(mine - ours.rigid.link_pose("grip", "left")[:3])
+        force.append([[world.force_on(f) if world is oracle else force_on(ours, f) for f in FINGERS]
+                      for world in (ours, oracle)])  # fmt: skip
+        off = max(off, float(np.linalg.norm(mine - middle_of(oracle.body_q(body)))))
+    held, force = np.array(held), np.array(force)
+    assert np.linalg.norm(held[440:].mean(0) - held[240:250].mean(0)) < 5e-5
+    assert off < 1e-3
+    np.testing.assert_allclose(force[400:, 0, :, 1].mean(0), force[400:, 1, :, 1].mean(0), rtol=0.01)
+    np.testing.assert_allclose(
+        ours.rigid.read("grip")[2][2:], oracle.rigid.read("grip")[2][2:], rtol=0.01, atol=0.01 * effort
+    )
+
+
+def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
+    model, body, middle = bunch_scene()
+    spec = gripper(middle, mimic=True)
+    ours, oracle = Physics(model), Whole(model, spec)
+    ours.add_robot(spec)
+    force, off = [], 0.0
+    for tick in range(450):
+        t = 0.01 * tick
+        for rigid in (ours.rigid, oracle.rigid):
+            rigid.command("grip", np.array([0.0, 0.05 * ramp(t, 1.0, 2.0), 0.05 * ramp(t, 0.3, 0.8)]))
+            rigid.push("grip", "hand", np.array([0.0, 0.0, -20.0 * ramp(t, 2.5, 3.0)]))
+        ours.step()
+        oracle.step()
+        force.append([[force_on(ours, f)[1], oracle.force_on(f)[1]] for f in FINGERS])
+        off = max(off, float(np.linalg.norm(middle_of(ours.view().body_q[body]) - middle_of(oracle.body_q(body)))))
+    force = np.array(force)
+    for phase in (slice(150, 240), slice(400, 450)):
+        mine, theirs = force[phase].mean(0).T
+        np.testing.assert_allclose(mine, theirs, rtol=0.01)
+        assert np.abs(mine).min() > 15.0
+    assert off < 1e-3
+
+
+def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
+    """Force: each finger closes against its servo (4000 N/m) and two contacts in a row of the fingers' compliance."""
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.006, beta=0.02)])
+    body = 12
+    home = model.forward(model.joint_settled)
+    at = home[body, :3] + np.array([0.03, 0.0, 0.0])
+    spec = gripper(at)
+    ours = Physics(model)
+    ours.add_robot(spec)
+    held, force = [], []
+    for tick in range(500):
+        t = 0.01 * tick
+        grip = 0.074 * ramp(t, 0.3, 0.8)
+        ours.rigid.command("grip", np.array([0.05 * ramp(t, 2.0, 2.6), 0.1 * ramp(t, 1.2, 1.8), grip, grip]))
+        ours.rigid.push("grip", "hand", np.array([0.0, 0.0, -15.0 * ramp(t, 3.0, 3.4)]))
+        ours.step()
+        held.append(ours.view().body_q[body, :3] - ours.rigid.link_pose("grip", "left")[:3])
+        force.append([force_on(ours, finger) for finger in FINGERS])
+    held, force = np.array(held), np.array(force)
+    closed = 4000.0 * (0.074 - (0.085 - 0.01 - 0.006))
+    expected = closed / (1.0 + 4000.0 / (2.0 * STIFFNESS))
+    np.testing.assert_allclose(force[110:119, 0, 1], expected, rtol=0.01)
+    np.testing.assert_allclose(force[110:119, 1, 1], -expected, rtol=0.01)
+    assert ours.view().body_q[body, 2] - home[body, 2] > 0.08
+    assert np.abs(held[480:] - held[290:300].mean(0)).max() < 5e-4  # it gives way when the pull begins
+    assert np.abs(held[480:] - held[380:390].mean(0)).max() < 1e-6  # and holds
+    on_fingers = force[480:, :, 2].sum(1)
+    assert np.abs(np.diff(on_fingers)).max() < 1e-3
+    assert on_fingers.mean() < -3.0  # what a bent cane weighs
+    ours.rigid.command("grip", np.zeros(4))
+    for _ in range(1500):
+        ours.step()
+    assert ours.touching.count == 0
+    assert np.abs(ours.view().body_q - home)[:, :3].max() < 1e-3
+
+
+@pytest.mark.parametrize("servo", [1e4, 1e5])
+@pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5, 1e6])
+def test_thirty_kilograms_press_on_pieces_of_half_a_gram(servo, stiffness):
+    """No blow-up, steady to a millinewton, and the force that hardly depends on the contact's stiffness."""
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.004, pieces=64)])
+    assert model.body_mass.max() < 7e-4
+    drives = (
+        Drive("along", servo, 2.0 * np.sqrt(servo * 31.0), 1e4, 5.0, -5.0, 5.0),
+        Drive("press", servo, 2.0 * np.sqrt(servo * 30.0), 1e4, 5.0, -5.0, 5.0),
+    )
+    physics = with_contacts(Physics(model), stiffness=stiffness)
+    physics.add_robot(probe((0.5, 0.0, 1.04), mass=30.0, drives=drives))
+    force = []
+    for tick in range(150):
+        physics.rigid.command("probe", np.array([0.0, -0.15 * ramp(0.01 * tick, 0.0, 0.5)]))
+        physics.step()
+        force.append(force_on(physics, "rod")[2])
+    force = np.array(force)
+    assert np.abs(np.diff(force[120:])).max() < 1e-3
+    assert force.max() < 1.05 * force[140]
+    assert force[140] == pytest.approx(3.5, rel=0.03)
+    assert physics.guard.count.sum() == 0
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 2e4, 1e6])
+@pytest.mark.parametrize("speed", [0.5, 3.0])
+def test_contact_without_damping_gives_no_energy(stiffness, speed):
+    model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005, beta=0.0) for i in range(5)])
+    physics = with_contacts(Physics(model), stiffness=stiffness, branches=False)
+    physics.touching.damping = 0.0
+    physics.touching._record()
+    physics.add_robot(bar((0.7, -0.08, 0.95)))
+    drive = physics.rigid._robots["bar"].v
+    physics.rigid.data.qvel[drive] = speed
+    start = energy(physics) + 1.5 * speed**2
+    most, met = -np.inf, set()
+    for _ in range(round(2.0 / speed * 100)):
+        physics.step()
+        most = max(most, energy(physics) + 1.5 * float(physics.rigid.data.qvel[drive][0]) ** 2 - start)
+        met |= set(physics.touched)
+    assert len(met) > 1
+    assert most < 1e-6
+
+
+def test_branches_that_push_each_other_give_no_energy():
+    model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005, beta=0.0) for i in range(5)])
+    physics = Physics(model)
+    physics.add_robot(bar((0.7, -0.08, 0.95)))
+    drive = physics.rigid._robots["bar"].v
+    physics.rigid.data.qvel[drive] = 0.5
+    start = energy(physics) + 1.5 * 0.5**2
+    most, pushed = -np.inf, 0
+    physics.plants.wake(np.arange(5))
+    for _ in range(400):
+        physics.step()
+        most = max(most, energy(physics) + 1.5 * float(physics.rigid.data.qvel[drive][0]) ** 2 - start)
+        pushed += any(c.actor == "plants" for c in physics.contacts)
+    assert pushed > 10
+    assert most < 1e-6
+
+
+@pytest.mark.parametrize("places", [(0.5,), (0.4, 0.8)])
+def test_what_rests_on_a_cane_weighs_what_it_weighs(places):
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.03)])
+    physics = Physics(model)
+    names = [f"probe{i}" for i in range(len(places))]
+    for name, x in zip(names, places, strict=True):
+        physics.add_robot(probe((x, 0.0, 1.03), name))
+        physics.rigid.push(name, "rod", np.array([0.0, 0.0, -3.0]))
+    force = []
+    for _ in range(1200):
+        physics.step()
+        force.append([sum(c.force[2] for c in physics.contacts if c.actor == name) for name in names])
+    np.testing.assert_allclose(np.array(force)[-50:], 3.0, rtol=1e-3)
+
+
+def test_what_is_dragged_along_a_cane_rubs_as_the_oracle_says():
+    """Mean force over three pieces within 1 %; from tick to tick it is smooth but for the corners between pieces."""
+    model, spec = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)]), probe((0.5, 0.0, 1.03))
+    ours, oracle = Physics(model), Whole(model, spec, dt=0.001, give=0.004)
+    ours.add_robot(spec)
+    force = []
+    for tick in range(1000):
+        for rigid in (ours.rigid, oracle.rigid):
+            rigid.push("probe", "rod", np.array([0.0, 0.0, -3.0]))
+            if tick > 600:
+                rigid.command("probe", np.array([0.001 * (tick - 600), 0.0]), np.array([0.1, 0.0]))
+        ours.step()
+        theirs = np.zeros(3)
+        for _ in range(10):
+            oracle.step()
+            theirs += oracle.force_on("rod") / 10
+        force.append([force_on(ours, "rod"), theirs])
+    force = np.array(force)[650:]
+    np.testing.assert_allclose(force[:, 0].mean(0)[[0, 2]], force[:, 1].mean(0)[[0, 2]], rtol=0.01)
+    rough = np.diff(force[:, :, 2], n=2, axis=0)
+    assert np.sqrt((rough[:, 0] ** 2).mean()) < 0.01 * 3.0
+    assert np.sqrt((rough[:, 0] ** 2).mean()) < np.sqrt((rough[:, 1] ** 2).mean())
+
+
+def test_a_floating_cane_takes_the_momentum_that_the_bar_loses():
+    model = assemble([cane((0.0, 0.0, 3.0), radius=0.005)])
+    physics = Physics(model)
+    physics.plants.cut(0)
+    physics.add_robot(bar((0.4, -0.06, 3.0)))
+    drive = physics.rigid._robots["bar"].v
+    physics.rigid.data.qvel[drive] = 1.0
+    total = []
+    for _ in range(40):
+        physics.step()
+        physics.refresh()
+        q, v = physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
+        com = frames.rotate(q[:, 3:], model.body_com.astype(float))
+        plants = model.body_mass @ (v[:, :3] + np.cross(v[:, 3:], com))
+        total.append((plants[1], 3.0 * float(physics.rigid.data.qvel[drive][0])))
+    total = np.array(total)
+    assert total[-1, 0] > 0.03
+    np.testing.assert_allclose(total.sum(1), 3.0, atol=1e-4)
+
+
+def test_a_cut_cane_falls_on_the_ground_lies_there_with_its_weight_and_sleeps():
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.005)])
+    physics = Physics(model)
+    physics.plants.cut(4)
+    weight, lying, ticks = 9.81 * model.body_mass[4:].sum(), [], 0
+    while len(physics.plants.awake) and ticks < 2000:
+        physics.step()
+        ticks += 1
+        ground = sum((c.force for c in physics.contacts if c.link == "ground"), np.zeros(3))
+        lying.append(-ground[2])
+    assert ticks < 2000
+    np.testing.assert_allclose(lying[-20:], weight, rtol=0.01)
+    height = physics.view().body_q[4:, 2]
+    assert height.min() > 0.004
+    assert height.max() < 0.05
+    assert physics.guard.count.sum() == 0
+    for _ in range(50):
+        physics.step()
+    assert len(physics.plants.awake) == 0
+
+
+def test_a_cut_cane_lies_across_a_pole_and_a_branch_that_it_falls_on():
+    poles = {"fixed_start": [[0.3, -0.5, 0.5]], "fixed_end": [[0.3, 0.5, 0.5]], "fixed_radius": [[0.03, 0.03]]}
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.006)], **poles, fixed_organ=[int(Organ.POLE)], fixed_index=[0])
+    physics = Physics(model)
+    physics.plants.cut(0)
+    met, low = set(), np.inf
+    for _ in range(60):
+        physics.step()
+        met |= {c.link for c in physics.contacts}
+        middle = physics.view().body_q[:, :3]
+        near = np.abs(middle[:, 0] - 0.3) < 0.03
+        if near.any() and np.abs(middle[near, 1]).max() < 0.4:
+            low = min(low, float(middle[near, 2].min()))
+    assert "fixed/0" in met
+    assert low > 0.5
+
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.008), cane((0.3, -0.3, 1.2), radius=0.006, heading=np.pi / 2)])
+    physics = Physics(model)
+    physics.plants.wake([0, 1])
+    cut = int(model.tree_first[1])
+    physics.plants.cut(cut)
+    met, sunk = 0, 0.0
+    for _ in range(60):
+        physics.step()
+        met += any(c.actor == "plants" for c in physics.contacts)
+        sunk = min(sunk, float((physics.view().body_q[:cut, 2] - 1.0).min()))
+    assert met > 5
+    assert sunk < -0.01
+
+
+def test_what_overlaps_as_drawn_stays_at_rest():
+    """Two canes through each other, one through a pole and one through the ground."""
+    standing = {"fixed_start": [[0.5, -0.5, 1.0]], "fixed_end": [[0.5, 0.5, 1.0]], "fixed_radius": [[0.03, 0.03]]}
+    model = assemble(
+        [cane((0.0, 0.0, 1.0)), cane((0.4, -0.4, 1.003), heading=np.pi / 2), cane((3.0, 0.0, 0.004))],
+        **standing, fixed_organ=[int(Organ.POLE)], fixed_index=[0],
+    )  # fmt: skip
+    physics = Physics(model)
+    physics.plants.wake([0, 1, 2])
+    fastest = 0.0
+    for _ in range(60):
+        physics.step()
+        fastest = max(fastest, float(physics.plants.tree_rate.max()))
+    assert fastest < 1e-3
+    assert len(physics.plants.awake) == 0
+    assert physics.contacts == ()
 
 
 def test_two_runs_agree_to_the_bit():

@@ -21,6 +21,7 @@ SPHERE = wp.constant(2)
 CAPSULE = wp.constant(3)
 ELLIPSOID = wp.constant(4)
 CYLINDER = wp.constant(5)
+BOX = wp.constant(6)
 
 # what is counted in one tick: awake trees, hits, hits without room, trees that are struck, plant bodies in contact,
 # and whether constraints of MuJoCo's own bind what is touched
@@ -34,6 +35,9 @@ BOUND = wp.constant(5)
 SKIN = wp.constant(wp.float64(0.002))
 """Contacts are seen from this gap on [m], and from as far as the two can come together in one tick."""
 
+HAIR = wp.constant(wp.float64(0.0002))
+"""What stands and other branches count when a tick brings them closer than this [m]."""
+
 AGREE = wp.constant(wp.float64(0.5))
 """Least cosine between the normals before and after a tick for which the contact moves on smoothly."""
 
@@ -43,6 +47,10 @@ ABRUPT = wp.constant(wp.float64(0.3))
 vec5d = wp.types.vector(length=5, dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
+FLAT = wp.constant(wp.float64(0.999))
+"""Least cosine between the normals at both ends of what runs along a face."""
+
+FACE_BISECTIONS = wp.constant(12)
 BLOCK = wp.constant(32)
 """So many things that do not move share one box, and are sorted out by one comparison."""
 
@@ -161,6 +169,45 @@ def nearest(kind: int, size: wp.vec3d, rotation: wp.mat33d, middle: wp.vec3d, a:
     n = distance(kind, size, start + t * along)
     normal = rotation * wp.vec3d(n[0], n[1], n[2])
     return vec5d(normal[0], normal[1], normal[2], n[3], t)
+
+
+@wp.func
+def close_to_flat(kind: int):
+    """Whether a segment can lie along this kind of primitive."""
+    return kind == BOX or kind == CAPSULE or kind == CYLINDER
+
+
+@wp.func
+def level(least: wp.vec4d, there: wp.vec4d):
+    """Whether a point lies along the same face as the closest one."""
+    agree = least[0] * there[0] + least[1] * there[1] + least[2] * there[2]
+    return agree > FLAT and there[3] < least[3] + SKIN
+
+
+@wp.func
+def along_face(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64):
+    """Both ends (0 to 1) of what runs along a primitive about its closest point; one place twice if it crosses it.
+
+    A segment that lies along a face needs two contacts: with one, it rocks about it from tick to tick.
+    """
+    half = wp.float64(0.5)
+    along = b - a
+    least = distance(kind, size, a + t * along)
+    ends = wp.vec2d(wp.float64(0.0), wp.float64(1.0))
+    for side in range(2):
+        if not level(least, distance(kind, size, a + ends[side] * along)):
+            outer = ends[side]
+            inner = t
+            for i in range(FACE_BISECTIONS):
+                middle = half * (outer + inner)
+                if level(least, distance(kind, size, a + middle * along)):
+                    inner = middle
+                else:
+                    outer = middle
+            ends[side] = inner
+    if (ends[1] - ends[0]) * wp.length(along) < wp.float64(2.0) * SKIN:
+        ends = wp.vec2d(t, t)
+    return ends
 
 
 @wp.func
@@ -313,6 +360,8 @@ def bound_trees(
     start_ahead_out: wp.array(dtype=wp.vec3),
     end_ahead_out: wp.array(dtype=wp.vec3),
     speed_out: wp.array(dtype=float),
+    shape_low_out: wp.array(dtype=wp.vec3),
+    shape_high_out: wp.array(dtype=wp.vec3),
     low_out: wp.array(dtype=wp.vec3),
     high_out: wp.array(dtype=wp.vec3),
 ):
@@ -348,10 +397,14 @@ def bound_trees(
         end = wp.transform_point(pose, shape_end[s])
         reach = wp.max(wp.length(shape_start[s]), wp.length(shape_end[s])) + shape_radius[s]
         speed = wp.length(wp.spatial_top(motion)) + reach * wp.length(wp.spatial_bottom(motion))
+        grown = wp.vec3(shape_radius[s] + speed * dt)
+        shape_low = wp.min(start, end) - grown
+        shape_high = wp.max(start, end) + grown
+        shape_low_out[s] = shape_low
+        shape_high_out[s] = shape_high
         if here(shape_when[s], fine):
-            grown = wp.vec3(shape_radius[s] + speed * dt)
-            low = wp.min(low, wp.min(start, end) - grown)
-            high = wp.max(high, wp.max(start, end) + grown)
+            low = wp.min(low, shape_low)
+            high = wp.max(high, shape_high)
         start_out[s] = start
         end_out[s] = end
         start_ahead_out[s] = ahead(dt, pose, motion, bend_out[body], start)
@@ -500,11 +553,14 @@ def meet(
     tree_high: wp.array(dtype=wp.vec3),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
+    body_qd_free: wp.array(dtype=wp.spatial_vector),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
     start_ahead: wp.array(dtype=wp.vec3),
     end_ahead: wp.array(dtype=wp.vec3),
     shape_speed: wp.array(dtype=float),
+    shape_low: wp.array(dtype=wp.vec3),
+    shape_high: wp.array(dtype=wp.vec3),
     xmat: wp.array(dtype=wp.mat33d),
     middle: wp.array(dtype=wp.vec3d),
     geom_velocity: wp.array(dtype=wp.vec3d),
@@ -563,13 +619,30 @@ def meet(
                 margin = SKIN + (wp.float64(shape_speed[s]) + geom_speed[g]) * dt
                 between = center - middle[g]
                 limit = bound + geom_radius[g] + margin
-                if wp.dot(between, between) < limit * limit:
+                touch = not apart(shape_low[s], shape_high[s], geom_low[g], geom_high[g])
+                if touch and wp.dot(between, between) < limit * limit:
                     rotation = xmat[geom_id[g]]
                     near = nearest(geom_kind[g], geom_size[g], rotation, middle[g], a, b)
-                    gap = near[3] - radius
-                    if gap < margin:
+                    sides = int(0)  # noqa: RUF046
+                    ends = wp.vec2d(near[4], near[4])
+                    if near[3] - radius < margin:
+                        sides = 1
+                        if close_to_flat(geom_kind[g]):
+                            back = wp.transpose(rotation)
+                            ends = along_face(
+                                geom_kind[g], geom_size[g], back * (a - middle[g]), back * (b - middle[g]), near[4]
+                            )
+                            if ends[0] < ends[1]:
+                                sides = 2
+                    for side in range(sides):
+                        # two points of a side along a face are followed each for itself, a single one is looked for
+                        if sides == 2:
+                            p = a + ends[side] * (b - a)
+                            near = nearest(geom_kind[g], geom_size[g], rotation, middle[g], p, p)
+                        t = ends[side]
+                        gap = near[3] - radius
                         normal = wp.vec3d(near[0], near[1], near[2])
-                        point = a + near[4] * (b - a) - (radius + half * gap) * normal
+                        point = a + t * (b - a) - (radius + half * gap) * normal
                         # how the two come together if both go on as they go, and where they are when the tick ends
                         body = shape_body[s]
                         velocity = velocity_at(body_q[body], body_qd[body], point)
@@ -582,25 +655,31 @@ def meet(
                                 to_double(end_drawn[s]),
                             )  # fmt: skip
                             gap = gap - wp.min(drawn[3] - radius - SKIN, zero)
-                            wanted = gap + wp.min(come, zero) < SKIN
+                            freely = velocity_at(body_q[body], body_qd_free[body], point)
+                            wanted = gap + wp.min(wp.min(come, dt * wp.dot(normal, freely)), zero) < HAIR
                         if wanted:
+                            from_a = to_double(start_ahead[s])
+                            from_b = to_double(end_ahead[s])
+                            if sides == 2:
+                                from_a = from_a + t * (from_b - from_a)
+                                from_b = from_a
                             later = nearest(
                                 geom_kind[g], geom_size[g], turn(dt * geom_spin[g], rotation),
-                                middle[g] + dt * geom_velocity[g], to_double(start_ahead[s]), to_double(end_ahead[s]),
+                                middle[g] + dt * geom_velocity[g], from_a, from_b,
                             )  # fmt: skip
                             normal_later = wp.vec3d(later[0], later[1], later[2])
                             bent = zero
                             if wp.dot(normal, normal_later) > AGREE:
                                 moved = dt * wp.length(velocity - push)
                                 bent = wp.clamp(later[3] - near[3] - come, -moved, moved)
-                                onto = to_double(start_ahead[s]) + later[4] * to_double(end_ahead[s] - start_ahead[s])
+                                onto = from_a + later[4] * (from_b - from_a)
                                 onto = onto - (later[3] - half * gap) * normal_later - dt * velocity
                                 normal = wp.normalize(normal + normal_later)
                                 point = half * (point + onto)
                             if gap + come + bent < zero and come < -ABRUPT * dt:
                                 onset = True
                             if found < slots:
-                                hit_shape_out[i, found] = s
+                                hit_shape_out[i, found] = 2 * s + side
                                 hit_other_out[i, found] = g
                                 hit_gap_out[i, found] = gap
                                 hit_room_out[i, found] = gap + bent
@@ -651,11 +730,14 @@ def meet_branches(
     tree_high: wp.array(dtype=wp.vec3),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
+    body_qd_free: wp.array(dtype=wp.spatial_vector),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
     start_ahead: wp.array(dtype=wp.vec3),
     end_ahead: wp.array(dtype=wp.vec3),
     shape_speed: wp.array(dtype=float),
+    shape_low: wp.array(dtype=wp.vec3),
+    shape_high: wp.array(dtype=wp.vec3),
     # out
     found_out: wp.array(dtype=wp.int32),
     hit_shape_out: wp.array2d(dtype=wp.int32),
@@ -681,19 +763,14 @@ def meet_branches(
             low = wp.max(tree_low[tree], tree_low[other])
             high = wp.min(tree_high[tree], tree_high[other])
             for s in range(tree_shape[tree], tree_shape[tree + 1]):
-                grown = wp.vec3(shape_radius[s] + shape_speed[s] * float(dt))
-                s_low = wp.min(start[s], end[s]) - grown
-                s_high = wp.max(start[s], end[s]) + grown
+                s_low = shape_low[s] - wp.vec3(0.002)
+                s_high = shape_high[s] + wp.vec3(0.002)
                 within = not apart(s_low, s_high, low, high)
                 if other == tree:
                     within = shape_bunch[s] >= 0
                 if within and there(shape_when[s], tree_fine[tree], shape_bunch[s], bunch_attached):
                     for t in range(tree_shape[other], tree_shape[other + 1]):
-                        radius = shape_radius[s] + shape_radius[t]
-                        margin = radius + 0.002 + (shape_speed[s] + shape_speed[t]) * float(dt)
-                        between = 0.5 * (start[s] + end[s] - start[t] - end[t])
-                        limit = margin + 0.5 * (wp.length(end[s] - start[s]) + wp.length(end[t] - start[t]))
-                        pair = wp.length_sq(between) < limit * limit
+                        pair = not apart(s_low, s_high, shape_low[t], shape_high[t])
                         if pair and other == tree:
                             pair = not kin(shape_body[s], shape_body[t], body_parent)
                             if shape_bunch[t] >= 0:
@@ -703,6 +780,8 @@ def meet_branches(
                             b = to_double(end[s])
                             c = to_double(start[t])
                             d = to_double(end[t])
+                            radius = shape_radius[s] + shape_radius[t]
+                            margin = radius + 0.002 + (shape_speed[s] + shape_speed[t]) * float(dt)
                             near = crossing(a, b, c, d)
                             gap = near[3] - wp.float64(radius)
                             if near[3] < wp.float64(margin):
@@ -717,7 +796,9 @@ def meet_branches(
                                 push = velocity_at(body_q[shape_body[t]], body_qd[shape_body[t]], point)
                                 come = dt * wp.dot(normal, velocity - push)
                                 gap = gap - wp.min(drawn[3] - wp.float64(radius) - SKIN, zero)
-                                if gap + wp.min(come, zero) < SKIN:
+                                freely = velocity_at(body_q[shape_body[s]], body_qd_free[shape_body[s]], point)
+                                freely = freely - velocity_at(body_q[shape_body[t]], body_qd_free[shape_body[t]], point)
+                                if gap + wp.min(wp.min(come, dt * wp.dot(normal, freely)), zero) < HAIR:
                                     later = crossing(
                                         to_double(start_ahead[s]), to_double(end_ahead[s]), to_double(start_ahead[t]),
                                         to_double(end_ahead[t]),
@@ -731,7 +812,7 @@ def meet_branches(
                                     if gap + come + bent < zero and come < -ABRUPT * dt:
                                         onset_out[i] = True
                                     if found < slots:
-                                        hit_shape_out[i, found] = s
+                                        hit_shape_out[i, found] = 2 * s
                                         hit_other_out[i, found] = -1 - t
                                         hit_gap_out[i, found] = gap
                                         hit_room_out[i, found] = gap + bent
@@ -795,7 +876,7 @@ def index(
         shape = hit_shape[hits[c]]
         other = hit_other[hits[c]]
         shape_out[c] = shape
-        body_out[c] = shape_body[shape]
+        body_out[c] = shape_body[shape // 2]
         other_body_out[c] = -1
         if other < 0:
             other_body_out[c] = shape_body[-1 - other]

@@ -362,7 +362,7 @@ class Touching:
         self._trees = np.zeros(trees, np.int32)
         self._tree_low, self._tree_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
         self._near = np.zeros(trees, np.bool_)
-        for name in ("start", "end", "start_ahead", "end_ahead"):
+        for name in ("start", "end", "start_ahead", "end_ahead", "shape_low", "shape_high"):
             setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
         self._bend = np.zeros((len(self.model.body_mass), 6), np.float32)
         self._shape_speed = np.zeros(shapes, np.float32)
@@ -477,6 +477,7 @@ class Touching:
         standing = [shared(x, wp.vec3) for x in (self._standing_low, self._standing_high)]
         s_radius, s_speed = shared(s.radius, float), shared(self._shape_speed, float)
         s_at = [shared(x, wp.vec3) for x in (self._start, self._end)]
+        s_box = [shared(x, wp.vec3) for x in (self._shape_low, self._shape_high)]
         s_ahead = [shared(x, wp.vec3) for x in (self._start_ahead, self._end_ahead)]
         m_first, m_size, m_parent = (
             shared(x, wp.int32) for x in (self.model.tree_first, self.model.tree_size, self.model.body_parent)
@@ -501,7 +502,7 @@ class Touching:
             kernels.bound_trees,
             [dt, m_first, m_size, core, m_parent, s_tree, s_body, s_when, shared(s.start, wp.vec3),
              shared(s.end, wp.vec3), s_radius, *ints("trees"), body_q, body_qd, shared(state.body_cut, wp.bool), fine],
-            [shared(self._bend, wp.spatial_vector), *s_at, *s_ahead, s_speed, *t_box],
+            [shared(self._bend, wp.spatial_vector), *s_at, *s_ahead, s_speed, *s_box, *t_box],
         )  # fmt: skip
         told = shared(self.told, wp.bool)
         a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
@@ -516,7 +517,7 @@ class Touching:
             shared(self._hit_normal, wp.vec3d),
             shared(self._hit_point, wp.vec3d),
         ]
-        onset, now = shared(self._onset, wp.bool), [body_q, body_qd, *s_at, *s_ahead, s_speed]
+        onset, now = shared(self._onset, wp.bool), [body_q, body_qd, body_qd_free, *s_at, *s_ahead, s_speed, *s_box]
         self._meeting = bind(
             kernels.meet,
             [dt, SLOTS, self._movable, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, g_id, g_kind, g_size,
