@@ -58,7 +58,7 @@ class World:
         pytest.fail(f"did not come true within {limit} s of simulated time")
 
     def touching(self):
-        return [c for c in self.picker.physics.contacts if c.actor == "picker" and c.body == self.body]
+        return [c for c in self.picker.physics.contacts if c.actor == "picker" and c.body in self.picker.trace.bodies]
 
 
 @pytest.fixture(scope="module")

@@ -124,7 +124,7 @@ class Client:
             body = self.trace.body
             force = np.zeros(3)
             for contact in self.physics.contacts:
-                if contact.body == body:
+                if contact.body in self.trace.bodies:
                     force -= contact.force
             told = int(self.model.body_tree[body]) in self._copies
             self.trace.add(self.physics.time, self.physics.state.body_q[body], force, told)

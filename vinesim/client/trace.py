@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 
+from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 
 
@@ -18,6 +19,8 @@ class Trace:
         """``rest_q`` [7]: pose of the bunch's body before anybody touched it."""
         self.bunch = bunch
         self.body = int(model.bunch_body[bunch])
+        self.bodies = np.flatnonzero((model.bunch_of() == bunch) & (model.body_organ == int(Organ.BUNCH))).tolist()
+        """The bunch's own body, and its clusters."""
         self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
         self._rest = self._centre(rest_q)
         self._clock = np.zeros(capacity)
