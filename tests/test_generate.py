@@ -139,7 +139,8 @@ def test_shoots_are_tied_where_they_pass_wires(vineyard):
     wire = model.fixed_organ == Organ.WIRE
     start, end = model.fixed_start[wire].astype(float), model.fixed_end[wire].astype(float)
     gap = np.array([to_segment(point, start, end).min() for point in at])
-    assert gap.max() < 0.075
+    assert np.mean(gap < 0.075) > (0.99 if scene.training == "vsp" else 0.35)
+    assert gap.max() < 0.36  # by a string of 0.3 m and a mesh of 0.5 m
     assert (np.diff(model.tie_body) >= 0).all()
     per_shoot = len(at) / len(model.tree_first)
     assert (3.0 < per_shoot <= 4.0) if scene.training == "vsp" else (0.5 < per_shoot < 4.0)
@@ -267,11 +268,19 @@ def modes(model, tree):
     below = np.eye(n, dtype=bool)
     for i in reversed(range(1, n)):
         below[parent[i]] |= below[i]
+    ties = np.flatnonzero((model.tie_body >= bodies.start) & (model.tie_body < bodies.stop))
+    held, pull = model.tie_body[ties] - first, model.tie_stiffness[ties, None].astype(float)
 
     def unbalanced(angle):
         q, axes, centre = place(angle)
         weight = np.outer(mass, [0.0, 0.0, -9.81])
-        moment = [np.cross(centre[below[i]] - q[i, :3], weight[below[i]]).sum(0) for i in range(n)]
+        at = q[held, :3] + frames.rotate(q[held, 3:], model.tie_point[ties].astype(float))
+        force = pull * (model.tie_anchor[ties] - at)
+        moment = [
+            np.cross(centre[below[i]] - q[i, :3], weight[below[i]]).sum(0)
+            + np.cross(at[below[i, held]] - q[i, :3], force[below[i, held]]).sum(0)
+            for i in range(n)
+        ]
         return (model.joint_stiffness[bodies] * angle - frames.rotate(frames.conjugate(axes), np.array(moment))).ravel()
 
     h = 1e-5
@@ -298,7 +307,7 @@ def test_shoots_stand_and_bunches_swing_as_measured(vineyard):
     laden = np.bincount(model.body_tree[model.bunch_body], minlength=len(model.tree_first))
     swings = []
     for count in (0, 1, 2):
-        for tree in np.flatnonzero(laden == count)[:4]:
+        for tree in np.flatnonzero(laden == count)[:: 9 if count == 0 else 1][:6]:
             square, shape, inertia = modes(model, tree)
             assert square[0] > 0.0, f"tree {tree} with {count} bunches falls over"
             if count == 1:

@@ -39,6 +39,8 @@ Draw = Callable[..., np.ndarray]
 _SIDE = slice(PIECES, PIECES + SIDE_PIECES)
 _CORE = PIECES + SIDE_PIECES + BUNCHES * (STALK_PIECES + 1)
 _SLOTS = _CORE + BUNCHES * grow.CLUSTERS
+_BOUND = 10
+"""The piece of a shoot at whose beginning a string binds it to the net."""
 _CLEAR = 0.02
 """Least gap between a bunch and its neighbours, poles and trunks [m]."""
 _UPRIGHT = 0.6
@@ -645,8 +647,12 @@ def _ties(scene: Scene, parts: vine.Vine, s: _Shoots, b: _Bodies) -> dict[str, n
             wire = np.round(apart / step)
             found &= (wire >= 1) & (wire <= trellis.vsp_wires.value)
             apart = point[..., 1] - layout.row_spacing * np.round(point[..., 1] / layout.row_spacing)
-        crossings.append((share, found & (np.abs(apart) < trellis.tie_reach.value)))
-    share, tied = (np.stack(values, -1) for values in zip(*crossings, strict=True))
+        crossings.append((share, np.where(found, np.abs(apart), np.inf)))
+    share, apart = (np.stack(values, -1) for values in zip(*crossings, strict=True))
+    tied = apart < trellis.tie_reach.value
+    if tendone:  # strings bind the end to the net: a long shoot that is free beyond its middle falls over
+        share[:, _BOUND, 0] = 0.0
+        tied[:, _BOUND, 0] = np.abs(start[:, _BOUND, 2] - layout.height) < trellis.tie_string.value
     shoot, slot, which = np.nonzero(tied)
     along = share[shoot, slot, which] * b.length[shoot, slot]
     stiffness = 4.0 * trellis.wire_tension.value / layout.vine_spacing

@@ -137,6 +137,7 @@ class Trellis(_Part, frozen=True, kw_only=True):
     vsp_wires: Annotated[Number, "1"]
     wire_tension: Annotated[Number, "N"]
     tie_reach: Annotated[Number, "m"]
+    tie_string: Annotated[Number, "m"]
     tie_damping: Annotated[Number, "s"]
 
 
