@@ -10,8 +10,8 @@ import warp as wp
 from clustered import clustered, momenta, moving
 
 from vinesim import frames
-from vinesim.physics.memory import Memory, NoDevice
 from vinesim.physics.guard import Guard
+from vinesim.physics.memory import Memory, NoDevice
 from vinesim.physics.plants import ONSET, Plants
 from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.model import Model
@@ -659,6 +659,8 @@ def test_a_gpu_agrees_with_the_cpu() -> None:
     np.testing.assert_allclose(far, near, rtol=1e-3, atol=1e-3 * abs(near).max())
     for a, b in zip(cpu, gpu, strict=True):
         np.testing.assert_allclose(np.frombuffer(b, np.float32), np.frombuffer(a, np.float32), atol=2e-2, rtol=1e-2)
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

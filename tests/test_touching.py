@@ -19,7 +19,6 @@ from vinesim.physics.touching import Touching, shapes_of
 from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
-from vinesim.world.ids import Organ
 
 KINDS = {
     "sphere": (2, (0.05, 0.0, 0.0)),
