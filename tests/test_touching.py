@@ -117,7 +117,7 @@ def test_distance_grows_along_its_normal_and_is_negative_inside(kind):
         assert ((found[:, 3] < 0.0) == inside).all()
 
 
-numbers = st.floats(-0.2, 0.2, allow_nan=False, width=32)
+numbers = st.integers(-200, 200).map(lambda k: k / 1000.0)
 points = st.tuples(numbers, numbers, numbers)
 
 
@@ -469,7 +469,7 @@ def test_a_swinging_cane_stops_at_a_pole():
     for standing in (True, False):
         physics = Physics(model if standing else assemble([cane((0.0, 0.0, 1.0))]))
         physics.plants.wake(0)
-        physics.state.joint_qd[0, 2] = 3.0
+        physics.state.joint_qd[:4, 2] = 3.0
         furthest[standing] = 0.0
         met = set()
         for _ in range(40):
