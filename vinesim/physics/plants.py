@@ -142,7 +142,7 @@ class Plants:
         self._stepping = np.zeros(trees, np.int32)
         self._subset = np.zeros(trees, np.int32)
         self._stepped = np.zeros(0, np.int32)
-        self._capacity = 0
+        self._capacity, self._joints = 0, 0
         # as the kernels see the trees: a cut body has no parent and no lever, a coarse tree no clusters
         self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
@@ -518,25 +518,13 @@ class Plants:
 
         Of the last tick, and only for bodies of trees that were awake in it. At rest it carries what hangs below.
         """
-        n, device = len(bodies), self.memory.device
-        out = wp.zeros(n, dtype=wp.spatial_vector, device=device)
-        asked = wp.array(self.memory.at[np.asarray(bodies)], dtype=wp.int32, device=device)
-        if n:
-            m = self.memory.arrays
-            wp.launch(
-                plant.joint_wrench,
-                n,
-                inputs=[
-                    self.dt, wp.vec3(GRAVITY), self.memory.pitch, m["tree_first"], m["tree_moving"], m["body_tree"],
-                    m["body_parent"], m["body_root"], m["body_mass"], m["body_com"], m["body_inertia"],
-                    m["body_product"], m["body_drag"], m["tie_span"], m["tie_point"], m["tie_stiffness"],
-                    m["tie_damping"], asked, m["phi_used"], m["tree_air"], m["tie_anchor"], m["body_q"], m["body_qd"],
-                    m["acceleration"], m["body_load"], m["wrench"],
-                ],
-                outputs=[out],
-                device=device,
-            )  # fmt: skip
-        return out.numpy()
+        n = len(bodies)
+        if n > self._joints:
+            self._record_joints(max(2 * self._joints, n, 16))
+        self._loaded[:n] = self.memory.at[bodies]
+        self._carry(n)
+        self.memory.wait()
+        return self._carried[:n].copy()
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
         """Least damping ratio that a spring mode of this frequency [Hz] can show: pi f (2 phi - 1) dt."""
@@ -768,6 +756,20 @@ class Plants:
         self._shares = {
             launch: [part(launch, i) for i in range(self.threads)] for launch in (self._free, self._integrate)
         }
+
+    def _record_joints(self, capacity: int) -> None:
+        """Room for what ``capacity`` joints carry."""
+        self._joints, memory = capacity, self.memory
+        self._loaded = memory.within_reach(np.zeros(capacity, np.int32))
+        self._carried = memory.within_reach(np.zeros((capacity, 6), np.float32))
+        memory.reach("loaded", self._loaded, wp.int32)
+        memory.reach("carried", self._carried, wp.spatial_vector)
+        self._carry = self._bind(
+            plant.joint_wrench, self.dt, wp.vec3(GRAVITY), memory.pitch, "tree_first", "tree_moving", "body_tree",
+            "body_parent", "body_root", "body_mass", "body_com", "body_inertia", "body_product", "body_drag",
+            "tie_span", "tie_point", "tie_stiffness", "tie_damping", "loaded", "phi_used", "tree_air", "tie_anchor",
+            "body_q", "body_qd", "acceleration", "body_load", "wrench", "carried",
+        )  # fmt: skip
 
     def _record_response(self, capacity: int) -> None:
         """Room for the responses of ``capacity`` bodies at once."""
