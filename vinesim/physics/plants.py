@@ -143,6 +143,8 @@ class Plants:
         self._subset = np.zeros(trees, np.int32)
         self._stepped = np.zeros(0, np.int32)
         self._capacity, self._joints = 0, 0
+        self._checked: np.ndarray | None = None
+        """Bodies that are known to be stepping."""
         # as the kernels see the trees: a cut body has no parent and no lever, a coarse tree no clusters
         self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
@@ -384,6 +386,7 @@ class Plants:
 
     def free(self) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the tick and solve the motion without contacts."""
+        self._checked = None
         self._choose()
         self._renew()
         self._carry_in(len(self._stepped))
@@ -395,20 +398,17 @@ class Plants:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
 
         ``response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of body
-        ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
+        ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees. A view, good until the
+        next call.
         """
         n = len(bodies)
-        if n == 0:
-            return np.zeros((0, 6, 0, 6), np.float32)
-        self._must_be_stepping(np.asarray(bodies))
-        if n > self._capacity:
+        self._must_be_stepping(bodies)
+        if n > self._capacity or self._capacity == 0:
             self._record_response(max(2 * self._capacity, n, 16))
         self._asked[:n] = self.memory.at[bodies]
-        self._asked[n] = -1
         self._respond(n)
         self.memory.wait()
-        y = self._response[:n, :, :n].reshape(6 * n, 6 * n)
-        return (0.5 * (y + y.T)).reshape(n, 6, n, 6)
+        return self._response[:n, :, :n]
 
     def commit(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
         """End the tick: wrenches (N, N m, world, at the bodies' origins) act over it, joints move.
@@ -419,10 +419,9 @@ class Plants:
         self._wrench[self._pushed] = 0.0
         self._pushed = np.zeros(0, np.int32)
         if bodies is not None and len(bodies):
-            bodies = np.asarray(bodies)
             self._must_be_stepping(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
-            self._pushed = bodies.astype(np.int32)
+            self._pushed = np.array(bodies, np.int32)
             touched = np.unique(self.model.body_tree[bodies])
             self._subset[: len(touched)] = touched
             self._carry_wrench(len(self._stepped))
@@ -556,6 +555,9 @@ class Plants:
         self._list = np.flatnonzero(self.state.tree_awake).astype(np.int32)
 
     def _must_be_stepping(self, bodies: np.ndarray) -> None:
+        if bodies is self._checked or len(bodies) == 0:
+            return
+        bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
         at = np.searchsorted(self._stepped, trees)
         if len(self._stepped) == 0 or (self._stepped[np.minimum(at, len(self._stepped) - 1)] != trees).any():
@@ -774,7 +776,7 @@ class Plants:
     def _record_response(self, capacity: int) -> None:
         """Room for the responses of ``capacity`` bodies at once."""
         self._capacity, memory = capacity, self.memory
-        self._asked = memory.within_reach(np.full(capacity + 1, -1, np.int32))
+        self._asked = memory.within_reach(np.zeros(capacity, np.int32))
         self._response = memory.within_reach(np.zeros((capacity, 6, capacity, 6), np.float32))
         stride = memory.span
         columns = [wp.empty(capacity * stride, dtype=wp.mat33, device=memory.device) for _ in range(4)]
