@@ -24,7 +24,8 @@ CYLINDER = wp.constant(5)
 BOX = wp.constant(6)
 
 # what is counted in one tick: awake trees, hits, hits without room, trees that are struck, plant bodies in contact,
-# whether constraints of MuJoCo's own bind what is touched, and islands of contacts that do not feel each other
+# whether constraints of MuJoCo's own bind what is touched, islands of contacts that do not feel each other, and the axis
+# along which trees are sorted
 TREES = wp.constant(0)
 HITS = wp.constant(1)
 MISSED = wp.constant(2)
@@ -32,6 +33,7 @@ STRUCK = wp.constant(3)
 BODIES = wp.constant(4)
 BOUND = wp.constant(5)
 ISLANDS = wp.constant(6)
+AXIS = wp.constant(7)
 
 SKIN = wp.constant(wp.float64(0.002))
 """Contacts are seen from this gap on [m], and from as far as the two can come together in one tick."""
@@ -403,6 +405,7 @@ def bound_trees(
     shape_radius: wp.array(dtype=float),
     shape_reach: wp.array(dtype=float),
     # in
+    every: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
@@ -419,7 +422,7 @@ def bound_trees(
     high_out: wp.array(dtype=wp.vec3),
 ):
     """Put the shapes of one tree into the world and find their boxes, that of the tree, and that of its wood."""
-    tree = trees[wp.tid()]
+    tree = trees[every[wp.tid()]]
     fine = tree_fine[tree]
     low = wp.vec3(1.0e30)
     high = wp.vec3(-1.0e30)
@@ -791,16 +794,17 @@ def meet_branches(
     hit_point_out: wp.array2d(dtype=wp.vec3d),
     onset_out: wp.array(dtype=wp.bool),
 ):
-    """Find where one tree touches itself (with a bunch) or awake trees behind it in the order of their boxes along x."""
+    """Find where one tree touches itself (with a bunch) or awake trees behind it in the order of their boxes."""
     place = every[wp.tid()]
     i = order[place]
     tree = trees[i]
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     found = found_out[i]
+    axis = tally[AXIS]
     for ahead_of in range(place, tally[TREES]):
         other = trees[order[ahead_of]]
-        if tree_low[other][0] > tree_high[tree][0]:
+        if tree_low[other][axis] > tree_high[tree][axis]:
             break
         if not apart(tree_low[tree], tree_high[tree], tree_low[other], tree_high[other]):
             low = wp.max(tree_low[tree], tree_low[other])

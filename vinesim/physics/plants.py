@@ -50,10 +50,10 @@ RIGID = 10.0
 that nothing is seen, but with phi below 1 it rings on and pumps the cane."""
 
 
-FEW = 100
+FEW = 16
 """[tree] For fewer awake trees a thread, handing ``free()`` to other threads costs more than it saves."""
 
-FEW_MOVES = 1000
+FEW_MOVES = 200
 """[tree] The same for the move at the end of ``commit()``, which is twelve times as short."""
 
 
@@ -158,9 +158,10 @@ class Plants:
             for name, value in vars(owner).items():
                 if isinstance(value, np.ndarray):
                     setattr(owner, name, memory.within_reach(value))
-        self._crew = Crew(threads) if threads > 1 else None
-        if self._crew is not None:
-            weakref.finalize(self, self._crew.close)
+        self.crew = Crew(threads) if threads > 1 else None
+        """Who shares the work, if there is more than one thread."""
+        if self.crew is not None:
+            weakref.finalize(self, self.crew.close)
         self._share_ends = [0] * (threads + 1)
         self._graph: wp.Graph | None = None
         self._graph_of = (-1, -1)
@@ -583,10 +584,10 @@ class Plants:
 
     def _all(self, launch: Callable[..., None], few: int) -> None:
         """Launch over the trees that this tick steps, on all threads if there are ``few`` for each."""
-        if self._crew is None or len(self._stepped) < few * self.threads:
+        if self.crew is None or len(self._stepped) < few * self.threads:
             launch(len(self._stepped))
         else:
-            self._crew.share(self._shares[launch])
+            self.crew.share(self._shares[launch])
 
     def _together(self, ticks: int, floating: int) -> None:
         """Predict and move, so many times, without coming back in between."""
@@ -601,11 +602,11 @@ class Plants:
             for _ in range(ticks):
                 wp.capture_launch(self._graph)
             self.memory.wait()
-        elif self._crew is None or count < self.threads or floating:
+        elif self.crew is None or count < self.threads or floating:
             self._tick(ticks, count, floating)
         else:
             share = [(ends[i + 1] - ends[i], ends[i], i) for i in range(self.threads)]
-            self._crew.share([functools.partial(_run, self._free, self._integrate, ticks, *part) for part in share])
+            self.crew.share([functools.partial(_run, self._free, self._integrate, ticks, *part) for part in share])
 
     def _tick(self, ticks: int, count: int, floating: int) -> None:
         for _ in range(ticks):

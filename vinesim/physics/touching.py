@@ -8,6 +8,8 @@ them in turn with penalty springs instead (a *staggered* scheme) blows up from 1
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -37,6 +39,8 @@ CLOSE = 256
 NOBODY = np.iinfo(np.int32).max
 """In place of a geom that is gone."""
 BLOCK = int(kernels.BLOCK)
+FEW = 16
+"""Awake trees for each thread: fewer are not worth handing over."""
 STIR = 1e-3
 """[m/s] A box or a loose bunch slower than this wakes nobody."""
 
@@ -198,8 +202,7 @@ class Touching:
         self.count, self.bodies, self.wrenches, self.force = 0, self.bodies[:0], self.wrenches[:0], None
         self._values: tuple[Contact, ...] | None = ()
         if len(awake) and len(self._geoms.id):
-            self._bound(awake)
-            self._meet(len(awake))
+            self._meet(awake)
             self._brace(awake)
         if self.count:
             self._press()
@@ -244,7 +247,22 @@ class Touching:
     def _bound(self, trees: np.ndarray) -> None:
         """Bring the boxes around some trees up to their bodies."""
         self._trees[: len(trees)] = trees
-        self._bound_trees(len(trees))
+        self._deal(len(trees), self._bound_trees)
+
+    def _deal(self, count: int, *launches: Callable[..., None]) -> None:
+        """Launch over so many trees of the list, one launch after the other for each; threads take turns in the list."""
+        crew = self.plants.crew
+        threads = 1 if crew is None or count < FEW * crew.size else crew.size
+        if self._dealt != (count, threads):
+            self._dealt = (count, threads)
+            self._every[:count] = np.concatenate([np.arange(i, count, threads) for i in range(threads)])
+        if threads == 1:
+            for launch in launches:
+                launch(count)
+            return
+        share = [len(range(i, count, threads)) for i in range(threads)]
+        first = [sum(share[:i]) for i in range(threads)]
+        crew.share([partial(_all, launches, share[i], first[i], i) for i in range(threads)])
 
     def _bound_tree_blocks(self, blocks: np.ndarray) -> None:
         """Bring the boxes around some blocks of trees up to their trees."""
@@ -264,15 +282,19 @@ class Touching:
             )
         self._standing_bound = True
 
-    def _meet(self, trees: int) -> None:
-        """List the contacts of the trees that were just bounded."""
+    def _meet(self, awake: np.ndarray) -> None:
+        """List the contacts of the awake trees."""
+        trees = len(awake)
         if trees > self._room:
             self._make_room(2 * trees)
+        self._trees[:trees] = awake
         self._tally[kernels.TREES] = trees
-        self._meeting(trees)
+        self._deal(trees, self._bound_trees, self._meeting)
         if self.branches:
-            self._order[:trees] = np.argsort(self._tree_low[self._trees[:trees], 0], kind="stable")
-            self._meeting_branches(trees)
+            low = self._tree_low[awake]
+            axis = self._tally[kernels.AXIS] = int(np.argmax(low.max(0) - low.min(0)))
+            self._order[:trees] = np.argsort(low[:, axis], kind="stable")
+            self._deal(trees, self._meeting_branches)
         self._gathering(1)
         count, missed = int(self._tally[kernels.HITS]), int(self._tally[kernels.MISSED])
         if count > self.capacity:
@@ -339,6 +361,7 @@ class Touching:
         n, trees, shapes = self.capacity, len(self.model.tree_first), len(self.shapes.body)
         self._trees = np.zeros(trees, np.int32)
         self._tree_low, self._tree_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
+        self._every, self._dealt = np.zeros(trees, np.int32), (0, 0)
         self._near = np.zeros(trees, np.bool_)
         for name in ("start", "end", "shape_low", "shape_high"):
             setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
@@ -353,7 +376,7 @@ class Touching:
         blocks = -(-trees // BLOCK)
         self._blocks = np.zeros(blocks, np.int32)
         self._block_low, self._block_high = np.zeros((blocks, 3), np.float32), np.zeros((blocks, 3), np.float32)
-        self._order, self._tally = np.zeros(trees, np.int32), np.zeros(7, np.int32)
+        self._order, self._tally = np.zeros(trees, np.int32), np.zeros(8, np.int32)
         for name in ("hits", "contact_shape", "contact_body", "place", "other", "other_body", "other_place", "island",
                      "known_shape", "known_other"):  # fmt: skip
             setattr(self, "_" + name, np.zeros(n, np.int32))
@@ -379,7 +402,6 @@ class Touching:
         self._room = trees
         self._close = np.zeros((trees, min(len(self._geoms.id), self._movable + CLOSE)), np.int32)
         self._found, self._slot = np.zeros(trees, np.int32), np.arange(SLOTS)
-        self._every = np.arange(trees, dtype=np.int32)
         self._hit_shape, self._hit_other = np.zeros((trees, SLOTS), np.int32), np.zeros((trees, SLOTS), np.int32)
         self._onset = np.zeros(trees, np.bool_)
         self._hit_gap, self._hit_room = np.zeros((trees, SLOTS)), np.zeros((trees, SLOTS))
@@ -475,6 +497,7 @@ class Touching:
         moving, speed = vectors("geom_middle", "geom_velocity", "geom_spin"), doubles("geom_speed")[0]
         dt, k, c = self.dt, self.stiffness, self.damping
         softness = 1.0 / (dt * (k * dt + c))
+        dealt = {"over": "every", "shares": self.plants.threads}
 
         self._bound_geoms = bind(
             kernels.bound_geoms,
@@ -486,8 +509,9 @@ class Touching:
         self._bound_trees = bind(
             kernels.bound_trees,
             [dt, s_tree, s_body, s_bunch, s_when, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius,
-             shared(self._reach_of_shape, float), *ints("trees"), body_q, body_qd, fine],
+             shared(self._reach_of_shape, float), *ints("every", "trees"), body_q, body_qd, fine],
             [*s_at, s_speed, *s_box, *w_box, *t_box],
+            **dealt,
         )  # fmt: skip
         told = shared(self.told, wp.bool)
         a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
@@ -509,12 +533,14 @@ class Touching:
              g_size, g_radius, g_copy, *ints("every"), told, fine, attached, *ints("trees"), *t_box, *now, xmat,
              *moving, speed, *g_box, *standing],
             [*ints("close", "found"), *hit, onset],
+            **dealt,
         )  # fmt: skip
         self._meeting_branches = bind(
             kernels.meet_branches,
             [dt, SLOTS, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, *ints("last_bunch", "every"),
              fine, attached, *ints("order", "tally", "trees"), *t_box, *w_box, *now],
             [*ints("found"), *hit, onset],
+            **dealt,
         )  # fmt: skip
         flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_other"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
@@ -558,6 +584,12 @@ class Touching:
             [dt, k, c, *blocks, *ints("contact_shape", "other"), axes, *doubles("A", "free", "impulse")],
             [*vectors("force"), *known],
         )  # fmt: skip
+
+
+def _all(launches: tuple[Callable[..., None], ...], count: int, first: int, share: int) -> None:
+    """One thread's share of several launches."""
+    for launch in launches:
+        launch(count, first, share)
 
 
 def _names(geoms) -> list[tuple[str, str, int]]:
