@@ -98,7 +98,9 @@ def client(
         float, typer.Option(min=0.1, max=5.0, help="Others nearer than this to a thing hear of it [m].")
     ] = 5.0,
     device: Annotated[str, typer.Option(help="Where plants are simulated: cpu, cuda or cuda:N.")] = "cpu",
-    threads: Annotated[int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 200 awake.")] = 1,
+    threads: Annotated[
+        int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 32 awake trees, on free cores.")
+    ] = 1,
     seconds: Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")] = None,
     out: Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")] = None,
     status: Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")] = "text",

@@ -1360,11 +1360,9 @@ def relax(
     impulse_out: wp.array(dtype=wp.float64),
     sweeps_out: wp.array(dtype=wp.int32),
 ):
-    """Solve one island of contacts: projected Gauss-Seidel on |rub| <= mu push, block by block, from the guess on.
-
-    Contacts that lean on each other (two fingers about a bunch) let it creep: it tells which contacts stick, slide or
-    open within a few sweeps, and takes a hundred for the rest. So small islands leap after every other sweep, at first.
-    """
+    """Solve one island of contacts: projected Gauss-Seidel on |rub| <= mu push, block by block, from the guess on."""
+    # Contacts that lean on each other (two fingers about a bunch) let it creep: it tells which contacts stick, slide or
+    # open within a few sweeps, and takes a hundred for the rest. So small islands leap after every other sweep, at first.
     island = wp.tid()
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
@@ -1417,8 +1415,8 @@ def relax(
                 if sweeps == 2:
                     for m in range(first, last):
                         for k in range(3):
-                            before_leaps = impulse_out[3 * island_member[m] + k]
-                            rows_out[3 * island_member[m] + k, rows_out.shape[1] - 1] = before_leaps
+                            row = 3 * island_member[m] + k
+                            rows_out[row, rows_out.shape[1] - 1] = impulse_out[row]
                 leap(softness, first, last, island_member, friction, A, free, offset, rows_out, impulse_out)
             else:  # guesses go round in circles: sweeps alone, from where they were
                 for m in range(first, last):

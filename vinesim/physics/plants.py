@@ -53,7 +53,7 @@ that nothing is seen, but with phi below 1 it rings on and pumps the cane."""
 FEW = 16
 """[tree] For fewer awake trees a thread, handing ``free()`` to other threads costs more than it saves."""
 
-FEW_MOVES = 200
+FEW_MOVES = 100
 """[tree] The same for the move at the end of ``commit()``, which is twelve times as short."""
 
 

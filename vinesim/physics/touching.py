@@ -250,7 +250,7 @@ class Touching:
         self._deal(len(trees), self._bound_trees)
 
     def _deal(self, count: int, *launches: Callable[..., None]) -> None:
-        """Launch over so many trees of the list, one launch after the other for each; threads take turns in the list."""
+        """Launch over so many trees of the list, for each one launch after the other; threads take turns in it."""
         crew = self.plants.crew
         threads = 1 if crew is None or count < FEW * crew.size else crew.size
         if self._dealt != (count, threads):
