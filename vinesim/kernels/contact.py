@@ -24,13 +24,16 @@ CYLINDER = wp.constant(5)
 BOX = wp.constant(6)
 
 # what is counted in one tick: awake trees, hits, hits without room, trees that are struck, plant bodies in contact,
-# and whether constraints of MuJoCo's own bind what is touched
+# whether constraints of MuJoCo's own bind what is touched, islands of contacts that do not feel each other, and the axis
+# along which trees are sorted
 TREES = wp.constant(0)
 HITS = wp.constant(1)
 MISSED = wp.constant(2)
 STRUCK = wp.constant(3)
 BODIES = wp.constant(4)
 BOUND = wp.constant(5)
+ISLANDS = wp.constant(6)
+AXIS = wp.constant(7)
 
 SKIN = wp.constant(wp.float64(0.002))
 """Contacts are seen from this gap on [m], and from as far as the two can come together in one tick."""
@@ -280,10 +283,16 @@ def bound_geoms(
     geom_root: wp.array(dtype=wp.int32),
     geom_center: wp.array(dtype=wp.vec3d),
     geom_half: wp.array(dtype=wp.vec3d),
+    geom_dof: wp.array(dtype=wp.int32),
+    dof_parent: wp.array(dtype=wp.int32),
     # in
     xpos: wp.array(dtype=wp.vec3d),
     xmat: wp.array(dtype=wp.mat33d),
     cvel: wp.array2d(dtype=wp.float64),
+    cdof: wp.array2d(dtype=wp.float64),
+    dof_free: wp.array(dtype=wp.float64),
+    dof_held: wp.array(dtype=wp.float64),
+    dof_held_before: wp.array(dtype=wp.float64),
     subtree_com: wp.array(dtype=wp.vec3d),
     # out
     middle_out: wp.array(dtype=wp.vec3d),
@@ -300,14 +309,36 @@ def bound_geoms(
     body = geom_body[g]
     spin = wp.vec3d(cvel[body, 0], cvel[body, 1], cvel[body, 2])
     velocity = wp.vec3d(cvel[body, 3], cvel[body, 4], cvel[body, 5])
-    velocity = velocity + wp.cross(spin, middle - subtree_com[geom_root[g]])
+    arm = middle - subtree_com[geom_root[g]]
+    velocity = velocity + wp.cross(spin, arm)
     half = geom_half[g]
-    speed = wp.length(velocity) + wp.length(spin) * wp.length(half)
-    grown = SKIN + speed * dt
+    extent = wp.length(half)
+    speed = wp.length(velocity) + wp.length(spin) * extent
+    # a drive may start within the tick: as fast as it will be if it is held back as in the last two, or by nothing
+    linear_likely = wp.vec3d()
+    spin_likely = wp.vec3d()
+    linear_free = wp.vec3d()
+    spin_free = wp.vec3d()
+    dof = geom_dof[g]
+    while dof >= 0:
+        angular = wp.vec3d(cdof[dof, 0], cdof[dof, 1], cdof[dof, 2])
+        linear = wp.vec3d(cdof[dof, 3], cdof[dof, 4], cdof[dof, 5]) + wp.cross(angular, arm)
+        rate = dof_free[dof]
+        linear_free += rate * linear
+        spin_free += rate * angular
+        one = dof_held[dof]
+        other = dof_held_before[dof]
+        if one * other > wp.float64(0.0):
+            rate += wp.where(wp.abs(one) < wp.abs(other), one, other)
+        linear_likely += rate * linear
+        spin_likely += rate * angular
+        dof = dof_parent[dof]
+    speed = wp.max(speed, wp.length(linear_likely) + wp.length(spin_likely) * extent)
+    grown = SKIN + dt * wp.max(speed, wp.length(linear_free) + wp.length(spin_free) * extent)
     box = wp.vec3()
     for i in range(3):
-        extent = wp.abs(rotation[i, 0]) * half[0] + wp.abs(rotation[i, 1]) * half[1] + wp.abs(rotation[i, 2]) * half[2]
-        box[i] = wp.float32(extent + grown)
+        reach = wp.abs(rotation[i, 0]) * half[0] + wp.abs(rotation[i, 1]) * half[1] + wp.abs(rotation[i, 2]) * half[2]
+        box[i] = wp.float32(reach + grown)
     center = wp.vec3(wp.float32(middle[0]), wp.float32(middle[1]), wp.float32(middle[2]))
     middle_out[g] = middle
     velocity_out[g] = velocity
@@ -333,83 +364,93 @@ def ahead(dt: float, pose: wp.transform, motion: wp.spatial_vector, bend: wp.spa
     return point + dt * (velocity + 0.5 * dt * (wp.spatial_top(bend) + wp.cross(wp.spatial_bottom(bend), arm) + turn))
 
 
+@wp.func
+def bent(
+    body: int,
+    body_parent: wp.array(dtype=wp.int32),
+    body_cut: wp.array(dtype=wp.bool),
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
+):
+    """The acceleration of a body while all joints between it and its root turn steadily."""
+    here = wp.transform_get_translation(body_q[body])
+    a = wp.vec3()
+    alpha = wp.vec3()
+    k = int(body)
+    while k >= 0:
+        above = body_parent[k]
+        if body_cut[k]:
+            above = -1
+        if above >= 0:
+            at = wp.transform_get_translation(body_q[k])
+            turning = wp.spatial_bottom(body_qd[above])
+            swing = wp.cross(turning, wp.spatial_bottom(body_qd[k]))
+            alpha += swing
+            a += wp.cross(swing, here - at)
+            a += wp.cross(turning, wp.cross(turning, at - wp.transform_get_translation(body_q[above])))
+        k = above
+    return wp.spatial_vector(a, alpha)
+
+
 @wp.kernel
 def bound_trees(
     # model
     dt: float,
-    tree_first: wp.array(dtype=wp.int32),
-    tree_size: wp.array(dtype=wp.int32),
-    tree_core: wp.array(dtype=wp.int32),
-    body_parent: wp.array(dtype=wp.int32),
     tree_shape: wp.array(dtype=wp.int32),
     shape_body: wp.array(dtype=wp.int32),
+    shape_bunch: wp.array(dtype=wp.int32),
     shape_when: wp.array(dtype=wp.int32),
     shape_start: wp.array(dtype=wp.vec3),
     shape_end: wp.array(dtype=wp.vec3),
     shape_radius: wp.array(dtype=float),
+    shape_reach: wp.array(dtype=float),
     # in
+    every: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
-    body_cut: wp.array(dtype=wp.bool),
     tree_fine: wp.array(dtype=wp.bool),
     # out
-    bend_out: wp.array(dtype=wp.spatial_vector),
     start_out: wp.array(dtype=wp.vec3),
     end_out: wp.array(dtype=wp.vec3),
-    start_ahead_out: wp.array(dtype=wp.vec3),
-    end_ahead_out: wp.array(dtype=wp.vec3),
     speed_out: wp.array(dtype=float),
     shape_low_out: wp.array(dtype=wp.vec3),
     shape_high_out: wp.array(dtype=wp.vec3),
+    wood_low_out: wp.array(dtype=wp.vec3),
+    wood_high_out: wp.array(dtype=wp.vec3),
     low_out: wp.array(dtype=wp.vec3),
     high_out: wp.array(dtype=wp.vec3),
 ):
-    """Put the shapes of one tree into the world, now and after a tick of steady joint rates, and find their box."""
-    tree = trees[wp.tid()]
-    # bend: the acceleration of a body while all joints turn steadily
-    first = tree_first[tree]
+    """Put the shapes of one tree into the world and find their boxes, that of the tree, and that of its wood."""
+    tree = trees[every[wp.tid()]]
     fine = tree_fine[tree]
-    size = tree_size[tree]
-    if not fine:
-        size = tree_core[tree]
-    for k in range(first, first + size):
-        above = body_parent[k]
-        bend = wp.spatial_vector()
-        if above >= 0 and not body_cut[k]:
-            motion = body_qd[above]
-            turning = wp.spatial_bottom(motion)
-            arm = wp.transform_get_translation(body_q[k]) - wp.transform_get_translation(body_q[above])
-            carried = bend_out[above]
-            alpha = wp.spatial_bottom(carried)
-            bend = wp.spatial_vector(
-                wp.spatial_top(carried) + wp.cross(alpha, arm) + wp.cross(turning, wp.cross(turning, arm)),
-                alpha + wp.cross(turning, wp.spatial_bottom(body_qd[k])),
-            )
-        bend_out[k] = bend
     low = wp.vec3(1.0e30)
     high = wp.vec3(-1.0e30)
+    wood_low = wp.vec3(1.0e30)
+    wood_high = wp.vec3(-1.0e30)
     for s in range(tree_shape[tree], tree_shape[tree + 1]):
-        body = shape_body[s]
-        pose = body_q[body]
-        motion = body_qd[body]
-        start = wp.transform_point(pose, shape_start[s])
-        end = wp.transform_point(pose, shape_end[s])
-        reach = wp.max(wp.length(shape_start[s]), wp.length(shape_end[s])) + shape_radius[s]
-        speed = wp.length(wp.spatial_top(motion)) + reach * wp.length(wp.spatial_bottom(motion))
-        grown = wp.vec3(shape_radius[s] + speed * dt)
-        shape_low = wp.min(start, end) - grown
-        shape_high = wp.max(start, end) + grown
-        shape_low_out[s] = shape_low
-        shape_high_out[s] = shape_high
         if here(shape_when[s], fine):
+            body = shape_body[s]
+            pose = body_q[body]
+            motion = body_qd[body]
+            start = wp.transform_point(pose, shape_start[s])
+            end = wp.transform_point(pose, shape_end[s])
+            speed = wp.length(wp.spatial_top(motion)) + shape_reach[s] * wp.length(wp.spatial_bottom(motion))
+            grown = wp.vec3(shape_radius[s] + speed * dt)
+            shape_low = wp.min(start, end) - grown
+            shape_high = wp.max(start, end) + grown
             low = wp.min(low, shape_low)
             high = wp.max(high, shape_high)
-        start_out[s] = start
-        end_out[s] = end
-        start_ahead_out[s] = ahead(dt, pose, motion, bend_out[body], start)
-        end_ahead_out[s] = ahead(dt, pose, motion, bend_out[body], end)
-        speed_out[s] = speed
+            if shape_bunch[s] < 0:
+                wood_low = wp.min(wood_low, shape_low)
+                wood_high = wp.max(wood_high, shape_high)
+            start_out[s] = start
+            end_out[s] = end
+            speed_out[s] = speed
+            shape_low_out[s] = shape_low
+            shape_high_out[s] = shape_high
+    wood_low_out[tree] = wood_low
+    wood_high_out[tree] = wood_high
     low_out[tree] = low
     high_out[tree] = high
 
@@ -532,6 +573,7 @@ def meet(
     dt: wp.float64,
     slots: int,
     movable: int,
+    body_parent: wp.array(dtype=wp.int32),
     tree_shape: wp.array(dtype=wp.int32),
     shape_body: wp.array(dtype=wp.int32),
     shape_bunch: wp.array(dtype=wp.int32),
@@ -545,6 +587,7 @@ def meet(
     geom_radius: wp.array(dtype=wp.float64),
     geom_copy: wp.array(dtype=wp.bool),
     # in
+    every: wp.array(dtype=wp.int32),
     tree_told: wp.array(dtype=wp.bool),
     tree_fine: wp.array(dtype=wp.bool),
     bunch_attached: wp.array(dtype=wp.bool),
@@ -556,8 +599,7 @@ def meet(
     body_qd_free: wp.array(dtype=wp.spatial_vector),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
-    start_ahead: wp.array(dtype=wp.vec3),
-    end_ahead: wp.array(dtype=wp.vec3),
+    body_cut: wp.array(dtype=wp.bool),
     shape_speed: wp.array(dtype=float),
     shape_low: wp.array(dtype=wp.vec3),
     shape_high: wp.array(dtype=wp.vec3),
@@ -582,7 +624,7 @@ def meet(
     onset_out: wp.array(dtype=wp.bool),
 ):
     """Find where one tree touches rigid shapes or may touch them before the tick ends, by (shape, geom)."""
-    i = wp.tid()
+    i = every[wp.tid()]
     tree = trees[i]
     fine = tree_fine[tree]
     low = tree_low[tree]
@@ -658,8 +700,9 @@ def meet(
                             freely = velocity_at(body_q[body], body_qd_free[body], point)
                             wanted = gap + wp.min(wp.min(come, dt * wp.dot(normal, freely)), zero) < HAIR
                         if wanted:
-                            from_a = to_double(start_ahead[s])
-                            from_b = to_double(end_ahead[s])
+                            bend = bent(body, body_parent, body_cut, body_q, body_qd)
+                            from_a = to_double(ahead(wp.float32(dt), body_q[body], body_qd[body], bend, start[s]))
+                            from_b = to_double(ahead(wp.float32(dt), body_q[body], body_qd[body], bend, end[s]))
                             if sides == 2:
                                 from_a = from_a + t * (from_b - from_a)
                                 from_b = from_a
@@ -720,7 +763,9 @@ def meet_branches(
     shape_radius: wp.array(dtype=float),
     start_drawn: wp.array(dtype=wp.vec3),
     end_drawn: wp.array(dtype=wp.vec3),
+    tree_last: wp.array(dtype=wp.int32),
     # in
+    every: wp.array(dtype=wp.int32),
     tree_fine: wp.array(dtype=wp.bool),
     bunch_attached: wp.array(dtype=wp.bool),
     order: wp.array(dtype=wp.int32),
@@ -728,13 +773,14 @@ def meet_branches(
     trees: wp.array(dtype=wp.int32),
     tree_low: wp.array(dtype=wp.vec3),
     tree_high: wp.array(dtype=wp.vec3),
+    wood_low: wp.array(dtype=wp.vec3),
+    wood_high: wp.array(dtype=wp.vec3),
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
     body_qd_free: wp.array(dtype=wp.spatial_vector),
     start: wp.array(dtype=wp.vec3),
     end: wp.array(dtype=wp.vec3),
-    start_ahead: wp.array(dtype=wp.vec3),
-    end_ahead: wp.array(dtype=wp.vec3),
+    body_cut: wp.array(dtype=wp.bool),
     shape_speed: wp.array(dtype=float),
     shape_low: wp.array(dtype=wp.vec3),
     shape_high: wp.array(dtype=wp.vec3),
@@ -748,16 +794,17 @@ def meet_branches(
     hit_point_out: wp.array2d(dtype=wp.vec3d),
     onset_out: wp.array(dtype=wp.bool),
 ):
-    """Find where one tree touches itself (with a bunch) or awake trees behind it in the order of their boxes along x."""
-    place = wp.tid()
+    """Find where one tree touches itself (with a bunch) or awake trees behind it in the order of their boxes."""
+    place = every[wp.tid()]
     i = order[place]
     tree = trees[i]
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     found = found_out[i]
+    axis = tally[AXIS]
     for ahead_of in range(place, tally[TREES]):
         other = trees[order[ahead_of]]
-        if tree_low[other][0] > tree_high[tree][0]:
+        if tree_low[other][axis] > tree_high[tree][axis]:
             break
         if not apart(tree_low[tree], tree_high[tree], tree_low[other], tree_high[other]):
             low = wp.max(tree_low[tree], tree_low[other])
@@ -766,8 +813,9 @@ def meet_branches(
                 s_low = shape_low[s] - wp.vec3(0.002)
                 s_high = shape_high[s] + wp.vec3(0.002)
                 within = not apart(s_low, s_high, low, high)
-                if other == tree:
-                    within = shape_bunch[s] >= 0
+                if other == tree:  # bunches against wood, and against later bunches
+                    clear = apart(s_low, s_high, wood_low[tree], wood_high[tree])
+                    within = shape_bunch[s] >= 0 and (not clear or shape_bunch[s] < tree_last[tree])
                 if within and there(shape_when[s], tree_fine[tree], shape_bunch[s], bunch_attached):
                     for t in range(tree_shape[other], tree_shape[other + 1]):
                         pair = not apart(s_low, s_high, shape_low[t], shape_high[t])
@@ -799,10 +847,17 @@ def meet_branches(
                                 freely = velocity_at(body_q[shape_body[s]], body_qd_free[shape_body[s]], point)
                                 freely = freely - velocity_at(body_q[shape_body[t]], body_qd_free[shape_body[t]], point)
                                 if gap + wp.min(wp.min(come, dt * wp.dot(normal, freely)), zero) < HAIR:
+                                    mine = shape_body[s]
+                                    its = shape_body[t]
+                                    h = wp.float32(dt)
+                                    bend = bent(mine, body_parent, body_cut, body_q, body_qd)
+                                    its_bend = bent(its, body_parent, body_cut, body_q, body_qd)
                                     later = crossing(
-                                        to_double(start_ahead[s]), to_double(end_ahead[s]), to_double(start_ahead[t]),
-                                        to_double(end_ahead[t]),
-                                    )  # fmt: skip
+                                        to_double(ahead(h, body_q[mine], body_qd[mine], bend, start[s])),
+                                        to_double(ahead(h, body_q[mine], body_qd[mine], bend, end[s])),
+                                        to_double(ahead(h, body_q[its], body_qd[its], its_bend, start[t])),
+                                        to_double(ahead(h, body_q[its], body_qd[its], its_bend, end[t])),
+                                    )
                                     normal_later = wp.vec3d(later[0], later[1], later[2])
                                     bent = zero
                                     if wp.dot(normal, normal_later) > AGREE:
@@ -852,14 +907,38 @@ def gather(
     tally_out[STRUCK] = struck
 
 
+@wp.func
+def root_of(label: wp.array(dtype=wp.int32), c: int):
+    """The first contact of the island that this one is in so far."""
+    at = int(c)
+    while label[at] != at:
+        at = label[at]
+    return at
+
+
+@wp.func
+def moved_along(
+    other: int, geom_dof: wp.array(dtype=wp.int32), dof_tree: wp.array(dtype=wp.int32), group: wp.array(dtype=wp.int32)
+):
+    """The group of rigid bodies that feel what presses on one of them; -1 for a branch, or what stands."""
+    found = int(-1)  # noqa: RUF046
+    if other >= 0 and geom_dof[wp.max(other, 0)] >= 0:
+        found = group[dof_tree[geom_dof[other]]]
+    return found
+
+
 @wp.kernel
 def index(
     # model
     shape_body: wp.array(dtype=wp.int32),
+    body_tree: wp.array(dtype=wp.int32),
+    geom_dof: wp.array(dtype=wp.int32),
+    dof_tree: wp.array(dtype=wp.int32),
     # in
     hits: wp.array(dtype=wp.int32),
     hit_shape: wp.array(dtype=wp.int32),
     hit_other: wp.array(dtype=wp.int32),
+    group: wp.array(dtype=wp.int32),
     # out
     tally_out: wp.array(dtype=wp.int32),
     bodies_out: wp.array(dtype=wp.int32),
@@ -868,8 +947,11 @@ def index(
     place_out: wp.array(dtype=wp.int32),
     other_body_out: wp.array(dtype=wp.int32),
     other_place_out: wp.array(dtype=wp.int32),
+    island_out: wp.array(dtype=wp.int32),
+    island_first_out: wp.array(dtype=wp.int32),
+    island_member_out: wp.array(dtype=wp.int32),
 ):
-    """Number the plant bodies that take part in contacts, sorted, each once (one thread does all)."""
+    """Number the plant bodies in contact, sorted, each once, and part contacts into islands (one thread does all)."""
     contacts = tally_out[HITS]
     count = int(0)  # noqa: RUF046
     for c in range(contacts):
@@ -901,6 +983,42 @@ def index(
             if bodies_out[k] == other_body_out[c]:
                 other_place_out[c] = k
     tally_out[BODIES] = count
+
+    # contacts that share a plant, or things that move each other
+    for c in range(contacts):
+        island_out[c] = c
+        tree = body_tree[body_out[c]]
+        over = int(-1)  # noqa: RUF046
+        if other_body_out[c] >= 0:
+            over = body_tree[other_body_out[c]]
+        with_c = moved_along(hit_other[hits[c]], geom_dof, dof_tree, group)
+        for d in range(c):
+            tree_d = body_tree[body_out[d]]
+            linked = tree_d == tree or tree_d == over
+            if other_body_out[d] >= 0:
+                over_d = body_tree[other_body_out[d]]
+                linked = linked or over_d == tree or over_d == over
+            if not linked and with_c >= 0:
+                linked = with_c == moved_along(hit_other[hits[d]], geom_dof, dof_tree, group)
+            if linked:
+                one = root_of(island_out, c)
+                two = root_of(island_out, d)
+                island_out[wp.max(one, two)] = wp.min(one, two)
+    islands = int(0)  # noqa: RUF046
+    members = int(0)  # noqa: RUF046
+    for c in range(contacts):
+        if island_out[c] == c:
+            island_first_out[islands] = members
+            for d in range(c, contacts):
+                if root_of(island_out, d) == c:
+                    island_member_out[members] = d
+                    members = members + 1
+            islands = islands + 1
+    island_first_out[islands] = members
+    for i in range(islands):
+        for m in range(island_first_out[i], island_first_out[i + 1]):
+            island_out[island_member_out[m]] = i
+    tally_out[ISLANDS] = islands
 
 
 @wp.kernel
@@ -1033,7 +1151,9 @@ def answer(
     row_entry: wp.array(dtype=wp.int32),
     row_entries: wp.array(dtype=wp.int32),
     entry_dof: wp.array(dtype=wp.int32),
+    body_tree: wp.array(dtype=wp.int32),
     # in
+    bodies: wp.array(dtype=wp.int32),
     tally: wp.array(dtype=wp.int32),
     other: wp.array(dtype=wp.int32),
     place: wp.array(dtype=wp.int32),
@@ -1056,14 +1176,21 @@ def answer(
     at = 6 * place[c]
     over = 6 * other_place[c]
     branch = other[c] < 0
-    for k in range(6 * tally[BODIES]):
-        moved = zero
-        for j in range(6):
-            moved = moved + plant_rows[row, j] * wp.float64(response[k, at + j])
-        if branch:
-            for j in range(6):
-                moved = moved + plant_rows[row, 6 + j] * wp.float64(response[k, over + j])
-        plant_answer_out[row, k] = moved
+    tree = body_tree[bodies[place[c]]]
+    over_tree = int(-1)  # noqa: RUF046
+    if branch:
+        over_tree = body_tree[bodies[other_place[c]]]
+    for b in range(tally[BODIES]):
+        its_tree = body_tree[bodies[b]]
+        for k in range(6 * b, 6 * b + 6):
+            moved = zero
+            if its_tree == tree:
+                for j in range(6):
+                    moved = moved + plant_rows[row, j] * wp.float64(response[k, at + j])
+            if its_tree == over_tree:
+                for j in range(6):
+                    moved = moved + plant_rows[row, 6 + j] * wp.float64(response[k, over + j])
+            plant_answer_out[row, k] = moved
     last = int(-1)  # noqa: RUF046
     if not branch:
         last = geom_dof[other[c]]
@@ -1102,7 +1229,9 @@ def assemble(
     geom_dof: wp.array(dtype=wp.int32),
     dof_parent: wp.array(dtype=wp.int32),
     # in
-    tally: wp.array(dtype=wp.int32),
+    island: wp.array(dtype=wp.int32),
+    island_first: wp.array(dtype=wp.int32),
+    island_member: wp.array(dtype=wp.int32),
     other: wp.array(dtype=wp.int32),
     place: wp.array(dtype=wp.int32),
     other_place: wp.array(dtype=wp.int32),
@@ -1113,7 +1242,7 @@ def assemble(
     # out
     A_out: wp.array2d(dtype=wp.float64),
 ):
-    """Write one row of A: how fast the impulses of all contacts part the two bodies of this one along this axis."""
+    """Write one row of A: how fast the impulses of its island part the two bodies of a contact along one axis."""
     row = wp.tid()
     c = row // 3
     at = 6 * place[c]
@@ -1121,18 +1250,94 @@ def assemble(
     last = int(-1)  # noqa: RUF046
     if other[c] >= 0:
         last = geom_dof[other[c]]
-    for column in range(3 * tally[HITS]):
-        moved = wp.float64(0.0)
-        for k in range(6):
-            moved = moved + plant_rows[row, k] * plant_answer[column, at + k]
-        if other[c] < 0:
+    for m in range(island_first[island[c]], island_first[island[c] + 1]):
+        for column in range(3 * island_member[m], 3 * island_member[m] + 3):
+            moved = wp.float64(0.0)
             for k in range(6):
-                moved = moved + plant_rows[row, 6 + k] * plant_answer[column, over + k]
-        dof = last
-        while dof >= 0:
-            moved = moved + rigid_rows[row, dof] * rigid_answer[column, dof]
-            dof = dof_parent[dof]
-        A_out[row, column] = moved
+                moved = moved + plant_rows[row, k] * plant_answer[column, at + k]
+            if other[c] < 0:
+                for k in range(6):
+                    moved = moved + plant_rows[row, 6 + k] * plant_answer[column, over + k]
+            dof = last
+            while dof >= 0:
+                moved = moved + rigid_rows[row, dof] * rigid_answer[column, dof]
+                dof = dof_parent[dof]
+            A_out[row, column] = moved
+
+
+@wp.func
+def leap(
+    softness: wp.float64,
+    first: int,
+    last: int,
+    island_member: wp.array(dtype=wp.int32),
+    friction: wp.array(dtype=wp.float64),
+    A: wp.array2d(dtype=wp.float64),
+    free: wp.array(dtype=wp.float64),
+    offset: wp.array(dtype=wp.float64),
+    rows_out: wp.array2d(dtype=wp.float64),
+    impulse_out: wp.array(dtype=wp.float64),
+):
+    """Solve one island as if each contact stayed what it is: open, sticking, or sliding the way it slides.
+
+    That is a linear system, eliminated here without pivoting: A is positive definite, and sliding bends it little. Where
+    the guess about a contact was wrong, its impulse is put back into its cone, and the next sweep makes a better guess.
+    """
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    size = 3 * (last - first)
+    for p in range(last - first):
+        j = island_member[first + p]
+        n = 3 * j
+        push = impulse_out[n]
+        rub = wp.sqrt(impulse_out[n + 1] * impulse_out[n + 1] + impulse_out[n + 2] * impulse_out[n + 2])
+        limit = friction[j] * push
+        slides = rub >= limit * wp.float64(0.999999)
+        for axis in range(3):
+            row = n + axis
+            fixed = push <= zero or (axis > 0 and slides)
+            for q in range(last - first):
+                i = 3 * island_member[first + q]
+                for k in range(3):
+                    entry = A[row, i + k]
+                    if fixed:
+                        entry = zero
+                    rows_out[row, 3 * q + k] = entry
+            rows_out[row, size] = -free[row] - offset[row]
+            if fixed:
+                rows_out[row, 3 * p + axis] = one
+                rows_out[row, size] = zero
+                if push > zero:
+                    rows_out[row, 3 * p] = -impulse_out[row] / push
+            else:
+                rows_out[row, 3 * p + axis] = rows_out[row, 3 * p + axis] + softness
+    for k in range(size):
+        pivot_row = 3 * island_member[first + k // 3] + k % 3
+        scale = one / rows_out[pivot_row, k]
+        for m in range(k + 1, size):
+            row = 3 * island_member[first + m // 3] + m % 3
+            factor = rows_out[row, k] * scale
+            if factor != zero:
+                for c in range(k + 1, size + 1):
+                    rows_out[row, c] = rows_out[row, c] - factor * rows_out[pivot_row, c]
+    for back in range(size):
+        k = size - 1 - back
+        row = 3 * island_member[first + k // 3] + k % 3
+        value = rows_out[row, size]
+        for c in range(k + 1, size):
+            value = value - rows_out[row, c] * impulse_out[3 * island_member[first + c // 3] + c % 3]
+        impulse_out[row] = value / rows_out[row, k]
+    for m in range(first, last):
+        j = island_member[m]
+        n = 3 * j
+        push = wp.max(impulse_out[n], zero)
+        rub = wp.sqrt(impulse_out[n + 1] * impulse_out[n + 1] + impulse_out[n + 2] * impulse_out[n + 2])
+        share = one
+        if rub > friction[j] * push:
+            share = friction[j] * push / rub
+        impulse_out[n] = push
+        impulse_out[n + 1] = share * impulse_out[n + 1]
+        impulse_out[n + 2] = share * impulse_out[n + 2]
 
 
 @wp.kernel
@@ -1140,6 +1345,8 @@ def relax(
     # model
     softness: wp.float64,
     iterations: int,
+    leaps: int,
+    largest_leap: int,
     tolerance: wp.float64,
     # in
     island_first: wp.array(dtype=wp.int32),
@@ -1149,10 +1356,15 @@ def relax(
     free: wp.array(dtype=wp.float64),
     offset: wp.array(dtype=wp.float64),
     # out
+    rows_out: wp.array2d(dtype=wp.float64),
     impulse_out: wp.array(dtype=wp.float64),
     sweeps_out: wp.array(dtype=wp.int32),
 ):
-    """Solve one island of contacts: projected Gauss-Seidel on |rub| <= mu push, block by block, from the guess on."""
+    """Solve one island of contacts: projected Gauss-Seidel on |rub| <= mu push, block by block, from the guess on.
+
+    Contacts that lean on each other (two fingers about a bunch) let it creep: it tells which contacts stick, slide or
+    open within a few sweeps, and takes a hundred for the rest. So small islands leap after every other sweep, at first.
+    """
     island = wp.tid()
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
@@ -1200,6 +1412,19 @@ def relax(
             impulse_out[v] = fv
         sweeps = sweeps + 1
         busy = change > tolerance * largest
+        if busy and last - first <= largest_leap and sweeps % 2 == 0 and sweeps <= 2 * leaps + 2:
+            if sweeps <= 2 * leaps:
+                if sweeps == 2:
+                    for m in range(first, last):
+                        for k in range(3):
+                            before_leaps = impulse_out[3 * island_member[m] + k]
+                            rows_out[3 * island_member[m] + k, rows_out.shape[1] - 1] = before_leaps
+                leap(softness, first, last, island_member, friction, A, free, offset, rows_out, impulse_out)
+            else:  # guesses go round in circles: sweeps alone, from where they were
+                for m in range(first, last):
+                    for k in range(3):
+                        row = 3 * island_member[m] + k
+                        impulse_out[row] = rows_out[row, rows_out.shape[1] - 1]
     sweeps_out[island] = sweeps
 
 
@@ -1210,7 +1435,9 @@ def remember(
     stiffness: wp.float64,
     damping: wp.float64,
     # in
-    count: wp.array(dtype=wp.int32),
+    island: wp.array(dtype=wp.int32),
+    island_first: wp.array(dtype=wp.int32),
+    island_member: wp.array(dtype=wp.int32),
     shape: wp.array(dtype=wp.int32),
     other: wp.array(dtype=wp.int32),
     axes: wp.array(dtype=wp.mat33d),
@@ -1235,9 +1462,10 @@ def remember(
     force_out[c] = wp.transpose(frame) * pressed / dt
     slip_u = free[n + 1]
     slip_v = free[n + 2]
-    for k in range(3 * count[0]):
-        slip_u = slip_u + A[n + 1, k] * impulse[k]
-        slip_v = slip_v + A[n + 2, k] * impulse[k]
+    for m in range(island_first[island[c]], island_first[island[c] + 1]):
+        for k in range(3 * island_member[m], 3 * island_member[m] + 3):
+            slip_u = slip_u + A[n + 1, k] * impulse[k]
+            slip_v = slip_v + A[n + 2, k] * impulse[k]
     # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
     stretch = -(impulse[n + 1] / dt + damping * slip_u) / stiffness * t1
     stretch = stretch - (impulse[n + 2] / dt + damping * slip_v) / stiffness * t2

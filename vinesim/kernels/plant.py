@@ -554,18 +554,16 @@ def response(
     alpha_by_moment_out: wp.array(dtype=wp.mat33),
     response_out: wp.array4d(dtype=float),
 ):
-    """Push one body by six unit impulses and write the velocity of every listed body (the list ends with -1)."""
+    """Push one body by six unit impulses; write the velocity of every body up to it in the list, and the transpose."""
     slot = wp.tid()
     body = bodies[slot]
     tree = body_tree[body]
     first = tree_first[tree]
     shift = slot * stride - first  # scratch of this thread: one entry for each body of the tree
     last = body
-    n = wp.int32(0)
-    while bodies[n] >= 0:
-        if body_tree[bodies[n]] == tree:
-            last = wp.max(last, bodies[n])
-        n = n + 1
+    for other in range(slot):
+        if body_tree[bodies[other]] == tree:
+            last = wp.max(last, bodies[other])
 
     # inward along the path to the root; columns are the three unit forces and the three unit moments
     zero = wp.mat33()
@@ -612,7 +610,7 @@ def response(
         alpha_by_force_out[shift + k] = alpha_f + alpha_by_force_out[shift + k] - DJ[k] * alpha_f - DH[k] * a_f
         alpha_by_moment_out[shift + k] = alpha_m + alpha_by_moment_out[shift + k] - DJ[k] * alpha_m - DH[k] * a_m
 
-    for other in range(n):
+    for other in range(slot + 1):
         a_f = zero
         a_m = zero
         alpha_f = zero
@@ -623,12 +621,21 @@ def response(
             a_m = a_by_moment_out[at]
             alpha_f = alpha_by_force_out[at]
             alpha_m = alpha_by_moment_out[at]
+        if other == slot:  # symmetric but for rounding
+            a_f = 0.5 * (a_f + wp.transpose(a_f))
+            alpha_m = 0.5 * (alpha_m + wp.transpose(alpha_m))
+            a_m = 0.5 * (a_m + wp.transpose(alpha_f))
+            alpha_f = wp.transpose(a_m)
         for r in range(3):
             for c in range(3):
                 response_out[other, r, slot, c] = a_f[r, c]
                 response_out[other, r, slot, 3 + c] = a_m[r, c]
                 response_out[other, 3 + r, slot, c] = alpha_f[r, c]
                 response_out[other, 3 + r, slot, 3 + c] = alpha_m[r, c]
+                response_out[slot, c, other, r] = a_f[r, c]
+                response_out[slot, 3 + c, other, r] = a_m[r, c]
+                response_out[slot, c, other, 3 + r] = alpha_f[r, c]
+                response_out[slot, 3 + c, other, 3 + r] = alpha_m[r, c]
 
 
 @wp.kernel

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator
 
 import mujoco
@@ -14,16 +13,17 @@ from vinesim.physics.rigid import Rigid
 from vinesim.physics.step import Physics
 from vinesim.world.values import Measurement, RobotSpec
 
-CANES = 64
+CANES = (64, 256)
 LIFTED = 12
 HELD = (14, 20, 26, 32)
 
 
 def contact() -> Iterator[Measurement]:
-    """64 canes with their bunches: a bar lifts twelve, four hands hold a bunch each."""
-    model = scenes.row(CANES)
+    """Canes with their bunches, all awake: a bar lifts twelve, four hands hold a bunch each."""
     robots = [scenes.bar("bar", 0, LIFTED), *(scenes.hand(f"hand{i}", scenes.bunch_at(i)) for i in HELD)]
-    yield from _beside(f"{CANES} canes and bunches, {LIFTED} lifted, {len(HELD)} held", "contact", model, robots, 20)
+    for canes, ticks in zip(CANES, (20, 5), strict=True):
+        case = f"{canes} canes and bunches, {LIFTED} lifted, {len(HELD)} held"
+        yield from _beside(case, "contact", scenes.row(canes), robots, ticks)
 
 
 def tick() -> Iterator[Measurement]:
@@ -34,7 +34,7 @@ def tick() -> Iterator[Measurement]:
 def _beside(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -> Iterator[Measurement]:
     theirs = Whole(model, robots)
     ours = [Physics(model)]
-    if "threads" in inspect.signature(Physics).parameters and len(model.tree_first) > 1:
+    if len(model.tree_first) > 1:
         ours.append(Physics(model, threads=2))
     for physics in ours:
         for robot in robots:

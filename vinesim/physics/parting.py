@@ -20,8 +20,6 @@ from vinesim.world.values import Parting
 
 STUB = 1e-3
 """What stays of a bunch on the tree [kg]."""
-WEIGHT = 9.81
-"""[N/kg]"""
 PATIENCE = 3
 """[tick] A peduncle parts when it has been strained too much for so long: one tick's peak is not a pull."""
 
@@ -57,6 +55,8 @@ class Partings:
         self._bunches = order.astype(np.int32)
         self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
+        self._awake: np.ndarray | None = None
+        self._at_stake = self._bunches[:0]
         self._told: list[Parting] = []
 
     # ------------------------------------------------------------------ the tick
@@ -72,55 +72,34 @@ class Partings:
 
     def _pull(self) -> None:
         """Part the bunches whose peduncles have been strained for long enough."""
-        plants, model, touching = self.plants, self.plants.model, self.touching
-        awake = plants.awake
-        count = self._first[awake + 1] - self._first[awake]
-        inner = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        bunches = self._bunches[np.repeat(self._first[awake], count) + inner]
-        bunches = bunches[plants.state.bunch_attached[bunches]]
+        bunches = self._hanging()
         if len(bunches) == 0:
             return
-        # bounds first: most carry no more than their weight, their inertia and what hands do to them
-        bodies = model.bunch_body[bunches]
-        hands = np.zeros((len(self._strained), 2))
-        touched = self._bunch_of[touching.bodies]
-        on = (touched >= 0) & (model.body_organ[touching.bodies] == int(Organ.BUNCH))
-        wrench = np.abs(touching.wrenches[on])
-        lever = 2.0 * model.bunch_length[touched[on]]
-        push = wrench[:, :3].sum(1)
-        np.add.at(hands, touched[on], np.stack([push, wrench[:, 3:].sum(1) + lever * push], 1))
-        own = model.body_mass[bodies] * (self._shaken(bunches) + WEIGHT)
-        force = hands[bunches, 0] + own
-        # weight and inertia act within the bunch's length
-        moment = hands[bunches, 1] + 2.0 * own * model.bunch_length[bunches]
-        strained = (force > model.bunch_pull[bunches]) | (moment > model.bunch_bend[bunches])
-        carried = np.zeros((len(bunches), 6))
-        if strained.any():
-            carried[strained] = plants.joint_wrench(bodies[strained])
-        pulled = np.linalg.norm(carried[:, :3], axis=1) / model.bunch_pull[bunches]
-        bent = np.linalg.norm(carried[:, 3:], axis=1) / model.bunch_bend[bunches]
+        model = self.plants.model
+        carried = self.plants.joint_wrench(model.bunch_body[bunches])
+        square = carried * carried
+        pulled = square[:, :3].sum(1) / np.square(model.bunch_pull[bunches])
+        bent = square[:, 3:].sum(1) / np.square(model.bunch_bend[bunches])
         strained = np.maximum(pulled, bent) > 1.0
+        if not strained.any():
+            self._strained[bunches] = 0
+            return
         self._strained[bunches] = np.where(strained, self._strained[bunches] + 1, 0)
         for i in np.flatnonzero(self._strained[bunches] >= PATIENCE):
             bunch = int(bunches[i])
             self._pick(bunch, "pull" if pulled[i] >= bent[i] else "bend", self._toucher(bunch), carried[i])
 
-    def _shaken(self, bunches: np.ndarray) -> np.ndarray:
-        """More than any part of these bunches accelerates [k] m/s^2; of fine trees every cluster is asked."""
-        plants, model = self.plants, self.plants.model
-        bodies = model.bunch_body[bunches]
-        fine = np.flatnonzero(plants.state.tree_fine[model.body_tree[bodies]] & (model.bunch_clusters[bunches] > 0))
-        count = model.bunch_clusters[bunches[fine]]
-        start = np.cumsum(count) - count
-        clusters = np.repeat(model.bunch_cluster[bunches[fine]] - start, count) + np.arange(count.sum())
-        asked = np.concatenate([bodies, clusters])
-        motion, rate = plants.acceleration[asked], plants.state.body_qd[asked, 3:]
-        turning = np.abs(motion[:, 3:]).sum(1) + (rate * rate).sum(1)
-        shaken = np.abs(motion[:, :3]).sum(1) + turning * model.body_length[asked]
-        most = shaken[: len(bodies)]
-        if len(fine):
-            most[fine] = np.maximum(most[fine], np.maximum.reduceat(shaken[len(bodies) :], start))
-        return most
+    def _hanging(self) -> np.ndarray:
+        """The bunches on awake trees that have not been picked [k]."""
+        awake = self.plants.awake
+        if awake is not self._awake:
+            self._awake = awake
+            first = self._first[awake]
+            count = self._first[awake + 1] - first
+            inner = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+            self._at_stake = self._bunches[np.repeat(first, count) + inner]
+        attached = self.plants.state.bunch_attached[self._at_stake]
+        return self._at_stake if attached.all() else self._at_stake[attached]
 
     def _close(self) -> None:
         """Cut what lies in the mouths that are closing."""

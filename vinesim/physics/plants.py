@@ -50,10 +50,10 @@ RIGID = 10.0
 that nothing is seen, but with phi below 1 it rings on and pumps the cane."""
 
 
-FEW = 100
+FEW = 16
 """[tree] For fewer awake trees a thread, handing ``free()`` to other threads costs more than it saves."""
 
-FEW_MOVES = 1000
+FEW_MOVES = 200
 """[tree] The same for the move at the end of ``commit()``, which is twelve times as short."""
 
 
@@ -142,7 +142,9 @@ class Plants:
         self._stepping = np.zeros(trees, np.int32)
         self._subset = np.zeros(trees, np.int32)
         self._stepped = np.zeros(0, np.int32)
-        self._capacity = 0
+        self._capacity, self._joints = 0, 0
+        self._checked: np.ndarray | None = None
+        """Bodies that are known to be stepping."""
         # as the kernels see the trees: a cut body has no parent and no lever, a coarse tree no clusters
         self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
@@ -156,9 +158,10 @@ class Plants:
             for name, value in vars(owner).items():
                 if isinstance(value, np.ndarray):
                     setattr(owner, name, memory.within_reach(value))
-        self._crew = Crew(threads) if threads > 1 else None
-        if self._crew is not None:
-            weakref.finalize(self, self._crew.close)
+        self.crew = Crew(threads) if threads > 1 else None
+        """Who shares the work, if there is more than one thread."""
+        if self.crew is not None:
+            weakref.finalize(self, self.crew.close)
         self._share_ends = [0] * (threads + 1)
         self._graph: wp.Graph | None = None
         self._graph_of = (-1, -1)
@@ -384,6 +387,7 @@ class Plants:
 
     def free(self) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the tick and solve the motion without contacts."""
+        self._checked = None
         self._choose()
         self._renew()
         self._carry_in(len(self._stepped))
@@ -395,20 +399,17 @@ class Plants:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
 
         ``response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of body
-        ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
+        ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees. A view, good until the
+        next call.
         """
         n = len(bodies)
-        if n == 0:
-            return np.zeros((0, 6, 0, 6), np.float32)
-        self._must_be_stepping(np.asarray(bodies))
-        if n > self._capacity:
+        self._must_be_stepping(bodies)
+        if n > self._capacity or self._capacity == 0:
             self._record_response(max(2 * self._capacity, n, 16))
         self._asked[:n] = self.memory.at[bodies]
-        self._asked[n] = -1
         self._respond(n)
         self.memory.wait()
-        y = self._response[:n, :, :n].reshape(6 * n, 6 * n)
-        return (0.5 * (y + y.T)).reshape(n, 6, n, 6)
+        return self._response[:n, :, :n]
 
     def commit(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
         """End the tick: wrenches (N, N m, world, at the bodies' origins) act over it, joints move.
@@ -419,10 +420,9 @@ class Plants:
         self._wrench[self._pushed] = 0.0
         self._pushed = np.zeros(0, np.int32)
         if bodies is not None and len(bodies):
-            bodies = np.asarray(bodies)
             self._must_be_stepping(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
-            self._pushed = bodies.astype(np.int32)
+            self._pushed = np.array(bodies, np.int32)
             touched = np.unique(self.model.body_tree[bodies])
             self._subset[: len(touched)] = touched
             self._carry_wrench(len(self._stepped))
@@ -518,25 +518,13 @@ class Plants:
 
         Of the last tick, and only for bodies of trees that were awake in it. At rest it carries what hangs below.
         """
-        n, device = len(bodies), self.memory.device
-        out = wp.zeros(n, dtype=wp.spatial_vector, device=device)
-        asked = wp.array(self.memory.at[np.asarray(bodies)], dtype=wp.int32, device=device)
-        if n:
-            m = self.memory.arrays
-            wp.launch(
-                plant.joint_wrench,
-                n,
-                inputs=[
-                    self.dt, wp.vec3(GRAVITY), self.memory.pitch, m["tree_first"], m["tree_moving"], m["body_tree"],
-                    m["body_parent"], m["body_root"], m["body_mass"], m["body_com"], m["body_inertia"],
-                    m["body_product"], m["body_drag"], m["tie_span"], m["tie_point"], m["tie_stiffness"],
-                    m["tie_damping"], asked, m["phi_used"], m["tree_air"], m["tie_anchor"], m["body_q"], m["body_qd"],
-                    m["acceleration"], m["body_load"], m["wrench"],
-                ],
-                outputs=[out],
-                device=device,
-            )  # fmt: skip
-        return out.numpy()
+        n = len(bodies)
+        if n > self._joints:
+            self._record_joints(max(2 * self._joints, n, 16))
+        self._loaded[:n] = self.memory.at[bodies]
+        self._carry(n)
+        self.memory.wait()
+        return self._carried[:n].copy()
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
         """Least damping ratio that a spring mode of this frequency [Hz] can show: pi f (2 phi - 1) dt."""
@@ -568,6 +556,9 @@ class Plants:
         self._list = np.flatnonzero(self.state.tree_awake).astype(np.int32)
 
     def _must_be_stepping(self, bodies: np.ndarray) -> None:
+        if bodies is self._checked or len(bodies) == 0:
+            return
+        bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
         at = np.searchsorted(self._stepped, trees)
         if len(self._stepped) == 0 or (self._stepped[np.minimum(at, len(self._stepped) - 1)] != trees).any():
@@ -593,10 +584,10 @@ class Plants:
 
     def _all(self, launch: Callable[..., None], few: int) -> None:
         """Launch over the trees that this tick steps, on all threads if there are ``few`` for each."""
-        if self._crew is None or len(self._stepped) < few * self.threads:
+        if self.crew is None or len(self._stepped) < few * self.threads:
             launch(len(self._stepped))
         else:
-            self._crew.share(self._shares[launch])
+            self.crew.share(self._shares[launch])
 
     def _together(self, ticks: int, floating: int) -> None:
         """Predict and move, so many times, without coming back in between."""
@@ -611,11 +602,11 @@ class Plants:
             for _ in range(ticks):
                 wp.capture_launch(self._graph)
             self.memory.wait()
-        elif self._crew is None or count < self.threads or floating:
+        elif self.crew is None or count < self.threads or floating:
             self._tick(ticks, count, floating)
         else:
             share = [(ends[i + 1] - ends[i], ends[i], i) for i in range(self.threads)]
-            self._crew.share([functools.partial(_run, self._free, self._integrate, ticks, *part) for part in share])
+            self.crew.share([functools.partial(_run, self._free, self._integrate, ticks, *part) for part in share])
 
     def _tick(self, ticks: int, count: int, floating: int) -> None:
         for _ in range(ticks):
@@ -769,10 +760,24 @@ class Plants:
             launch: [part(launch, i) for i in range(self.threads)] for launch in (self._free, self._integrate)
         }
 
+    def _record_joints(self, capacity: int) -> None:
+        """Room for what ``capacity`` joints carry."""
+        self._joints, memory = capacity, self.memory
+        self._loaded = memory.within_reach(np.zeros(capacity, np.int32))
+        self._carried = memory.within_reach(np.zeros((capacity, 6), np.float32))
+        memory.reach("loaded", self._loaded, wp.int32)
+        memory.reach("carried", self._carried, wp.spatial_vector)
+        self._carry = self._bind(
+            plant.joint_wrench, self.dt, wp.vec3(GRAVITY), memory.pitch, "tree_first", "tree_moving", "body_tree",
+            "body_parent", "body_root", "body_mass", "body_com", "body_inertia", "body_product", "body_drag",
+            "tie_span", "tie_point", "tie_stiffness", "tie_damping", "loaded", "phi_used", "tree_air", "tie_anchor",
+            "body_q", "body_qd", "acceleration", "body_load", "wrench", "carried",
+        )  # fmt: skip
+
     def _record_response(self, capacity: int) -> None:
         """Room for the responses of ``capacity`` bodies at once."""
         self._capacity, memory = capacity, self.memory
-        self._asked = memory.within_reach(np.full(capacity + 1, -1, np.int32))
+        self._asked = memory.within_reach(np.zeros(capacity, np.int32))
         self._response = memory.within_reach(np.zeros((capacity, 6, capacity, 6), np.float32))
         stride = memory.span
         columns = [wp.empty(capacity * stride, dtype=wp.mat33, device=memory.device) for _ in range(4)]

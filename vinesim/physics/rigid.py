@@ -387,12 +387,11 @@ class Rigid:
 
     @property
     def group(self) -> np.ndarray:
-        """[MuJoCo geom] a label that two geoms share if a force on one may move the other in this tick."""
+        """[MuJoCo kinematic tree] a label that two share if a force on one may move the other in this tick."""
         m, d = self.world, self.data
-        label = np.arange(m.ntree + 1)
-        if d.nefc and d.nisland:
-            label[:-1] = np.where(d.tree_island >= 0, m.ntree + 1 + d.tree_island, label[:-1])
-        return label[m.body_treeid[m.geom_bodyid]]
+        if d.nefc == 0:
+            return self._each
+        return np.where(d.tree_island >= 0, m.ntree + d.tree_island, self._each) if d.nisland else 0 * self._each
 
     def bound(self, bodies: np.ndarray) -> bool:
         """Whether native constraints that are active now bind one of these MuJoCo bodies [k].
@@ -534,6 +533,7 @@ class Rigid:
             _carry(self.world, self.data, self._contact, world, data, contact)
         self.world, self.data, self._contact = world, data, contact
         self._blocks: dict[bytes, _Block] = {}
+        self._each = np.arange(self.world.ntree, dtype=np.int32)
         self._sound = data.qpos.copy()
         self._fresh = False
         for slot in range(self._waiting):

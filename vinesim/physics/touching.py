@@ -8,6 +8,8 @@ them in turn with penalty springs instead (a *staggered* scheme) blows up from 1
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -22,19 +24,23 @@ from vinesim.world.values import Contact
 
 STIFFNESS = 2e4
 """[N/m] of every contact, normal and (as the anchor of friction) tangential; its damping is 2 dt times this."""
-SWEEPS = 50
-"""Gauss-Seidel sweeps at most; warm-started, ten to twenty are usual."""
+SWEEPS = 100
+"""Gauss-Seidel sweeps at most; warm-started and with leaps, up to six are usual."""
+LEAPS = 6
+"""So many times an island is solved directly, as if its contacts stayed as they are, before sweeps go on alone."""
+LARGEST_LEAP = 16
+"""Islands of more contacts do not leap: it takes the cube of their number, sweeps take the square."""
 TOLERANCE = 1e-6
 """Of the largest impulse: a smaller change in a sweep ends them."""
 SLOTS = 64
 """Contacts that one tree can have at once."""
-ISLANDS = 24
-"""Up to so many contacts are solved as one block; more are parted into islands that do not feel each other."""
 CLOSE = 256
 """Standing things that can be close to one tree at once."""
 NOBODY = np.iinfo(np.int32).max
 """In place of a geom that is gone."""
 BLOCK = int(kernels.BLOCK)
+FEW = 16
+"""Awake trees for each thread: fewer are not worth handing over."""
 STIR = 1e-3
 """[m/s] A box or a loose bunch slower than this wakes nobody."""
 
@@ -141,7 +147,8 @@ class Touching:
         """[n, 6] N, N m on them, at their origins, world axes."""
         self.force: np.ndarray | None = None
         """[dof] generalised force of the same contacts on the rigid world; None without contact."""
-        self.sweeps = 0
+        self.sweeps = self.islands = 0
+        """Of the last solve: sweeps that its slowest island took; islands, which do not feel each other."""
         self.dropped = 0
         """Contacts left out since the start, for want of room."""
         self.complaint = ""
@@ -174,6 +181,9 @@ class Touching:
         if len(fallen_asleep):
             self._bound(fallen_asleep)
             self._bound_tree_blocks(np.unique(fallen_asleep // BLOCK))
+        self._dof_held_before[:] = self._dof_held
+        np.subtract(self.rigid.data.qvel, self._dof_free, out=self._dof_held)
+        self._dof_free[:] = self.rigid.velocity_free
         if self._standing_bound:
             self._bound_geoms(self._movable)
         else:
@@ -192,8 +202,7 @@ class Touching:
         self.count, self.bodies, self.wrenches, self.force = 0, self.bodies[:0], self.wrenches[:0], None
         self._values: tuple[Contact, ...] | None = ()
         if len(awake) and len(self._geoms.id):
-            self._bound(awake)
-            self._meet(len(awake))
+            self._meet(awake)
             self._brace(awake)
         if self.count:
             self._press()
@@ -238,7 +247,22 @@ class Touching:
     def _bound(self, trees: np.ndarray) -> None:
         """Bring the boxes around some trees up to their bodies."""
         self._trees[: len(trees)] = trees
-        self._bound_trees(len(trees))
+        self._deal(len(trees), self._bound_trees)
+
+    def _deal(self, count: int, *launches: Callable[..., None]) -> None:
+        """Launch over so many trees of the list, one launch after the other for each; threads take turns in the list."""
+        crew = self.plants.crew
+        threads = 1 if crew is None or count < FEW * crew.size else crew.size
+        if self._dealt != (count, threads):
+            self._dealt = (count, threads)
+            self._every[:count] = np.concatenate([np.arange(i, count, threads) for i in range(threads)])
+        if threads == 1:
+            for launch in launches:
+                launch(count)
+            return
+        share = [len(range(i, count, threads)) for i in range(threads)]
+        first = [sum(share[:i]) for i in range(threads)]
+        crew.share([partial(_all, launches, share[i], first[i], i) for i in range(threads)])
 
     def _bound_tree_blocks(self, blocks: np.ndarray) -> None:
         """Bring the boxes around some blocks of trees up to their trees."""
@@ -258,17 +282,21 @@ class Touching:
             )
         self._standing_bound = True
 
-    def _meet(self, trees: int) -> None:
-        """List the contacts of the trees that were just bounded."""
+    def _meet(self, awake: np.ndarray) -> None:
+        """List the contacts of the awake trees."""
+        trees = len(awake)
         if trees > self._room:
             self._make_room(2 * trees)
+        self._trees[:trees] = awake
         self._tally[kernels.TREES] = trees
-        self._meeting(trees)
+        self._deal(trees, self._bound_trees, self._meeting)
         if self.branches:
-            self._order[:trees] = np.argsort(self._tree_low[self._trees[:trees], 0], kind="stable")
-            self._meeting_branches(trees)
+            low = self._tree_low[awake]
+            axis = self._tally[kernels.AXIS] = int(np.argmax(low.max(0) - low.min(0)))
+            self._order[:trees] = np.argsort(low[:, axis], kind="stable")
+            self._deal(trees, self._meeting_branches)
         self._gathering(1)
-        _, count, missed, _, _, _ = self._tally.tolist()
+        count, missed = int(self._tally[kernels.HITS]), int(self._tally[kernels.MISSED])
         if count > self.capacity:
             missed += count - self.capacity
             hits = np.flatnonzero(self._slot < self._found[:trees, None])
@@ -300,59 +328,31 @@ class Touching:
     def _press(self) -> None:
         """Impulses of all contacts at once, and what they do to either side."""
         n, rows = self.count, 3 * self.count
+        self._group[:] = self.rigid.group
         self._indexing(1)
-        touched = int(self._tally[kernels.BODIES])
-        bodies = self._bodies[:touched]
+        touched, islands = int(self._tally[kernels.BODIES]), int(self._tally[kernels.ISLANDS])
+        self.bodies = bodies = self._bodies[:touched].copy()
         rigid_rows, rigid_answer = self._rigid_rows[:rows], self._rigid_answer[:rows]
         rigid_rows[:] = 0.0
         rigid_answer[:] = 0.0
-        self._dof_free[:] = self.rigid.velocity_free
         self._coupling(n)
 
-        self._y[: 6 * touched, : 6 * touched] = self.plants.response(bodies).reshape(6 * touched, -1)
+        self._y[:touched, :, :touched] = self.plants.response(bodies)
         bound = self._tally[kernels.BOUND] = self.rigid.bound(self._geoms.body[self._other[:n].clip(0)])
         self._answering(rows)
         if bound:
             rigid_answer[:] = self.rigid.inverse(rigid_rows).T
         self._assembling(rows)
-        islands = self._part(n)
         self._relaxing(islands)
         self.sweeps = int(self._sweeps[:islands].max())
+        self.islands = islands
 
         self._known_count[0] = n
         self._remembering(n)
         self._adding(touched)
-        self.bodies = bodies.copy()
         self.wrenches = self._wrench[:touched].copy()
         self.force = self._impulse[:rows] @ rigid_rows / -self.dt
         self._values = None
-
-    def _part(self, n: int) -> int:
-        """Split the contacts into islands that share no body; returns how many there are."""
-        if n <= ISLANDS:
-            self._island_first[1] = n
-            self._island_member[:n] = self._every[:n]
-            return 1
-        tree, other = self.model.body_tree[self._contact_body[:n]], self._other[:n]
-        # what stands parts islands: it does not hand on what it feels
-        thing = np.where(other >= self._movable, tree, -1 - self.rigid.group[self._geoms.id[np.maximum(other, 0)]])
-        thing = np.where(other < 0, self.model.body_tree[self._other_body[:n]], thing)
-        label: dict[int, int] = {}
-
-        def root(x: int) -> int:
-            while label.setdefault(x, x) != x:
-                x = label[x]
-            return x
-
-        for t, r in sorted(set(zip(tree.tolist(), thing.tolist(), strict=True))):
-            a, b = sorted((root(t), root(r)))
-            label[b] = a
-        of_contact = np.array([root(t) for t in tree.tolist()])
-        _, member = np.unique(of_contact, return_inverse=True)
-        self._island_member[:n] = np.argsort(member, kind="stable")
-        ends = np.cumsum(np.bincount(member))
-        self._island_first[1 : 1 + len(ends)] = ends
-        return len(ends)
 
     # ------------------------------------------------------------------ memory and launches
 
@@ -361,18 +361,23 @@ class Touching:
         n, trees, shapes = self.capacity, len(self.model.tree_first), len(self.shapes.body)
         self._trees = np.zeros(trees, np.int32)
         self._tree_low, self._tree_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
+        self._every, self._dealt = np.zeros(trees, np.int32), (0, 0)
         self._near = np.zeros(trees, np.bool_)
-        for name in ("start", "end", "start_ahead", "end_ahead", "shape_low", "shape_high"):
+        for name in ("start", "end", "shape_low", "shape_high"):
             setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
-        self._bend = np.zeros((len(self.model.body_mass), 6), np.float32)
+        self._wood_low, self._wood_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
+        ends = np.maximum(np.linalg.norm(self.shapes.start, axis=1), np.linalg.norm(self.shapes.end, axis=1))
+        self._reach_of_shape = (ends + self.shapes.radius).astype(np.float32)
+        self._last_bunch = np.full(trees, -1, np.int32)
+        np.maximum.at(self._last_bunch, self.model.body_tree[self.shapes.body], self.shapes.bunch)
         self._shape_speed = np.zeros(shapes, np.float32)
         for name in ("start_drawn", "end_drawn"):
             setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
         blocks = -(-trees // BLOCK)
         self._blocks = np.zeros(blocks, np.int32)
         self._block_low, self._block_high = np.zeros((blocks, 3), np.float32), np.zeros((blocks, 3), np.float32)
-        self._order, self._tally = np.zeros(trees, np.int32), np.zeros(6, np.int32)
-        for name in ("hits", "contact_shape", "contact_body", "place", "other", "other_body", "other_place",
+        self._order, self._tally = np.zeros(trees, np.int32), np.zeros(8, np.int32)
+        for name in ("hits", "contact_shape", "contact_body", "place", "other", "other_body", "other_place", "island",
                      "known_shape", "known_other"):  # fmt: skip
             setattr(self, "_" + name, np.zeros(n, np.int32))
         for name in ("gap", "friction", "known_push"):
@@ -384,9 +389,9 @@ class Touching:
         self._axes = np.zeros((n, 3, 3))
         self._bodies, self._wrench = np.zeros(2 * n + 1, np.int32), np.zeros((2 * n, 6))
         self._plant_rows, self._A = np.zeros((3 * n, 12)), np.zeros((3 * n, 3 * n))
-        self._y, self._plant_answer = np.zeros((12 * n, 12 * n), np.float32), np.zeros((3 * n, 12 * n))
+        self._y, self._plant_answer = np.zeros((2 * n, 6, 2 * n, 6), np.float32), np.zeros((3 * n, 12 * n))
         self._island_first, self._island_member = np.zeros(n + 1, np.int32), np.zeros(n, np.int32)
-        self._sweeps, self._every = np.zeros(n, np.int32), np.arange(n, dtype=np.int32)
+        self._sweeps, self._rows = np.zeros(n, np.int32), np.zeros((3 * n, 3 * n + 2))
         self._known_count = np.zeros(1, np.int32)
         self._values = ()
         self._room = 0
@@ -427,7 +432,9 @@ class Touching:
         self._geom_spin, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
         self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
         self._rigid_rows, self._rigid_answer = (np.zeros((3 * self.capacity, self.rigid.world.nv)) for _ in range(2))
-        self._dof_free = np.zeros(self.rigid.world.nv)
+        self._dof_free = self.rigid.velocity_free
+        self._dof_held, self._dof_held_before = np.zeros(self.rigid.world.nv), np.zeros(self.rigid.world.nv)
+        self._group = np.zeros(self.rigid.world.ntree, np.int32)
         self._dof_parent = self.rigid.world.dof_parentid
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
         m = self.rigid.world
@@ -472,16 +479,15 @@ class Touching:
         a_first, a_lies = shared(self._actor_first, wp.int32), shared(self._actor_lies, wp.bool)
         s_tree, s_body, s_bunch, s_when = (shared(x, wp.int32) for x in (s.tree, s.body, s.bunch, s.when))
         s_drawn = [shared(x, wp.vec3) for x in (self._start_drawn, self._end_drawn)]
-        fine, core = shared(state.tree_fine, wp.bool), shared(self.model.tree_core, wp.int32)
+        fine, cut = shared(state.tree_fine, wp.bool), shared(state.body_cut, wp.bool)
         blocks = [shared(x, wp.vec3) for x in (self._block_low, self._block_high)]
         standing = [shared(x, wp.vec3) for x in (self._standing_low, self._standing_high)]
         s_radius, s_speed = shared(s.radius, float), shared(self._shape_speed, float)
         s_at = [shared(x, wp.vec3) for x in (self._start, self._end)]
         s_box = [shared(x, wp.vec3) for x in (self._shape_low, self._shape_high)]
-        s_ahead = [shared(x, wp.vec3) for x in (self._start_ahead, self._end_ahead)]
-        m_first, m_size, m_parent = (
-            shared(x, wp.int32) for x in (self.model.tree_first, self.model.tree_size, self.model.body_parent)
-        )
+        w_box = [shared(x, wp.vec3) for x in (self._wood_low, self._wood_high)]
+        m_parent, m_tree = (shared(x, wp.int32) for x in (self.model.body_parent, self.model.body_tree))
+        d_parent = shared(self._dof_parent, wp.int32)
         xpos, com = shared(mj["xpos"], wp.vec3d), shared(mj["com"], wp.vec3d)
         xmat = shared(mj["xmat"].reshape(-1, 3, 3), wp.mat33d)
         cvel, cdof = shared(mj["cvel"], wp.float64), shared(mj["cdof"], wp.float64)
@@ -491,18 +497,21 @@ class Touching:
         moving, speed = vectors("geom_middle", "geom_velocity", "geom_spin"), doubles("geom_speed")[0]
         dt, k, c = self.dt, self.stiffness, self.damping
         softness = 1.0 / (dt * (k * dt + c))
+        dealt = {"over": "every", "shares": self.plants.threads}
 
         self._bound_geoms = bind(
             kernels.bound_geoms,
-            [dt, g_id, g_body, g_root, g_center, g_half, xpos, xmat, cvel, com],
+            [dt, g_id, g_body, g_root, g_center, g_half, g_dof, d_parent, xpos, xmat, cvel, cdof,
+             *doubles("dof_free", "dof_held", "dof_held_before"), com],
             [*moving, speed, *g_box],
-        )
+        )  # fmt: skip
         self._bound_actors = bind(kernels.bound_actors, [STIR, a_first, a_lies, speed, *g_box], a_box)
         self._bound_trees = bind(
             kernels.bound_trees,
-            [dt, m_first, m_size, core, m_parent, s_tree, s_body, s_when, shared(s.start, wp.vec3),
-             shared(s.end, wp.vec3), s_radius, *ints("trees"), body_q, body_qd, shared(state.body_cut, wp.bool), fine],
-            [shared(self._bend, wp.spatial_vector), *s_at, *s_ahead, s_speed, *s_box, *t_box],
+            [dt, s_tree, s_body, s_bunch, s_when, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius,
+             shared(self._reach_of_shape, float), *ints("every", "trees"), body_q, body_qd, fine],
+            [*s_at, s_speed, *s_box, *w_box, *t_box],
+            **dealt,
         )  # fmt: skip
         told = shared(self.told, wp.bool)
         a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
@@ -517,60 +526,70 @@ class Touching:
             shared(self._hit_normal, wp.vec3d),
             shared(self._hit_point, wp.vec3d),
         ]
-        onset, now = shared(self._onset, wp.bool), [body_q, body_qd, body_qd_free, *s_at, *s_ahead, s_speed, *s_box]
+        onset, now = shared(self._onset, wp.bool), [body_q, body_qd, body_qd_free, *s_at, cut, s_speed, *s_box]
         self._meeting = bind(
             kernels.meet,
-            [dt, SLOTS, self._movable, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, g_id, g_kind, g_size,
-             g_radius, g_copy, told, fine, attached, *ints("trees"), *t_box, *now, xmat, *moving, speed, *g_box,
-             *standing],
+            [dt, SLOTS, self._movable, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, g_id, g_kind,
+             g_size, g_radius, g_copy, *ints("every"), told, fine, attached, *ints("trees"), *t_box, *now, xmat,
+             *moving, speed, *g_box, *standing],
             [*ints("close", "found"), *hit, onset],
+            **dealt,
         )  # fmt: skip
         self._meeting_branches = bind(
             kernels.meet_branches,
-            [dt, SLOTS, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, fine, attached,
-             *ints("order", "tally", "trees"), *t_box, *now],
+            [dt, SLOTS, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, *ints("last_bunch", "every"),
+             fine, attached, *ints("order", "tally", "trees"), *t_box, *w_box, *now],
             [*ints("found"), *hit, onset],
+            **dealt,
         )  # fmt: skip
         flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_other"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
-        axes = shared(self._axes, wp.mat33d)
+        axes, sparse = shared(self._axes, wp.mat33d), [shared(x, wp.int32) for x in mj["sparse"]]
         self._gathering = bind(kernels.gather, [SLOTS, *ints("found"), onset], ints("hits", "tally"))
         self._indexing = bind(
             kernels.index,
-            [s_body, *ints("hits"), *flat[:2]],
-            ints("tally", "bodies", "contact_shape", "contact_body", "place", "other_body", "other_place"),
-        )
+            [s_body, m_tree, g_dof, sparse[0], *ints("hits"), *flat[:2], *ints("group")],
+            ints("tally", "bodies", "contact_shape", "contact_body", "place", "other_body", "other_place", "island",
+                 "island_first", "island_member"),
+        )  # fmt: skip
         self._coupling = bind(
             kernels.couple,
-            [dt, k, c, FRICTION, g_friction, g_dof, g_root, shared(self._dof_parent, wp.int32), *ints("hits"),
+            [dt, k, c, FRICTION, g_friction, g_dof, g_root, d_parent, *ints("hits"),
              *flat[1:], *ints("contact_shape", "contact_body", "other_body"), body_q,
              body_qd_free, *doubles("dof_free"), cdof, com, *ints("known_count"), *known],
             [*ints("other"), *doubles("gap", "friction"), *vectors("point"), axes,
              *doubles("plant_rows", "rigid_rows", "free", "offset", "impulse")],
         )  # fmt: skip
-        pairs, rows = ints("tally", "other", "place", "other_place"), doubles("plant_rows", "rigid_rows")
-        answers = doubles("plant_answer", "rigid_answer")
+        pairs, rows = ints("other", "place", "other_place"), doubles("plant_rows", "rigid_rows")
+        answers, y = doubles("plant_answer", "rigid_answer"), shared(self._y, float).reshape((12 * self.capacity, -1))
+        blocks = ints("island", "island_first", "island_member")
         self._answering = bind(
             kernels.answer,
-            [*(shared(x, wp.int32) for x in mj["sparse"][:3]), g_dof, *(shared(x, wp.int32) for x in mj["sparse"][3:]),
-             *pairs, *rows, shared(self._y, float), *(shared(x, wp.float64) for x in mj["factors"])],
+            [*sparse[:3], g_dof, *sparse[3:], m_tree, *ints("bodies", "tally"), *pairs, *rows, y,
+             *(shared(x, wp.float64) for x in mj["factors"])],
             answers,
         )  # fmt: skip
-        self._assembling = bind(
-            kernels.assemble, [g_dof, shared(self._dof_parent, wp.int32), *pairs, *rows, *answers], doubles("A")
+        self._assembling = bind(kernels.assemble, [g_dof, d_parent, *blocks, *pairs, *rows, *answers], doubles("A"))
+        self._adding = bind(
+            kernels.add_up, [dt, *ints("tally"), *pairs, rows[0], *doubles("impulse")], doubles("wrench")
         )
-        self._adding = bind(kernels.add_up, [dt, *pairs, rows[0], *doubles("impulse")], doubles("wrench"))
         self._relaxing = bind(
             kernels.relax,
-            [softness, SWEEPS, TOLERANCE, *ints("island_first", "island_member"),
+            [softness, SWEEPS, LEAPS, LARGEST_LEAP, TOLERANCE, *blocks[1:],
              *doubles("friction", "A", "free", "offset")],
-            [*doubles("impulse"), *ints("sweeps")],
+            [*doubles("rows", "impulse"), *ints("sweeps")],
         )  # fmt: skip
         self._remembering = bind(
             kernels.remember,
-            [dt, k, c, *ints("known_count", "contact_shape", "other"), axes, *doubles("A", "free", "impulse")],
+            [dt, k, c, *blocks, *ints("contact_shape", "other"), axes, *doubles("A", "free", "impulse")],
             [*vectors("force"), *known],
         )  # fmt: skip
+
+
+def _all(launches: tuple[Callable[..., None], ...], count: int, first: int, share: int) -> None:
+    """One thread's share of several launches."""
+    for launch in launches:
+        launch(count, first, share)
 
 
 def _names(geoms) -> list[tuple[str, str, int]]:
