@@ -10,7 +10,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from scipy.integrate import solve_bvp
+from scipy.integrate import solve_bvp, solve_ivp
 from scipy.linalg import eig, eigh
 from scipy.optimize import brentq, curve_fit
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
@@ -117,6 +117,37 @@ def elastica_line(beam: Beam) -> np.ndarray:
         assert solution.success, solution.message
         s, y = solution.x, solution.y
     return y[2:]
+
+
+def elastica_of_parts(parts: list[Beam]) -> tuple[float, float]:
+    """:func:`elastica` of rods that go on from each other's tips; the first's angle and the last's tip mass count.
+
+    From the tip back, where no moment is: its angle is sought that leads to the clamp's. Parts may taper.
+    """
+
+    def weight(part: Beam, s: np.ndarray) -> np.ndarray:  # of the part beyond s
+        thin = part.taper - 1.0
+        r = 1.0 + thin * s / part.length
+        volume = part.length - s if thin == 0.0 else part.length / (3.0 * thin) * (part.taper**3 - r**3)
+        return G * part.line_mass * volume
+
+    def back(tip_angle: float) -> np.ndarray:
+        y, beyond = np.array([tip_angle, 0.0, 0.0, 0.0]), G * parts[-1].tip
+        for part in reversed(parts):
+
+            def slope(s: float, y: np.ndarray, part: Beam = part, beyond: float = beyond) -> list[float]:
+                r = 1.0 + (part.taper - 1.0) * s / part.length
+                force = beyond + weight(part, s)
+                return [y[1] / (part.rigidity * r**4), force * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])]
+
+            y = solve_ivp(slope, (part.length, 0.0), y, rtol=1e-9, atol=1e-11).y[:, -1]
+            beyond += weight(part, 0.0)
+        return y
+
+    clamp = parts[0].angle
+    angle = brentq(lambda tip: back(tip)[0] - clamp, -np.pi / 2 + 1e-6, clamp, xtol=1e-12)
+    _, _, x, z = back(angle)
+    return float(-x), float(-z)
 
 
 def elastica_by_integrals(alpha: float) -> tuple[float, float]:
@@ -262,6 +293,22 @@ def settle(trees: list[Tree], seconds: float = 30.0) -> Plants:
     return plants
 
 
+def grown(parts: list[Beam], side: float = 0.0) -> Tree:
+    """Rods that go on from each other's tips, as bodies; the last carries its tip mass."""
+    first, last = parts[0], parts[-1]
+    tree = dataclasses.replace(first, tip=0.0).tree(side)
+    tree.bodies.pop()
+    for part in parts[1:]:
+        wood = Wood(part.modulus, part.density, part.beta)
+        tree.rod(len(tree.bodies) - 1, part.length, (part.radius, part.taper * part.radius), wood, part.pieces)
+    mass = max(last.tip, 1e-6)
+    tree.add(
+        len(tree.bodies) - 1, offset=(last.length / last.pieces, 0, 0), mass=mass, inertia=[mass * 1e-6] * 3,
+        length=1e-3, stiffness=[1e-3] * 3, damping=[1e-3] * 3,
+    )  # fmt: skip
+    return tree
+
+
 def last_bodies(plants: Plants) -> np.ndarray:
     """The last body of each tree."""
     return np.cumsum(plants.model.tree_size) - 1
@@ -338,6 +385,33 @@ def errors_over_pieces() -> dict[str, np.ndarray]:
     return dict(zip(CONVERGING, off, strict=True))
 
 
+SOFT, STIFF = Beam(modulus=1e9, length=0.5, tip=0.01), Beam(modulus=5e9, length=0.5, tip=0.01)
+JOINED = {
+    "stiff wood, then soft": [STIFF, SOFT],
+    "soft wood, then stiff": [SOFT, STIFF],
+    "thick, then thin": [Beam(radius=0.005, length=0.5), Beam(radius=0.003, length=0.5, tip=0.02)],
+    "three, tapering, of unlike length": [
+        Beam(radius=0.006, taper=0.8, length=0.3, angle=0.4, density=600.0),
+        Beam(modulus=2e9, radius=0.0045, taper=0.7, length=0.5),
+        Beam(modulus=1e9, radius=0.004, taper=0.6, length=0.2, density=1000.0, tip=0.1),
+    ],
+}
+
+
+@functools.cache
+def errors_over_pieces_of_joined() -> dict[str, np.ndarray]:
+    """The same for rods of unlike wood and thickness joined end to end: so many pieces in each."""
+    made = [
+        grown([dataclasses.replace(part, pieces=n // 2, beta=0.3) for part in parts], i)
+        for i, (parts, n) in enumerate((parts, n) for parts in JOINED.values() for n in PIECES)
+    ]
+    plants = settle(made)
+    seen = plants.state.body_q[last_bodies(plants)][:, [0, 2]] - np.array([0.0, HEIGHT])
+    truth = np.repeat([elastica_of_parts(parts) for parts in JOINED.values()], len(PIECES), axis=0)
+    off = np.linalg.norm(seen - truth, axis=1).reshape(-1, len(PIECES))
+    return dict(zip(JOINED, off, strict=True))
+
+
 STEPS = (0.01, 0.005, 0.0025, 0.00125)
 
 
@@ -388,15 +462,11 @@ def damping_sweep() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def two_woods(stiff_first: bool, *, beta: tuple[float, float] = (0.0, 0.0), density: float = 800.0) -> Tree:
-    """A level cane of a metre, one half 5 GPa, the other 1 GPa; the joint between them is half of each."""
+    """A level cane of a metre, one half 5 GPa, the other 1 GPa."""
     moduli = (5e9, 1e9) if stiff_first else (1e9, 5e9)
     tree = Tree(frames.pose(np.array([0.0, 0.0, HEIGHT])))
     half = tree.rod(-1, 0.5, (0.004, 0.004), Wood(moduli[0], density, beta[0]), 8)
-    other = tree.rod(half[-1], 0.5, (0.004, 0.004), Wood(moduli[1], density, beta[1]), 8, clamped=False)
-    here, there = (tree.bodies[k]["stiffness"] for k in (half[-1], other[0]))
-    between = tree.bodies[other[0]]
-    between["stiffness"] = 2.0 * here * there / (here + there)
-    between["damping"] = np.mean(beta) * between["stiffness"]
+    tree.rod(half[-1], 0.5, (0.004, 0.004), Wood(moduli[1], density, beta[1]), 8)
     return tree
 
 

@@ -36,8 +36,40 @@ def test_springs_are_ei_over_h_and_twice_that_at_the_root():
     assert model.joint_damping == pytest.approx(0.01 * model.joint_stiffness, rel=1e-6)
 
 
+def test_a_joint_of_unlike_pieces_is_half_of_each():
+    """Springs of the halves one after the other, and each wood's damping in its share of the bend."""
+    tree = grow.Tree(POSE)
+    below = tree.rod(-1, 0.5, (0.006, 0.005), CANE, 5)[-1]
+    green = grow.Wood(modulus=1e9, density=900.0, damping=0.05)
+    on = tree.rod(below, 0.4, (0.004, 0.002), green, 8)[0]
+    ours, theirs = (2.0 * e * np.pi * r**4 / 4.0 / h for e, r, h in ((1e9, 0.004, 0.05), (5e9, 0.005, 0.1)))
+    stiffness, damping = (tree.bodies[on][name] for name in ("stiffness", "damping"))
+    assert stiffness[1:] == pytest.approx(ours * theirs / (ours + theirs), rel=1e-12)
+    assert stiffness[0] == pytest.approx(stiffness[1] / 1.3, rel=1e-12)
+    share = stiffness[1] / theirs
+    assert damping[1] == pytest.approx(stiffness[1] * (0.01 * share + 0.05 * (1.0 - share)), rel=1e-12)
+
+
+def test_a_fork_bends_with_what_it_grows_on():
+    """Sideways on a like piece: its tip is a joint of half twist, half bend; its middle or before is a clamp."""
+    tree = grow.Tree(POSE)
+    below = tree.rod(-1, 1.0, (0.004, 0.004), CANE, 10)[-1]
+    aside = frames.yaw(np.pi / 2)
+    clamp = 2.0 * 5e9 * np.pi * 0.004**4 / 4.0 / 0.1
+    one = clamp / np.array([1.3, 1.0, 1.0])
+    tip, half, middle, base = (
+        tree.bodies[tree.rod(below, 0.5, (0.004, 0.004), CANE, 5, rest=aside, offset=offset)[0]]["stiffness"]
+        for offset in (None, (0.075, 0.0, 0.0), (0.05, 0.0, 0.0), (0.0, 0.0, 0.0))
+    )
+    other = clamp / np.array([1.0, 1.3, 1.0])  # its twist is our bending
+    assert tip == pytest.approx(1.0 / (1.0 / one + 1.0 / other), rel=1e-9)
+    assert half == pytest.approx(1.0 / (1.0 / one + 0.5 / other), rel=1e-9)
+    assert middle == pytest.approx(one, rel=1e-9)
+    assert base == pytest.approx(one, rel=1e-9)
+
+
 def test_inertia_of_a_piece_is_that_of_a_cylinder():
-    mass, inertia, _ = grow.section(0.1, 0.01, 0.01, 1e9, 1000.0, False)
+    mass, inertia, *_ = grow.section(0.1, 0.01, 0.01, 1e9, 1000.0)
     assert inertia == pytest.approx([mass * 0.01**2 / 2, *[mass * (3 * 0.01**2 + 0.1**2) / 12] * 2], rel=1e-12)
 
 

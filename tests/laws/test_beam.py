@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.special import jv
 
 from vinesim import frames
+from vinesim.world.grow import Tree, Wood
 
 
 @pytest.mark.parametrize("alpha", [0.1, 1.0, 5.0, 20.0])
@@ -71,6 +72,23 @@ def test_error_falls_with_the_square_of_the_pieces(case: str) -> None:
     assert (np.log2(errors[:-1] / errors[1:]) > 1.8).all(), errors
 
 
+def test_the_elastica_of_parts_agrees_with_that_of_the_whole() -> None:
+    """The truth of the test below: a tapered cane cut in three where it does not matter."""
+    beam = beams.of_load(2.0, 0.3, taper=0.5, angle=0.3)
+    thin = [1.0 - 0.5 * s for s in (0.0, 0.3, 0.6, 1.0)]
+    parts = [
+        dataclasses.replace(beam, length=length, radius=beam.radius * a, taper=b / a)
+        for length, a, b in zip((0.3, 0.3, 0.4), thin, thin[1:], strict=False)
+    ]
+    assert beams.elastica_of_parts(parts) == pytest.approx(beams.elastica(beam), abs=1e-6)
+
+
+@pytest.mark.parametrize("case", beams.JOINED)
+def test_error_falls_with_the_square_of_the_pieces_where_woods_join(case: str) -> None:
+    errors = beams.errors_over_pieces_of_joined()[case]
+    assert (np.log2(errors[:-1] / errors[1:]) > 1.8).all(), errors
+
+
 def test_error_falls_with_the_square_of_the_step() -> None:
     """phi 1/2: order 1.8 and more, in frequency by the factor that theory gives the trapezoidal rule."""
     errors = beams.errors_over_dt()
@@ -119,6 +137,24 @@ def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
     near, far = (5e9, 1e9) if stiff_first else (1e9, 5e9)
     truth = load / (3 * second_moment) * ((1.0 - half**3) / near + half**3 / far)
     assert tips[1][1] - tips[0][1] == pytest.approx(truth, rel=0.01)
+
+
+@pytest.mark.parametrize("pieces", [2, 8])
+def test_a_cane_of_two_thicknesses_twists_as_two(pieces: int) -> None:
+    """A small weight beside the tip: W a (l / GJ + l' / G'J'), exactly, since the moment is the same all along."""
+    tree = Tree(frames.pose(np.array([0.0, 0.0, beams.HEIGHT])))
+    thick = tree.rod(-1, 0.4, (0.005, 0.005), Wood(5e9, 8.0, 0.3), pieces)
+    thin = tree.rod(thick[-1], 0.6, (0.003, 0.003), Wood(2e9, 8.0, 0.3, shear=1e9), pieces)
+    mass, beside, half = 0.002, 0.05, tree.bodies[thin[-1]]["far"]
+    tree.add(
+        thin[-1], offset=(0.6 / pieces, 0, 0), mass=mass, com=(0, beside, 0), inertia=[mass * 1e-4] * 3, length=1e-3,
+        stiffness=half, damping=0.3 * half,
+    )  # fmt: skip
+    plants = beams.settle([tree])
+    side = frames.rotate(plants.state.body_q[-1, 3:].astype(float), np.array([0.0, 1.0, 0.0]))
+    polar = np.pi / 2 * np.array([0.005, 0.003]) ** 4
+    truth = mass * beams.G * beside * (0.4 / (5e9 / 2.6 * polar[0]) + 0.6 / (1e9 * polar[1]))
+    assert -np.arcsin(side[2]) == pytest.approx(truth, rel=0.003)
 
 
 @pytest.mark.parametrize("beta", [(0.006, 0.0), (0.0, 0.006), (0.003, 0.009)])

@@ -132,28 +132,39 @@ def drift(tree: Tree, kick: np.ndarray, *, phi: float = 0.5, seconds: float = 60
     return np.array(seen), float(fastest)
 
 
-def drawn_cane(modulus: float = 5e9) -> Tree:
+def drawn_cane(modulus: float = 5e9, shear: float | None = None) -> Tree:
     """Level and straight when at rest, tapered, undamped."""
     tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.003), Wood(modulus, 800.0), 16)
+    tree.rod(-1, 1.0, (0.004, 0.003), Wood(modulus, 800.0, shear=shear), 16)
     tree.settle()
     return tree
 
 
-@pytest.mark.parametrize(
-    ("kick", "loss"), [((0.0, 0.05, 0.0), 0.01), ((0.0, 0.04, 0.03), 0.01), ((0.0, 0.0, 0.05), 0.03)]
-)
-def test_energy_keeps_for_a_minute(kick: tuple[float, float, float], loss: float) -> None:
-    """phi 1/2, every body below 1 rad/s, up and down, slantwise, and aside: 1 %.
+@pytest.mark.parametrize("kick", [(0.0, 0.05, 0.0), (0.0, 0.04, 0.03), (0.0, 0.0, 0.05)])
+@pytest.mark.parametrize("shear", [None, 2.5e9, 1e9])
+def test_energy_keeps_for_a_minute(kick: tuple[float, float, float], shear: float | None) -> None:
+    """phi 1/2, every body below 1 rad/s, up and down, slantwise, and aside; soft in twist, or stiff: 1 %.
 
-    Aside, the sagging weight twists the cane as it swings, and 2.2 % are lost in that minute; never is any gained.
+    Aside, the sagging weight twists the cane as it swings: without that coupling in the scheme 2 % are lost.
     """
-    seen, fastest = drift(drawn_cane(), np.array(kick))
+    seen, fastest = drift(drawn_cane(shear=shear), np.array(kick))
     assert fastest < 1.0
     assert seen[0] > 1e-4
     share = seen[-100:].mean() / seen[:100].mean()
-    assert 1.0 - loss < share < 1.01
+    assert 0.99 < share < 1.01
     assert seen.max() < 1.01 * seen[0]
+
+
+@pytest.mark.parametrize("tip", [0.1, 0.2, 0.3])
+def test_energy_of_a_loaded_cane_keeps(tip: float) -> None:
+    """phi 1/2, swinging aside with up to 85 % of the load that would buckle it: 5 % in 20 s, and nothing is gained."""
+    tree = Tree(frames.pose(np.zeros(3)))
+    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0), 16)
+    tree.bodies[-1]["mass"] += tip
+    tree.settle()
+    seen, _ = drift(tree, np.array([0.0, 0.0, 0.02]), seconds=20.0)
+    assert seen[-100:].mean() > 0.95 * seen[0]
+    assert seen.max() < 1.001 * seen[0]
 
 
 @pytest.mark.parametrize("size", [0.02, 0.1, 0.3])

@@ -530,12 +530,15 @@ def _rod(
     b: _Bodies, slots: slice, points: np.ndarray, radius: np.ndarray, modulus: np.ndarray, density: float,
     damping: float, up: np.ndarray, parent: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill the slots of one axis: points [shoot, piece + 1, 3], radius [shoot, piece + 1], modulus [piece]."""
+    """Fill the slots of one axis: points [shoot, piece + 1, 3], radius [shoot, piece + 1], modulus [piece].
+
+    What it grows on is tens of times as stiff, and taken for a clamp.
+    """
     along = np.diff(points, axis=1)
     length = np.linalg.norm(along, axis=-1)
     start, end = radius[:, :-1], radius[:, 1:]
-    first = np.arange(length.shape[1]) == 0
-    mass, inertia, stiffness = grow.section(length, start, end, modulus, density, first)
+    mass, inertia, stiffness, far = grow.section(length, start, end, modulus, density)
+    stiffness[:, 1:] = 1.0 / (1.0 / stiffness[:, 1:] + 1.0 / far[:, :-1])
     b.parent[:, slots] = parent
     b.origin[:, slots] = points[:, :-1]
     b.turn[:, slots] = frames.aligned(along, up[:, None])

@@ -1,7 +1,8 @@
 """Beams to bodies: how a piece of wood becomes mass, inertia and joint springs, and pieces become a :class:`Model`.
 
-A rod of length L cut into n bodies of length h = L/n has a spring EI/h in every joint but the first, which is
-2EI/h: half an element lies between the clamp and the first body's middle (with EI/h the tip is 12.8 % off).
+A piece of length h bends by half on either side of its middle, each half a spring 2EI/h. A joint is the two halves that
+meet there, one after the other: EI/h in a rod, 2EI/h at a clamp, which has no half (with EI/h the tip is 12.8 % off),
+and where unlike pieces meet what lies between.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def bunch_pieces(
     edges = np.stack([number, number + 1], -1) * h[:, None, None]
     hull = radius[:, None, None] * np.sqrt(np.maximum(1.0 - (edges / half[..., None] - 1.0) ** 2, 0.0))
     thick = 0.5 * rachis.diameter.at(number / count[:, None])
-    _, _, stiffness = section(h[:, None], thick, thick, rachis.modulus.value, 1.0, False)
+    stiffness = 0.5 * section(h[:, None], thick, thick, rachis.modulus.value, 1.0)[2]
     return Pieces(
         count, h, np.where(here, fruit + stem, 0.0), both, np.where(here[..., None], inertia, 0.0),
         np.where(here[..., None], hull, 0.0), np.where(here[..., None], stiffness, 0.0),
@@ -142,13 +143,13 @@ class Tree:
         offset: Any = None,
         rest: Any = frames.IDENTITY,
         bends: np.ndarray | None = None,
-        clamped: bool | None = None,
     ) -> list[int]:
         """Grow a (tapered) rod of ``pieces`` bodies and return their numbers.
 
         ``rest`` turns the first piece against the parent, ``bends`` [pieces, 4] each piece against the one before.
-        ``offset`` is the joint in the parent's frame, the parent's tip unless given. ``clamped`` (the default on a
-        root and on a fork, where the neighbour is stiff) doubles the first spring.
+        ``offset`` is the joint in the parent's frame, the parent's tip unless given. The first joint is half a piece
+        of this rod and what of the parent, if that is a piece of a rod, lies between its middle and the joint; damping
+        is each wood's in its share.
         """
         if length <= 0.0 or min(radius) <= 0.0 or pieces < 1 or wood.modulus <= 0.0 or wood.density <= 0.0:
             raise ValueError(
@@ -156,27 +157,32 @@ class Tree:
             )
         h = length / pieces
         edges = radius[0] + (radius[1] - radius[0]) * np.arange(pieces + 1) / pieces
-        first = (np.arange(pieces) == 0) & (clamped is None or clamped)
-        masses, inertias, stiffnesses = section(h, edges[:-1], edges[1:], wood.modulus, wood.density, first, wood.shear)
-        if not first[0]:  # the joint lies between like neighbours: the section of the piece's middle stands for both
-            middle = 0.5 * (edges[0] + edges[1])
-            stiffnesses[0] = section(h, middle, middle, wood.modulus, wood.density, False, wood.shear)[2]
+        masses, inertias, near, far = section(h, edges[:-1], edges[1:], wood.modulus, wood.density, wood.shear)
+        above = self.bodies[parent] if parent >= 0 else {}
+        if offset is None:
+            offset = (above.get("length", 0.0), 0.0, 0.0)
+        slack, damped = 1.0 / near, wood.damping / near  # [rad/N m] of the lower halves, and with the wood's damping
+        slack[1:] += 1.0 / far[:-1]
+        damped[1:] += wood.damping / far[:-1]
+        if "far" in above:
+            reach = np.clip(2.0 * offset[0] / above["length"] - 1.0, 0.0, 1.0)
+            share = reach * (1.0 / above["far"]) @ frames.matrix(np.asarray(rest, float)) ** 2
+            slack[0] += share
+            damped[0] += above["beta"] * share
+        stiffnesses = 1.0 / slack
+        dampings = stiffnesses**2 * damped
         numbers = []
         for i in range(pieces):
             turn = frames.IDENTITY if bends is None else bends[i]
             if i == 0:
-                at = (
-                    offset
-                    if offset is not None
-                    else ((0, 0, 0) if parent < 0 else (self.bodies[parent]["length"], 0, 0))
-                )
+                at = offset
                 turn = frames.multiply(rest, turn)
             else:
                 at = (h, 0.0, 0.0)
             parent = self.add(
                 parent, offset=at, rest=turn, organ=int(organ), mass=masses[i], com=(h / 2, 0, 0), length=h,
                 radius=(edges[i], edges[i + 1]), inertia=inertias[i], stiffness=stiffnesses[i],
-                damping=wood.damping * stiffnesses[i],
+                damping=dampings[i], far=far[i], beta=wood.damping,
             )  # fmt: skip
             numbers.append(parent)
         return numbers
@@ -253,22 +259,25 @@ def section(
     end: np.ndarray | float,
     modulus: np.ndarray | float,
     density: float,
-    clamped: np.ndarray | bool,
     shear: float | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass [...], moments of inertia [..., 3] and joint stiffness [..., 3] of rod pieces with radii start and end [m].
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Mass [...] and moments of inertia [..., 3] of rod pieces with radii start and end [m], and the springs [..., 3]
+    N m/rad of their halves near the start and far from it: twist, and bending by two axes.
 
-    The joint sits at the start and bends with the section there; ``clamped`` doubles it (half an element to a wall).
+    Each half is taken to have the section at its end of the piece, where joints sit.
     """
     length, start, end, modulus = np.broadcast_arrays(length, start, end, modulus)
     middle = 0.5 * (start + end)
     mass = density * np.pi * length * (start * start + start * end + end * end) / 3.0
     across = mass * (length * length / 12.0 + middle * middle / 4.0)
     inertia = np.stack([0.5 * mass * middle * middle, across, across], -1)
-    area_moment = np.pi * start**4 / 4.0 * np.where(clamped, 2.0, 1.0) / length
-    bend = modulus * area_moment
-    twist = (modulus / 2.6 if shear is None else shear) * 2.0 * area_moment
-    return mass, inertia, np.stack([twist, bend, bend], -1)
+    halves = []
+    for radius in (start, end):
+        area_moment = np.pi * radius**4 / 2.0 / length
+        bend = modulus * area_moment
+        twist = (modulus / 2.6 if shear is None else shear) * 2.0 * area_moment
+        halves.append(np.stack([twist, bend, bend], -1))
+    return mass, inertia, halves[0], halves[1]
 
 
 def settle(model: Model) -> Model:
