@@ -43,10 +43,14 @@ def squares(track: Track) -> tuple[float, np.ndarray, np.ndarray]:
     return loss, weight_q * q, weight_qd * qd
 
 
-def slope(loss: Callable[[float], float], step: float = 0.03) -> float:
-    """d loss(1 + e) / de at 0 by central differences at two steps, extrapolated (Richardson)."""
-    wide, narrow = ((loss(1.0 + e) - loss(1.0 - e)) / (2.0 * e) for e in (2.0 * step, step))
-    return (4.0 * narrow - wide) / 3.0
+def slope(loss: Callable[[float], float], reach: float = 0.06) -> float:
+    """d loss(1 + e) / de at 0: the odd part of the loss over eight steps up to ``reach``, fitted by e and its cube.
+
+    One central difference would tell the rounding of single precision, not a mass's slope to a thousandth.
+    """
+    e = np.linspace(reach / 3.0, reach, 8)
+    odd = np.array([0.5 * (loss(1.0 + x) - loss(1.0 - x)) for x in e])
+    return float(np.linalg.lstsq(np.stack([e, e**3], 1), odd, rcond=None)[0][0])
 
 
 @pytest.mark.parametrize(("ticks", "checkpoint"), [(50, 50), (200, 50), (200, 33)])
@@ -72,6 +76,9 @@ def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
 
         found = float((getattr(gradient, name) * value)[bodies].sum())
         assert found == pytest.approx(slope(loss), rel=1e-3), (name, bodies)
+    # what is as many times as stiff, damped and heavy moves the same
+    shares = [(getattr(gradient, name) * value).sum() for name, value, _ in cases[:6:2]]
+    assert sum(shares) == pytest.approx(0.0, abs=1e-4 * max(map(abs, shares)))
 
 
 def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
@@ -91,14 +98,14 @@ def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
     assert (track.phi == 1.0).all()
     gradient = rollout.gradient(*squares(track)[1:])
     assert float((gradient.load * load).sum()) == pytest.approx(
-        slope(lambda s: squares(run(load=s * load))[0], 0.1), rel=1e-3
+        slope(lambda s: squares(run(load=s * load))[0], 0.2), rel=1e-3
     )
     assert float((gradient.turn * turn).sum()) == pytest.approx(
-        slope(lambda s: squares(run(angle=s - 1.0))[0], 0.1), rel=1e-3
+        slope(lambda s: squares(run(angle=s - 1.0))[0], 0.2), rel=1e-3
     )
     stiffness = model.joint_stiffness
     assert float((gradient.stiffness * stiffness).sum()) == pytest.approx(
-        slope(lambda s: squares(run(stiffness=s * stiffness))[0]), rel=2e-3
+        slope(lambda s: squares(run(stiffness=s * stiffness))[0]), rel=1e-3
     )
 
 
