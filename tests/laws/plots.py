@@ -17,8 +17,9 @@ import numpy as np
 import test_contact
 import test_rod_in_space
 import warp as wp
-from touch_scenes import Whole, bunch_scene, grasp, gripper
+from touch_scenes import bunch_scene, grasp, gripper
 
+from vinesim.physics.oracle import Whole
 from vinesim.physics.step import Physics
 
 matplotlib.use("Agg")
@@ -145,7 +146,7 @@ def damping() -> Table:
 def grasped() -> Table:
     """A bunch grasped, lifted, moved, pulled, let go: ours and the same scene wholly in MuJoCo."""
     model, body, middle = bunch_scene()
-    ours, oracle = Physics(model), Whole(model, gripper(middle))
+    ours, oracle = Physics(model), Whole(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     place, force = np.zeros((2, 800, 3)), np.zeros((2, 800))
     for tick in range(800):
