@@ -451,7 +451,8 @@ def _bodies(scene: Scene, parts: vine.Vine, s: _Shoots) -> _Bodies:
         present=np.ones(shape, bool), parent=np.zeros(shape, int), organ=np.full(shape, int(Organ.CANE)),
         origin=np.zeros((*shape, 3)), turn=np.zeros((*shape, 4)), length=np.zeros(shape), radius=np.zeros((*shape, 2)),
         mass=np.zeros(shape), com=np.zeros((*shape, 3)), inertia=np.zeros((*shape, 3)),
-        stiffness=np.zeros((*shape, 3)), half=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)), drag=np.zeros(shape),
+        stiffness=np.zeros((*shape, 3)), half=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)),
+        drag=np.zeros(shape),
         head={"mass": np.zeros((count, BUNCHES)), "com": np.zeros((count, BUNCHES, 3)),
               "inertia": np.zeros((count, BUNCHES, 3))},
     )  # fmt: skip
