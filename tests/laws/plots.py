@@ -102,7 +102,7 @@ def convergence() -> Table:
     pieces.set(xlabel="bodies of a cane", ylabel="tip off [mm]", xticks=n, xticklabels=beams.PIECES)
     pieces.minorticks_off()
     pieces.set_title("resting tip against the elastica: order")
-    pieces.legend(fontsize=7)
+    pieces.legend(fontsize=7, loc="lower left")
 
     over_dt, dt = beams.errors_over_dt(), 1e3 * np.array(beams.STEPS)
     slope = beams.order(beams.STEPS, over_dt["frequency"])

@@ -247,3 +247,26 @@ def test_limp_threads_calm_down(beta: float) -> None:
     assert rates.max() < plants.bound
     assert np.median(rates[-200:], axis=0).max() < 6.0
     assert seen[-500:].mean() < 0.35 * seen[:100].mean()
+
+
+def test_a_thrown_tree_keeps_phi_1_until_it_has_been_calm_for_a_second() -> None:
+    """Not so a quiet one, nor one that is touched while it swings below ``brisk``."""
+    trees = [beams.Beam(beta=0.004).tree(i) for i in range(3)]
+    for tree in trees:
+        tree.settle()
+    plants = beams.standing(trees)
+    thrown, quiet, touched = (plants.model.bodies_of(i) for i in range(3))
+    plants.state.joint_qd[thrown, 2] = 8.0
+    plants.state.joint_qd[quiet, 2] = plants.state.joint_qd[touched, 2] = 0.2
+    phi, rate = np.zeros((400, 3), np.float32), np.zeros((400, 3))
+    for tick in range(400):
+        plants.free()
+        push = np.array([[0.0, 0.1, 0.0, 0.0, 0.0, 0.0]]) * (50 <= tick < 60)
+        plants.commit(np.array([touched.start + 12]), push) if push.any() else plants.commit()
+        phi[tick], rate[tick] = plants.phi_used, plants.tree_rate
+    wild = np.flatnonzero(rate[:, 0] > 0.06 * plants.limit)
+    assert (phi[: wild[-1] + 101, 0] == 1.0).all()
+    assert (phi[wild[-1] + 102 :, 0] == np.float32(0.55)).all()
+    assert wild[-1] < 250
+    assert (phi[:, 1] == np.float32(0.55)).all()
+    assert (phi[:, 2] == 1.0).sum() == 3
