@@ -23,8 +23,13 @@ def _contact() -> Iterator[Measurement]:
 
 def _tick() -> Iterator[Measurement]:
     from vinesim.physics.bench_contact import tick
+    from vinesim.robot.description import load
 
-    return tick()
+    robot = load("vinebot")
+    raised = robot.home.copy()
+    for joint, position in RAISED.items():
+        raised[robot.joints.index(joint)] = position
+    return tick(robot.spec("robot"), raised)
 
 
 def _asleep() -> Iterator[Measurement]:
@@ -39,6 +44,12 @@ def _camera() -> Iterator[Measurement]:
 
     return camera()
 
+
+RAISED = {
+    "torso_lift_joint": 0.45,
+    **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
+}
+"""Where vinebot's hands are among the vines [m, rad]."""
 
 BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "plants": _plants,

@@ -1,21 +1,38 @@
-"""Touched plants beside MuJoCo C: the same canes, hands and bar, contacts on for both, in one process, taking turns."""
+"""Touched plants beside MuJoCo C: the same canes, hands and bar, contacts on for both, in one process, taking turns.
+
+And the whole tick of a vineyard, one robot or ten, twenty trees awake, ten thousand bunches: whose time it takes.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import os
+import time
 from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 
+from vinesim import frames
 from vinesim.physics import bench_scenes as scenes
 from vinesim.physics.oracle import Whole
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.step import Physics
+from vinesim.world.generate import generate
+from vinesim.world.model import Model
+from vinesim.world.scene import load
 from vinesim.world.values import Measurement, RobotSpec
 
 CANES = (64, 256)
 LIFTED = 12
 HELD = (14, 20, 26, 32)
+SCENE = "tendone"
+ROBOTS = (1, 10)
+PLACE = (15.5, 17.2)
+"""Of the robot in the block: its arms reach into the row behind it [m]."""
+AWAKE = 20
+TICKS, WARM = 1000, 100
 
 
 def contact() -> Iterator[Measurement]:
@@ -26,9 +43,78 @@ def contact() -> Iterator[Measurement]:
         yield from _beside(case, "contact", scenes.row(canes), robots, ticks)
 
 
-def tick() -> Iterator[Measurement]:
-    """One robot and the vine it holds: the whole tick."""
-    yield from _beside("1 robot, 1 held vine", "tick", scenes.row(1), [scenes.hand("hand", scenes.bunch_at(0))], 100)
+def tick(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
+    """One hand and the vine it holds, beside the peer; then the shipped block with one ``robot`` and with ten.
+
+    The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
+    on the headland. All swing their joints.
+    """
+    yield from _beside("1 hand, 1 held vine", "tick", scenes.row(1), [scenes.hand("hand", scenes.bunch_at(0))], 100)
+    model = generate(load(SCENE))
+    with _one_core():
+        for count in ROBOTS:
+            yield from _block(model, robot, raised, count)
+
+
+def _block(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> Iterator[Measurement]:
+    """Tick by tick, and stage by stage, each with its own clock."""
+    physics = Physics(model)
+    for i in range(count):
+        pose = frames.pose([*PLACE, 0.0], frames.yaw(0.5 * np.pi)) if i == 0 else frames.pose([4.0 * i, -6.0, 0.0])
+        home = robot.home if i else raised
+        physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
+        physics.rigid.drive_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))
+    _swing(physics, robot, raised, 0)
+    physics.step()
+    reached = physics.touching.near
+    away = np.linalg.norm(model.tree_pose[:, :2] - PLACE, axis=1)
+    away[reached] = -1.0
+    scenes.sleepless(physics, np.sort(np.argsort(away, kind="stable")[:AWAKE]))
+    seconds, contacts = np.zeros((TICKS, len(physics.stages) + 1)), 0
+    for i in range(-WARM, TICKS):
+        _swing(physics, robot, raised, i + WARM)
+        marks = [time.perf_counter()]
+        for _, stage in physics.stages:
+            stage()
+            marks.append(time.perf_counter())
+        physics.tick += 1
+        if i >= 0:
+            seconds[i, :-1], seconds[i, -1] = np.diff(marks), marks[-1] - marks[0]
+            contacts += len(physics.contacts)
+    milliseconds = 1e3 * seconds
+    whose = np.array([_whose(name) for name, _ in physics.stages])
+    awake, bunches = len(physics.plants.awake), len(model.bunch_body)
+    case = f"{count} robot{'s' * (count > 1)}, {awake} trees awake, {bunches} bunches, {contacts / TICKS:.0f} contacts"
+    for share, text in (("", "tick"), ("MuJoCo", "MuJoCo's share"), ("ours", "ours"), ("rest", "the rest")):
+        of = milliseconds[:, :-1][:, whose == share].sum(1) if share else milliseconds[:, -1]
+        for name, percent in (("p50", 50), ("p99", 99)):
+            yield Measurement("tick", f"{case}: {text}, {name}", float(np.percentile(of, percent)), "ms/tick")
+
+
+def _whose(stage: str) -> str:
+    """Rigid stages call MuJoCo and do little else; plants and touching are ours; the rest hands over and watches."""
+    room = stage.split(":")[0]
+    return {"rigid": "MuJoCo", "plants": "ours", "touching": "ours"}.get(room, "rest")
+
+
+def _swing(physics: Physics, robot: RobotSpec, raised: np.ndarray, tick: int) -> None:
+    for i, name in enumerate(physics.rigid.robots):
+        wave = 0.05 * np.sin(0.05 * tick + i)
+        physics.rigid.command(name, (robot.home if i else raised) + wave)
+
+
+@contextlib.contextmanager
+def _one_core() -> Iterator[None]:
+    """Keep this process on one core, where the system lets it."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
 def _beside(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -> Iterator[Measurement]:

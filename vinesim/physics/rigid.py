@@ -45,12 +45,19 @@ ROLLING = 0.004
 """[m] Arm of the rolling resistance of a bunch: GUESSED, half the distance between two berries that it lies on is 10 mm
 and gives way. Without it a bunch of round shapes rolls on for ever.
 """
+SOFT = (0.02, 3.0)
+"""Time constant [s] and damping ratio of a loose bunch's contacts. With MuJoCo's own ratio of 1 one that falls from a
+metre, centimetres deep in the crate after one tick, leaves it at up to 110 m/s; a longer time never comes to rest.
+"""
 PARKED = -100.0
 """[m] Where waiting bodies sleep: under the ground, where nothing is."""
 
 # collision bits: what stands, what lies about, and one bit for each robot, so that a robot never meets itself
 _GROUND, _FIXED, _BOX, _FIRST_ROBOT, _LAST_BIT = 1 << 0, 1 << 1, 1 << 2, 3, 30
 _ALL = (1 << (_LAST_BIT + 1)) - 1
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+_INIT, _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_INIT), int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
@@ -62,6 +69,8 @@ class _Robot:
     """One robot: what it was asked for, and where its numbers lie in MuJoCo's arrays."""
 
     spec: RobotSpec
+    parsed: mujoco.MjSpec
+    """As MuJoCo read its URDF; every compilation takes a copy."""
     bit: int
     shapes: dict[str, tuple[Shape, ...]]
     stiffness: np.ndarray
@@ -154,6 +163,7 @@ class Rigid:
         self._bunches: dict[int, Loose] = {}
         self._waiting = 0
         self._slot: dict[int, int] = {}
+        self._scene = _scene(model, dt)
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
         self.faults = 0
@@ -185,8 +195,13 @@ class Rigid:
             raise RobotError(f"robot {spec.name!r} is one too many: {len(used)} robots share this world, remove one")
         check(spec)
         pose = np.asarray(spec.pose, float)
+        try:
+            parsed = _parsed(spec, 1 << free[0])
+        except ValueError as error:
+            raise RobotError(f"robot {spec.name!r}: MuJoCo cannot read its URDF: {error}") from error
         robot = _Robot(
             spec=spec,
+            parsed=parsed,
             bit=free[0],
             shapes=shapes_of(spec.urdf),
             stiffness=np.array([d.stiffness for d in spec.drives], float),
@@ -386,6 +401,15 @@ class Rigid:
         return velocity
 
     @property
+    def dof_names(self) -> list[tuple[str, int]]:
+        """[dof] joint (or loose bunch) and number in it: they outlive a compilation, their places do not."""
+        m = self.world
+        bunch_in = {f"loose/{slot}": f"bunch/{bunch}" for bunch, slot in self._slot.items()}
+        names = [m.joint(i).name for i in range(m.njnt)]
+        of = [bunch_in.get(name, name) for name in names]
+        return [(of[i], int(v - m.jnt_dofadr[i])) for v, i in enumerate(m.dof_jntid.tolist())]
+
+    @property
     def group(self) -> np.ndarray:
         """[MuJoCo kinematic tree] a label that two share if a force on one may move the other in this tick."""
         m, d = self.world, self.data
@@ -519,40 +543,41 @@ class Rigid:
 
     def _compile(self) -> None:
         """Build the world anew and carry every joint's and body's state over by its name."""
-        spec = _scene(self.model, self.dt)
+        spec = self._scene.copy()
         for robot in self._robots.values():
             _attach(spec, robot)
         self._waiting = max(self._slot.values(), default=-1) + 1 + WAITING
         for slot in range(self._waiting):
             _wait(spec, slot)
-        world = spec.compile()
-        data = mujoco.MjData(world)
-        contact = np.zeros(world.nv)
-        if self.generation:
-            data.time = self.data.time
-            _carry(self.world, self.data, self._contact, world, data, contact)
-        self.world, self.data, self._contact = world, data, contact
-        self._blocks: dict[bytes, _Block] = {}
-        self._each = np.arange(self.world.ntree, dtype=np.int32)
-        self._sound = data.qpos.copy()
-        self._fresh = False
+        before = (self.world, self.data, self._contact) if self.generation else None
+        self.world = world = _built(spec)
+        # the solver's tolerance is relative to it: whoever joins would change when it stops for everybody else
+        world.stat.meaninertia = 1.0
         for slot in range(self._waiting):
             self._untouch(slot)
         for bunch, body in self._bunches.items():
             self._embody(bunch, _alone(body))
-            self._rouse(self._slot[bunch])
+        if before is None:
+            self.data, self._contact = mujoco.MjData(world), np.zeros(world.nv)
+        else:
+            parked = {f"loose/{slot}" for slot in range(self._waiting)}
+            parked -= {f"loose/{slot}" for slot in self._slot.values()}
+            self.data, self._contact = _carried(*before, world, parked)
+        self._blocks: dict[bytes, _Block] = {}
+        self._each = np.arange(world.ntree, dtype=np.int32)
+        self._sound = self.data.qpos.copy()
+        self._fresh = False
         for robot in self._robots.values():
             self._locate(robot)
+        if before is None:
+            self.standing = self._list_standing()
         self._list()
 
     def _list(self) -> None:
         """List anew what is here; whoever keeps views of it takes notice of the new ``generation``."""
         self.generation += 1
-        # without it a bunch creeps through the fingers
-        self.world.opt.noslip_iterations = 3 if self._bunches else 0
         self._links, self._link_body = self._list_links()
         self.geoms = self._list_geoms()
-        self.standing = self._list_standing()
 
     def _embody(self, bunch: int, alone: mujoco.MjModel) -> None:
         """Give the waiting body of a bunch its weight and shapes, with all constants that MuJoCo derives from them.
@@ -625,7 +650,7 @@ class Rigid:
         return self._geoms(ids, [owner[int(b)] for b in m.geom_bodyid[ids]])
 
     def _list_standing(self) -> Geoms:
-        """Ground, poles and trunks."""
+        """Ground, poles and trunks: MuJoCo's first geoms, whoever comes and goes."""
         m = self.world
         ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] == 0 and m.geom_contype[g]], int)
         return self._geoms(ids, [("world", m.geom(g).name) for g in ids.tolist()])
@@ -714,7 +739,8 @@ def _scene(model: Model, dt: float) -> mujoco.MjSpec:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    spec.option.impratio = 10.0
+    # less, and a bunch creeps through the fingers; MuJoCo's noslip stage would hold it too, but piles never rest then
+    spec.option.impratio = 1000.0
     # one bad number must not reset the whole world: finish() stops what it belongs to
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     # boxes and bunches that lie still cost nothing; robots, being driven, never sleep
@@ -724,11 +750,12 @@ def _scene(model: Model, dt: float) -> mujoco.MjSpec:
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=_GROUND, conaffinity=_BOX,
         friction=friction,
     )  # fmt: skip
+    thickness = model.fixed_radius.mean(1)
     for piece in np.flatnonzero(np.isin(model.fixed_organ, [Organ.POLE, Organ.TRUNK])):
         spec.worldbody.add_geom(
             name=f"fixed/{piece}", type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             fromto=np.concatenate([model.fixed_start[piece], model.fixed_end[piece]]).astype(float),
-            size=[float(model.fixed_radius[piece].mean()), 0, 0], contype=_FIXED, conaffinity=0, friction=friction,
+            size=[float(thickness[piece]), 0, 0], contype=_FIXED, conaffinity=0, friction=friction,
         )  # fmt: skip
     for box, pose in enumerate(model.box_pose.astype(float)):
         body = spec.worldbody.add_body(name=f"box/{box}", pos=pose[:3], quat=frames.to_wxyz(frames.normalize(pose[3:])))
@@ -741,6 +768,14 @@ def _scene(model: Model, dt: float) -> mujoco.MjSpec:
                 mass=float(model.box_mass[box]) * share / sum(volume), contype=_BOX, conaffinity=_ALL,
             )  # fmt: skip
     return spec
+
+
+def _built(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile without contacts: MuJoCo tries a step, in which all robots would stand on one another at the origin."""
+    spec.option.disableflags |= _CONSTRAINT
+    world = spec.compile()
+    world.opt.disableflags &= ~_CONSTRAINT
+    return world
 
 
 def crate(size: np.ndarray) -> tuple[Shape, ...]:
@@ -757,11 +792,9 @@ def crate(size: np.ndarray) -> tuple[Shape, ...]:
     return tuple(Shape("box", half, frames.pose(np.array(at)), (0.75, 0.15, 0.12, 1.0)) for half, at in walls)
 
 
-def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
-    """Set a robot on a planar base and give it its servos."""
-    given, name = robot.spec, robot.spec.name
-    child = mujoco.MjSpec.from_string(touchable(given.urdf, {drive.joint for drive in given.drives}))
-    bit = 1 << robot.bit
+def _parsed(given: RobotSpec, bit: int) -> mujoco.MjSpec:
+    """A robot without base and servos, as its URDF says; its shapes carry the collision ``bit``."""
+    child = mujoco.MjSpec.from_string(touchable(given.urdf, frozenset(drive.joint for drive in given.drives)))
     for geom in child.geoms:
         geom.contype, geom.conaffinity = bit, _ALL & ~bit & ~_GROUND
         geom.friction = [FRICTION, 0.005, 0.0001]
@@ -775,12 +808,19 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
             joint.armature = driven[joint.name].rotor
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
+    return child
+
+
+def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
+    """Set a robot on a planar base and give it its servos."""
+    given, name = robot.spec, robot.spec.name
     base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, float(given.pose[2])])
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     axes = zip(_PLANAR, (slide, slide, hinge), np.eye(3), strict=True)
     for axis, kind, direction in axes:
         base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
-    spec.attach(child, prefix=f"{name}/", frame=base.add_frame())
+    spec.copy_during_attach = True
+    spec.attach(robot.parsed, prefix=f"{name}/", frame=base.add_frame())
     for drive, stiffness, damping in zip(given.drives, robot.stiffness, robot.damping, strict=True):
         _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
     stiffness, damping = robot.tracks
@@ -829,7 +869,8 @@ def _drop(spec: mujoco.MjSpec, loose: Loose) -> None:
             kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
         body.add_geom(
             type=kind, size=[float(radius), 0, 0], mass=0.0, contype=_BOX, conaffinity=_ALL, condim=6,
-            friction=[FRICTION, 0.005, ROLLING], priority=1, solimp=[0.99, 0.999, 0.001, 0.5, 2], **place,
+            friction=[FRICTION, 0.005, ROLLING], priority=1, solref=SOFT, solimp=[0.99, 0.999, 0.001, 0.5, 2],
+            **place,
         )  # fmt: skip
     for _ in range(LUMPS - len(loose.radius)):
         body.add_geom(
@@ -867,26 +908,70 @@ _OF_GEOM = (
     "geom_type", "geom_contype", "geom_conaffinity", "geom_condim", "geom_priority", "geom_size", "geom_pos",
     "geom_quat", "geom_aabb", "geom_rbound", "geom_sameframe", "geom_friction", "geom_solimp", "geom_solref",
 )  # fmt: skip
-_OF_DOFS = ("qvel", "qacc", "qacc_warmstart", "qfrc_applied", "qfrc_gravcomp", "qfrc_actuator")
+_OF_DOFS = (
+    "qvel", "qacc", "qacc_smooth", "qacc_warmstart", "qfrc_smooth", "qfrc_applied", "qfrc_gravcomp",
+    "qfrc_actuator",
+)  # fmt: skip
 
 
-def _carry(
-    old: mujoco.MjModel, old_data: mujoco.MjData, old_contact: np.ndarray,
-    new: mujoco.MjModel, new_data: mujoco.MjData, contact: np.ndarray,
-) -> None:  # fmt: skip
-    """Copy the state of every joint and body that is in both worlds, bit by bit."""
-    before = {old.joint(i).name: i for i in range(old.njnt)}
-    for i in range(new.njnt):
-        j = before.get(new.joint(i).name)
-        if j is None:
-            continue
-        q, v = (7, 6) if new.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE else (1, 1)
+def _carried(
+    old: mujoco.MjModel, old_data: mujoco.MjData, old_contact: np.ndarray, new: mujoco.MjModel, parked: set[str]
+) -> tuple[mujoco.MjData, np.ndarray]:
+    """State and contact efforts [dof] of a new world: all joints, bodies and sleepers of the old, bit by bit.
+
+    ``parked`` names joints that only seem to be the same ones.
+    """
+    joints = {old.joint(i).name: i for i in range(old.njnt)}
+    pairs = [(i, joints[name]) for i in range(new.njnt) if (name := new.joint(i).name) in joints and name not in parked]
+    asleep = _sleepers(old, old_data, new, pairs)
+    # Only making its data lets MuJoCo take things for asleep. They lie where they are and depend on nothing.
+    for i, j in pairs:
+        if new.jnt_type[i] == _FREE:
+            to, source, tree = new.jnt_qposadr[i], old.jnt_qposadr[j], int(new.dof_treeid[new.jnt_dofadr[i]])
+            new.qpos0[to : to + 7] = old_data.qpos[source : source + 7]
+            new.tree_sleep_policy[tree] = _INIT if tree in asleep else _ALLOWED
+    new.opt.disableflags |= _CONSTRAINT
+    data = mujoco.MjData(new)
+    new.opt.disableflags &= ~_CONSTRAINT
+    contact = np.zeros(new.nv)
+    data.time = old_data.time
+    for i, j in pairs:
+        q, v = (7, 6) if new.jnt_type[i] == _FREE else (1, 1)
         to_q, from_q, to_v, from_v = new.jnt_qposadr[i], old.jnt_qposadr[j], new.jnt_dofadr[i], old.jnt_dofadr[j]
-        new_data.qpos[to_q : to_q + q] = old_data.qpos[from_q : from_q + q]
+        data.qpos[to_q : to_q + q] = old_data.qpos[from_q : from_q + q]
         for name in _OF_DOFS:
-            getattr(new_data, name)[to_v : to_v + v] = getattr(old_data, name)[from_v : from_v + v]
+            getattr(data, name)[to_v : to_v + v] = getattr(old_data, name)[from_v : from_v + v]
         contact[to_v : to_v + v] = old_contact[from_v : from_v + v]
+        tree, was = new.dof_treeid[to_v], old.dof_treeid[from_v]
+        if tree in asleep:
+            data.tree_asleep[tree] = asleep[tree]
+        elif old_data.tree_asleep[was] < 0:
+            data.tree_asleep[tree] = old_data.tree_asleep[was]
     bodies = {old.body(i).name: i for i in range(1, old.nbody)}
     for i in range(1, new.nbody):
-        if (j := bodies.get(new.body(i).name)) is not None:
-            new_data.xfrc_applied[i] = old_data.xfrc_applied[j]
+        if (j := bodies.get(new.body(i).name)) is not None and new.body(i).name not in parked:
+            data.xfrc_applied[i] = old_data.xfrc_applied[j]
+            if new.body_mocapid[i] >= 0 and old.body_mocapid[j] >= 0:
+                data.mocap_pos[new.body_mocapid[i]] = old_data.mocap_pos[old.body_mocapid[j]]
+                data.mocap_quat[new.body_mocapid[i]] = old_data.mocap_quat[old.body_mocapid[j]]
+    return data, contact
+
+
+def _sleepers(
+    old: mujoco.MjModel, old_data: mujoco.MjData, new: mujoco.MjModel, pairs: list[tuple[int, int]]
+) -> dict[int, int]:
+    """Trees of the new world that sleep: each with the next of those that wake together.
+
+    Whoever slept leaning on something that is gone wakes, and so does whoever somebody has just roused.
+    """
+    now = {int(old.dof_treeid[old.jnt_dofadr[j]]): int(new.dof_treeid[new.jnt_dofadr[i]]) for i, j in pairs}
+    following = old_data.tree_asleep.tolist()
+    asleep = {}
+    for first in now:
+        tree = first
+        while following[tree] >= 0 and tree in now and not old_data.tree_awake[tree]:
+            tree = following[tree]
+            if tree == first:
+                asleep[now[first]] = now[following[first]]
+                break
+    return asleep

@@ -162,6 +162,8 @@ class Touching:
         self.told = np.zeros(len(model.tree_first), np.bool_)
         """[tree] whose state another client tells."""
         self._generation = 0
+        self._dof_names: list[tuple[str, int]] = []
+        self._dof_free = self._dof_held = self._dof_held_before = np.zeros(0)
         self._awake = np.zeros(0, np.int32)
         self._allocate()
         self._renew()
@@ -432,8 +434,15 @@ class Touching:
         self._geom_spin, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
         self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
         self._rigid_rows, self._rigid_answer = (np.zeros((3 * self.capacity, self.rigid.world.nv)) for _ in range(2))
+        at = {name: i for i, name in enumerate(self._dof_names)}
+        self._dof_names = self.rigid.dof_names
+        same = np.array([at.get(name, -1) for name in self._dof_names], int)
+        free, held, held_before = self._dof_free, self._dof_held, self._dof_held_before
         self._dof_free = self.rigid.velocity_free
-        self._dof_held, self._dof_held_before = np.zeros(self.rigid.world.nv), np.zeros(self.rigid.world.nv)
+        self._dof_held, self._dof_held_before = np.zeros(len(same)), np.zeros(len(same))
+        self._dof_free[same >= 0] = free[same[same >= 0]]
+        self._dof_held[same >= 0] = held[same[same >= 0]]
+        self._dof_held_before[same >= 0] = held_before[same[same >= 0]]
         self._group = np.zeros(self.rigid.world.ntree, np.int32)
         self._dof_parent = self.rigid.world.dof_parentid
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -40,7 +41,8 @@ def check(spec: RobotSpec) -> None:
             raise RobotError(f"robot {spec.name!r}: {drive} must have gains of 0 or more and an effort above 0")
 
 
-def touchable(urdf: str, driven: set[str]) -> str:
+@functools.lru_cache(16)  # robots of one kind share it
+def touchable(urdf: str, driven: frozenset[str]) -> str:
     """The URDF as physics needs it: no pictures; joints that nobody drives and that copy nobody are fixed."""
     root = ElementTree.fromstring(urdf)
     for link in root.iter("link"):
@@ -58,6 +60,7 @@ def touchable(urdf: str, driven: set[str]) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
+@functools.lru_cache(16)
 def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
     """What sensors see of each link of a URDF: its visual shapes, or its collision shapes if it has none."""
     root = ElementTree.fromstring(urdf)
