@@ -154,6 +154,8 @@ class Robot(Embodied):
         """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
         self._spring_damping = np.array([drive.elastic_damping if drive.elastic else drive.damping for drive in drives])
         self._order = {drive.joint: i for i, drive in enumerate(drives)}
+        self._grippers: dict[str, np.ndarray] = {}
+        """Fingers that close together: a hand that drifted with what it holds would be two hands."""
         self._cutters: dict[str, list[Blade]] = {}
         self._physics: Physics | None = None
         for mount in (*description.wrenches, *description.imus):
@@ -182,6 +184,8 @@ class Robot(Embodied):
         self.interface = np.full(len(self.setpoint), Interface.POSITION)
         """[joint] :class:`Interface` by which each was commanded last"""
         self._goal = self.setpoint.copy()
+        self._velocity = np.zeros(len(self.setpoint))
+        self._braked = np.zeros(len(self.setpoint), bool)
         self._retuned = True
         self._base_goal = np.zeros(2)
         self._base_velocity = np.zeros(2)
@@ -246,6 +250,7 @@ class Robot(Embodied):
         if effort is not None and not effort > 0.0:
             raise CommandError(f"{self.name}: gripper effort {effort}; give more than 0, or none for all there is")
         self.command_position(np.full(len(fingers), opening / len(fingers)), fingers)
+        self._grippers[group] = fingers
         self._limit[fingers] = self.effort[fingers] if effort is None else np.minimum(effort, self.effort[fingers])
         self._retuned = True
 
@@ -301,6 +306,15 @@ class Robot(Embodied):
         return self.description.indices(group)
 
     def _switch(self, joints: np.ndarray, interface: Interface) -> None:
+        before = self.interface[joints] == Interface.ELASTIC
+        if before.any() or interface == Interface.ELASTIC:  # from motors to links, or back
+            position, _, effort, _ = self.rigid.read(self.name)
+            motor = position + effort / self.spring
+            self.setpoint[joints] = np.where(
+                before == (interface == Interface.ELASTIC),
+                self.setpoint[joints],
+                np.where(before, position[joints], motor[joints]),
+            )
         self.interface[joints] = interface
         self._retuned = True
 
@@ -328,19 +342,29 @@ class Robot(Embodied):
         # A servo that already gives all it has gives no more when asked for more, but would overshoot when let go.
         stiffness = np.where(by_motor, self.spring, self._stiffness)
         lead = self._limit / np.maximum(stiffness, 1e-9) + self.speed * dt
-        start = np.where(by_effort, position, np.clip(self.setpoint, position - lead, position + lead))
+        middle = position
+        if self._grippers:
+            middle = position.copy()
+            for fingers in self._grippers.values():
+                middle[fingers] = position[fingers].mean()
+        start = np.where(by_effort, position, np.clip(self.setpoint, middle - lead, middle + lead))
         step = np.where(by_velocity, self._goal * dt, np.where(by_effort, 0.0, self._goal - start))
         target = np.clip(start + np.clip(step, -self.speed * dt, self.speed * dt), self.lower, self.upper)
         self.setpoint = target
         rate = np.where(by_effort, 0.0, (target - start) / dt)
         changing = by_effort.any() or by_motor.any()
         if changing or self._retuned:
-            # an effort that drives the joint too fast gives way to a brake: all of it up to 90 % of the largest speed
+            # An effort that would drive the joint too fast gives way to a brake: 90 % of the largest speed are free.
+            # Looking a tick ahead, and no stronger than it may be: at its limit a servo acts all through the tick.
             brake = 10.0 * self.effort / self.speed
-            fast = by_effort & (self._goal > brake * (self.speed - velocity))
-            back = by_effort & (self._goal < -brake * (self.speed + velocity))
-            rate = np.where(fast, self.speed, np.where(back, -self.speed, rate))
-            braked = fast | back
+            soon = 2.0 * velocity - self._velocity
+            still = self._braked & (np.abs(velocity) > 0.5 * self.speed)
+            fast = by_effort & (self._goal > brake * (self.speed - soon)) | still & (velocity > 0.0)
+            back = by_effort & (self._goal < -brake * (self.speed + soon)) | still & (velocity < 0.0)
+            braked = self._braked = (fast | back) & by_effort & (self._goal * velocity >= 0.0)
+            rate = np.where(braked, np.where(fast, self.speed, -self.speed), rate)
+            most = 0.8 * np.where(np.abs(velocity) < self.speed, np.abs(self._goal), self.effort)
+            brake = np.minimum(brake, most / np.maximum(np.abs(rate - velocity), 1e-9))
             damping = np.where(by_motor, self._spring_damping, self._damping)
             self.rigid.tune(
                 self.name,
@@ -351,6 +375,7 @@ class Robot(Embodied):
                 exact=by_motor | (self._compliant & ~by_effort),
             )
             self._retuned = False
+        self._velocity = velocity
         self.rigid.command(self.name, target, rate)
 
         limits = self.description.base_limits
