@@ -65,6 +65,7 @@ class Client:
             model, device=device, threads=threads, picking=False
         )  # the network does not carry it yet
         self.robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
+        self.robot.fit_cutters(self.physics)
         hello = Hello(
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=scene.name,
             digest=model.digest(), index=label_index(name), joints=len(description.joints),
