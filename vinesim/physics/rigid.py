@@ -406,12 +406,12 @@ class Rigid:
         return self._felt(name, link)[1]
 
     def angular_velocity(self, name: str, link: str) -> np.ndarray:
-        """[3] rad/s of a link, world axes."""
+        """[3] rad/s of a link, in its axes."""
         body = self._body(name, link)
         self._refresh()
         jacobian = np.zeros((3, self.world.nv))
         mujoco.mj_jacBody(self.world, self.data, None, jacobian, body)
-        return jacobian @ self.data.qvel
+        return jacobian @ self.data.qvel @ self.data.xmat[body].reshape(3, 3)
 
     def links(self) -> tuple[Link, ...]:
         """Every robot's and box's bodies that have a shape; the same object until an actor comes or goes."""
@@ -536,11 +536,12 @@ class Rigid:
         for robot in self._robots.values():
             for link, (wrench, acceleration) in robot.felt.items():
                 body = robot.bodies[link]
-                turn = d.xmat[body].reshape(3, 3)
-                moment, force = d.cfrc_int[body, :3], d.cfrc_int[body, 3:]
+                turn, inner = d.xmat[body].reshape(3, 3), d.cfrc_int[body]
                 # MuJoCo gives it about the centre of mass of the whole robot, and as what the parent does
-                moment = moment + frames.cross(d.subtree_com[m.body_rootid[body]] - d.xpos[body], force)
-                wrench[:3], wrench[3:] = -force @ turn, -moment @ turn
+                x, y, z = (d.subtree_com[m.body_rootid[body]] - d.xpos[body]).tolist()
+                u, v, w = inner[3:].tolist()
+                moment = inner[:3] + (y * w - z * v, z * u - x * w, x * v - y * u)
+                wrench[:3], wrench[3:] = -inner[3:] @ turn, -moment @ turn
                 mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, acceleration, 1)
 
     def _roll_back(self) -> None:

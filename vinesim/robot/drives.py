@@ -412,7 +412,7 @@ class Robot(Embodied):
 
     def _imu(self, mount: Mount, time: float) -> Imu:
         turn = self.frame_pose(mount.frame)[3:]
-        spin = frames.rotate(frames.conjugate(turn), self.rigid.angular_velocity(self.name, mount.frame))
+        spin = self.rigid.angular_velocity(self.name, mount.frame)
         acceleration = self.rigid.acceleration(self.name, mount.frame)[3:].copy()
         return Imu(time, mount.name, mount.frame, turn, spin, acceleration)
 
