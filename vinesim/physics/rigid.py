@@ -6,6 +6,9 @@ says how an impulse changes that prediction, and :meth:`Rigid.finish` integrates
 
 MuJoCo's integrator ``discrete`` is implicit in joint damping and in the servos: the metric of the tick is
 M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where its servos give 40 N.
+
+That damps a servo as if D were larger by dt K, which keeps stiff servos and what they hold quiet. A compliant joint
+must swing as it was told to instead: for these :func:`_split` takes the surplus back.
 """
 
 from __future__ import annotations
@@ -76,11 +79,16 @@ class _Robot:
     stiffness: np.ndarray
     damping: np.ndarray
     effort: np.ndarray
+    """[joint] limit of the servos, at most ``most``."""
+    most: np.ndarray
+    """[joint] limit of the drives: servo and weight together."""
     target: np.ndarray
     """[joint] position the drives pull to."""
     target_velocity: np.ndarray
     forward: np.ndarray
     """[joint] effort beside that of the springs [N m or N]."""
+    control: np.ndarray
+    """[joint] what MuJoCo was asked for in the last tick; less K q and D v it is what the servo gave."""
     base_target: np.ndarray
     """[3] x, y, yaw where the tracks hold; moves with ``base_velocity``."""
     base_velocity: np.ndarray
@@ -88,6 +96,12 @@ class _Robot:
     tracks: tuple[np.ndarray, np.ndarray]
     """Stiffness and damping [3] of the base's servos along x, y and about z."""
     give: float = GIVE
+    exact: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
+    """[joint] bool: the scheme must not add to its damping."""
+    late: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    """[joint] the part of the damping that acts on the velocity at the start of the tick."""
+    soon: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    """[joint] the part that MuJoCo applies to the velocity at its end, beside the spring at its end."""
     q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     v: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     actuator: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
@@ -95,6 +109,8 @@ class _Robot:
     base_v: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     base_actuator: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     bodies: dict[str, int] = dataclasses.field(default_factory=dict)
+    felt: dict[str, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    """Of each link that carries a sensor: wrench [6] and acceleration [6] of the last tick."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,12 +223,15 @@ class Rigid:
             stiffness=np.array([d.stiffness for d in spec.drives], float),
             damping=np.array([d.damping for d in spec.drives], float),
             effort=np.array([d.effort for d in spec.drives], float),
+            most=np.array([d.effort for d in spec.drives], float),
             target=np.array(spec.home, float),
             target_velocity=np.zeros(len(spec.drives)),
             forward=np.zeros(len(spec.drives)),
+            control=np.zeros(len(spec.drives)),
             base_target=np.array([pose[0], pose[1], _yaw(pose)]),
             base_velocity=np.zeros(3),
             tracks=_tracks(spec),
+            exact=np.zeros(len(spec.drives), bool),
         )
         self._robots[spec.name] = robot
         try:
@@ -235,6 +254,7 @@ class Rigid:
         robot.base_target[:] = self.data.qpos[robot.base_q] = pose[0], pose[1], _yaw(pose)
         self.data.qvel[robot.v] = self.data.qvel[robot.base_v] = 0.0
         robot.target_velocity[:] = robot.base_velocity[:] = 0.0
+        robot.control[:] = robot.stiffness * robot.target + robot.forward
         for joint, (source, coefficients) in self._mimics(robot).items():
             polynomial = np.polynomial.Polynomial(coefficients)
             self.data.joint(joint).qpos[0] = polynomial(self.data.joint(source).qpos[0])
@@ -288,15 +308,29 @@ class Rigid:
         robot.target[:] = position
         robot.target_velocity[:] = 0.0 if velocity is None else velocity
 
-    def tune(self, name: str, stiffness: np.ndarray, damping: np.ndarray, effort: np.ndarray) -> None:
+    def tune(
+        self,
+        name: str,
+        stiffness: np.ndarray,
+        damping: np.ndarray,
+        effort: np.ndarray,
+        *,
+        limit: np.ndarray | None = None,
+        exact: np.ndarray | None = None,
+    ) -> None:
         """Give the servos other gains, and an ``effort`` beside (all [joint]): zero gains make a joint effort-driven.
 
-        The effort is added within the drive's limit. Gains stay until they are given anew.
+        The effort is added within ``limit`` [joint], which is the drive's own unless a lower one is given. Joints that
+        are ``exact`` [joint] swing with just this damping; the others are damped as if it were larger by dt times
+        stiffness, as stiff servos should be. All stay until they are given anew.
         """
         robot = self._robot(name)
         robot.stiffness[:], robot.damping[:], robot.forward[:] = stiffness, damping, effort
-        self.world.actuator_biasprm[robot.actuator, 1] = -robot.stiffness
-        self.world.actuator_biasprm[robot.actuator, 2] = -robot.damping
+        if limit is not None:
+            robot.effort[:] = np.minimum(limit, robot.most)
+        if exact is not None:
+            robot.exact[:] = exact
+        self._set_gains(robot)
 
     def drive_base(self, name: str, velocity: tuple[float, float, float]) -> None:
         """Ask the tracks for (vx, vy, wz) [m/s, m/s, rad/s] in the base's axes; zero holds the place."""
@@ -336,11 +370,15 @@ class Rigid:
         """
         robot, d = self._robot(name), self.data
         position, velocity = d.qpos[robot.q], d.qvel[robot.v]
-        servo = robot.stiffness * (robot.target - position) + robot.damping * (robot.target_velocity - velocity)
-        servo = np.clip(servo + robot.forward, -robot.effort, robot.effort)
         # implicit servos: over the tick they gave the force of its end, not that of its start
-        effort = np.clip(servo + d.qfrc_gravcomp[robot.v], -robot.effort, robot.effort)
+        servo = robot.control - robot.stiffness * position - robot.soon * velocity
+        servo = np.clip(servo, -robot.effort, robot.effort)
+        effort = np.clip(servo + d.qfrc_gravcomp[robot.v], -robot.most, robot.most)
         return position, velocity, effort, self._contact[robot.v]
+
+    def weight(self, name: str) -> np.ndarray:
+        """[joint] what the drives give to carry the robot's own weight [N m or N], part of their effort."""
+        return self.data.qfrc_gravcomp[self._robot(name).v]
 
     def base(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (world axes) of the base link."""
@@ -364,6 +402,31 @@ class Rigid:
         jacobian = np.zeros((6, self.world.nv))
         mujoco.mj_jac(self.world, self.data, jacobian[:3], jacobian[3:], np.asarray(point, float), body)
         return jacobian[:, robot.v]
+
+    def instrument(self, name: str, link: str) -> None:
+        """From the next tick on, measure at a link what :meth:`wrench` and :meth:`acceleration` tell."""
+        self._body(name, link)
+        self._robot(name).felt[link] = np.zeros(6), np.zeros(6)
+
+    def wrench(self, name: str, link: str) -> np.ndarray:
+        """Force [N] and moment about the link's origin [N m] of the link, and all beyond it, on its parent [6].
+
+        In the link's axes, mean of the last tick. Weight, inertia, pushes and contacts with rigid things count; those
+        with plants do not: who solves them has them.
+        """
+        return self._felt(name, link)[0]
+
+    def acceleration(self, name: str, link: str) -> np.ndarray:
+        """Angular [rad/s2] and proper acceleration of a link's origin [m/s2] in its axes [6]; at rest 9.81 upwards."""
+        return self._felt(name, link)[1]
+
+    def angular_velocity(self, name: str, link: str) -> np.ndarray:
+        """[3] rad/s of a link, in its axes."""
+        body = self._body(name, link)
+        self._refresh()
+        jacobian = np.zeros((3, self.world.nv))
+        mujoco.mj_jacBody(self.world, self.data, None, jacobian, body)
+        return jacobian @ self.data.qvel @ self.data.xmat[body].reshape(3, 3)
 
     def links(self) -> tuple[Link, ...]:
         """Every robot's and box's bodies that have a shape; the same object until an actor comes or goes."""
@@ -457,6 +520,7 @@ class Rigid:
             out = np.zeros(m.nv)
             mujoco.mj_mulJacTVec(m, d, out, native)
             self._contact += out
+        self._feel()
         self._fresh = False
 
     # ------------------------------------------------------------------ inside
@@ -480,6 +544,29 @@ class Rigid:
             mujoco.mj_kinematics(self.world, self.data)
             mujoco.mj_comPos(self.world, self.data)
             self._fresh = True
+
+    def _felt(self, name: str, link: str) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            return self._robot(name).felt[link]
+        except KeyError:
+            raise ValueError(f"nothing is measured at {link!r} of robot {name!r}; instrument() it first") from None
+
+    def _feel(self) -> None:
+        """Measure forces and accelerations of the tick that ends, with MuJoCo's places still those of its start."""
+        m, d = self.world, self.data
+        if not any(robot.felt for robot in self._robots.values()):
+            return
+        mujoco.mj_rnePostConstraint(m, d)
+        for robot in self._robots.values():
+            for link, (wrench, acceleration) in robot.felt.items():
+                body = robot.bodies[link]
+                turn, inner = d.xmat[body].reshape(3, 3), d.cfrc_int[body]
+                # MuJoCo gives it about the centre of mass of the whole robot, and as what the parent does
+                x, y, z = (d.subtree_com[m.body_rootid[body]] - d.xpos[body]).tolist()
+                u, v, w = inner[3:].tolist()
+                moment = inner[:3] + (y * w - z * v, z * u - x * w, x * v - y * u)
+                wrench[:3], wrench[3:] = -inner[3:] @ turn, -moment @ turn
+                mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, acceleration, 1)
 
     def _roll_back(self) -> None:
         """Stop the kinematic trees with a number that is not finite where the tick began; the others go on."""
@@ -507,8 +594,9 @@ class Rigid:
         """Turn every robot's targets into MuJoCo's controls."""
         d = self.data
         for robot in self._robots.values():
-            pull = robot.stiffness * robot.target + robot.damping * robot.target_velocity
-            d.ctrl[robot.actuator] = pull + robot.forward
+            pull = robot.stiffness * robot.target + (robot.soon + robot.late) * robot.target_velocity
+            robot.control[:] = pull - robot.late * d.qvel[robot.v] + robot.forward
+            d.ctrl[robot.actuator] = robot.control
             q = d.qpos[robot.base_q]
             c, s = math.cos(q[2]), math.sin(q[2])
             vx, vy, wz = robot.base_velocity.tolist()
@@ -518,6 +606,17 @@ class Rigid:
             np.maximum(held, q - robot.give, out=robot.base_target)
             stiffness, damping = robot.tracks
             d.ctrl[robot.base_actuator] = stiffness * robot.base_target + damping * velocity
+
+    def _set_gains(self, robot: _Robot) -> None:
+        """Turn a robot's gains and limits into MuJoCo's constants."""
+        m = self.world
+        soon, late = _split(robot.stiffness, robot.damping, m.dof_damping[robot.v], m.dof_armature[robot.v], self.dt)
+        robot.soon = np.where(robot.exact, soon, robot.damping)
+        robot.late = np.where(robot.exact, late, 0.0)
+        m.actuator_biasprm[robot.actuator, 1] = -robot.stiffness
+        m.actuator_biasprm[robot.actuator, 2] = -robot.soon
+        m.actuator_forcerange[robot.actuator, 0] = -robot.effort
+        m.actuator_forcerange[robot.actuator, 1] = robot.effort
 
     def _mimics(self, robot: _Robot) -> dict[str, tuple[str, np.ndarray]]:
         """Joints of a robot that copy another joint: name -> (source, polynomial)."""
@@ -569,6 +668,7 @@ class Rigid:
         self._fresh = False
         for robot in self._robots.values():
             self._locate(robot)
+            self._set_gains(robot)
         if before is None:
             self.standing = self._list_standing()
         self._list()
@@ -821,8 +921,8 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
         base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
     spec.copy_during_attach = True
     spec.attach(robot.parsed, prefix=f"{name}/", frame=base.add_frame())
-    for drive, stiffness, damping in zip(given.drives, robot.stiffness, robot.damping, strict=True):
-        _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
+    for drive in given.drives:  # their gains follow once joints have their numbers
+        _add_servo(spec, f"{name}/{drive.joint}", drive.stiffness, drive.damping, drive.effort)
     stiffness, damping = robot.tracks
     for i, axis in enumerate(_PLANAR):
         _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
@@ -897,6 +997,24 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
         gaintype=mujoco.mjtGain.mjGAIN_FIXED, gainprm=gain, biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=bias,
         forcelimited=True, forcerange=[-effort, effort], ctrllimited=False,
     )  # fmt: skip
+
+
+def _split(
+    stiffness: np.ndarray, damping: np.ndarray, friction: np.ndarray, rotor: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """How a servo's damping is split so that the joint swings as asked: parts [joint] at the tick's end and start.
+
+    With the spring at the end of the tick, q + dt v, the scheme damps as if D were larger by dt K. So much is taken
+    from the part at the end, which makes the spring's share explicit. Half of the damping (``friction`` of the joint
+    included) acts on the velocity at the start: the trapezoidal rule, whose decay is right to third order in dt D / M.
+    The price is that the scheme is not stable for every inertia M. A - B >= dt K / 2 - 2 M / dt is needed, A and B
+    being the parts at the end (without - dt K) and at the start; M is at least ``rotor``, so B is cut down, and if
+    that does not suffice A is raised: a joint that is too stiff for its tick is damped more than asked.
+    """
+    asked = damping + friction
+    needed = np.maximum(0.0, 0.5 * dt * stiffness - 2.0 * rotor / dt)
+    late = np.clip(0.5 * (asked - needed), 0.0, 0.5 * rotor / dt)
+    return np.maximum(asked, needed) - late - friction - dt * stiffness, late
 
 
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))

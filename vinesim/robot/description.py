@@ -56,6 +56,8 @@ class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Largest force [N] and moment [N m]."""
     timeout: float = 0.5
     """Time without a command after which it stops [s]."""
+    slip: tuple[float, float] = (0.0, 0.0)
+    """Share of the tracks' travel that is lost on the ground, ahead and in turns; odometry counts the travel."""
 
 
 class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -68,6 +70,10 @@ class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Velocity gains [N m s/rad or N s/m]."""
     rotor: tuple[float, ...] | None = None
     """Inertias of motor and gear seen from the joint [kg m2 or kg]."""
+    elastic: tuple[float, ...] | None = None
+    """Stiffnesses of the springs between gear and joint [N m/rad or N/m]; without them the position gains count."""
+    elastic_damping: tuple[float, ...] | None = None
+    """Their damping [N m s/rad or N s/m]."""
     home: tuple[float, ...] | None = None
     """[rad or m]"""
     tool: str = ""
@@ -82,6 +88,19 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     type: str = ""
 
 
+class Cutter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The mouth of a blade: x along the blades, y from one to the other, z across their plane."""
+
+    group: str
+    """The gripper it belongs to."""
+    frame: str
+    """The link that carries it."""
+    half: tuple[float, float, float]
+    """Half edges of the mouth [m]; the second is how far to either side wood is caught."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Middle of the mouth in ``frame`` [m]."""
+
+
 class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The TOML beside a URDF."""
 
@@ -91,6 +110,7 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lidars: tuple[Mount, ...] | None = None
     imus: tuple[Mount, ...] = ()
     wrenches: tuple[Mount, ...] = ()
+    cutters: tuple[Cutter, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -150,6 +170,7 @@ class Description:
     lidars: tuple[Mount, ...]
     imus: tuple[Mount, ...]
     wrenches: tuple[Mount, ...]
+    cutters: tuple[Cutter, ...]
     base_limits: BaseLimits
     mass: float
     """[kg]"""
@@ -512,12 +533,13 @@ def _assemble(
         lidars=sidecar.lidars or (),
         imus=sidecar.imus,
         wrenches=sidecar.wrenches,
+        cutters=sidecar.cutters,
         base_limits=sidecar.base,
         mass=sum(link.inertial.mass or 0.0 for link in robot.links if link.inertial is not None),
         notes=(),
     )
     _check_sidecar(description, {joint.name for joint in driven}, file.with_suffix(".toml"))
-    gains, rotors = {}, {}
+    gains, rotors, springs = {}, {}, {}
     for group in description.groups.values():
         for i, joint in enumerate(group.joints):
             if group.home is not None:
@@ -526,12 +548,15 @@ def _assemble(
                 gains[joint] = group.stiffness[i], group.damping[i]
             if group.rotor is not None:
                 rotors[joint] = group.rotor[i]
+            if group.elastic is not None and group.elastic_damping is not None:
+                springs[joint] = group.elastic[i], group.elastic_damping[i]
     inertia = _carried_inertia(robot, description)
     guessed = [joint.name for joint in driven if joint.name not in gains]
     if guessed:
         notes.append(f"servo gains of {len(guessed)} joints are derived from effort limits and inertia")
     drives = tuple(
-        _drive(joint, gains.get(joint.name), rotors.get(joint.name), inertia[joint.name]) for joint in driven
+        _drive(joint, gains.get(joint.name), rotors.get(joint.name), springs.get(joint.name), inertia[joint.name])
+        for joint in driven
     )
     return dataclasses.replace(description, drives=drives, notes=tuple(notes))
 
@@ -616,14 +641,29 @@ def _check_sidecar(description: Description, driven: set[str], file: pathlib.Pat
         for joint in group.joints:
             if joint not in driven:
                 raise _error(file, f"group {name!r} names {joint!r}, which no drive moves", "name driven joints only")
-        for key in ("stiffness", "damping", "rotor", "home"):
+        for key in ("stiffness", "damping", "rotor", "elastic", "elastic_damping", "home"):
             values = getattr(group, key)
             if values is not None and len(values) != len(group.joints):
                 raise _error(
                     file, f"group {name!r} has {len(values)} of {key} for {len(group.joints)} joints", "give one each"
                 )
+        if (group.elastic is None) != (group.elastic_damping is None):
+            raise _error(file, f"group {name!r} gives only half of its springs", "give elastic and elastic_damping")
+        if group.elastic is not None and min(*group.elastic, *group.elastic_damping) < 0.0:
+            raise _error(file, f"group {name!r} has a spring below zero", "give 0 or more")
         if group.tool and group.tool not in description.anchors:
             raise _error(file, f"group {name!r} has the tool {group.tool!r}", "name a link of the URDF")
+    for cutter in description.cutters:
+        if cutter.group not in description.groups:
+            raise _error(file, f"a cutter belongs to {cutter.group!r}", "name a group")
+        if cutter.frame not in description.anchors:
+            raise _error(file, f"the cutter of {cutter.group!r} sits in {cutter.frame!r}", "name a link of the URDF")
+        if min(cutter.half) <= 0.0:
+            raise _error(
+                file, f"the cutter of {cutter.group!r} has a mouth of {cutter.half}", "give half edges above 0"
+            )
+    if not all(0.0 <= slip < 1.0 for slip in description.base_limits.slip):
+        raise _error(file, f"slip of {description.base_limits.slip}", "give shares from 0 to below 1")
     for mount in (*description.cameras, *description.lidars, *description.imus, *description.wrenches):
         if mount.frame not in description.anchors:
             raise _error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
@@ -662,7 +702,13 @@ def _is_beyond(link: str, joint_child: str, above: dict[str, str]) -> bool:
     return link == joint_child
 
 
-def _drive(joint: yourdfpy.Joint, gains: tuple[float, float] | None, rotor: float | None, inertia: float) -> Drive:
+def _drive(
+    joint: yourdfpy.Joint,
+    gains: tuple[float, float] | None,
+    rotor: float | None,
+    spring: tuple[float, float] | None,
+    inertia: float,
+) -> Drive:
     limit = joint.limit
     endless = joint.type == "continuous"
     if rotor is None:
@@ -681,4 +727,6 @@ def _drive(joint: yourdfpy.Joint, gains: tuple[float, float] | None, rotor: floa
         lower=-math.inf if endless else limit.lower,
         upper=math.inf if endless else limit.upper,
         rotor=rotor,
+        elastic=spring[0] if spring else 0.0,
+        elastic_damping=spring[1] if spring else 0.0,
     )

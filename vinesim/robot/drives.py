@@ -9,27 +9,34 @@
 
 Servos and effort limits act in physics; what is asked of them stays within the URDF's limits here, so a step of a
 position command becomes a ramp at the joint's largest speed, as in the joint_limits of ros2_control.
+
+A drive is a motor behind a spring (D6.4 section 3.1). The motor's own control is taken to be fast: it turns to where
+the spring gives what position, velocity, effort or impedance control asks for. Commanded itself, it stays put.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from collections.abc import Sequence
 
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.parting import Blade
 from vinesim.physics.rigid import Rigid
-from vinesim.robot.description import Description
-from vinesim.world.values import Contact, JointSample, RobotSample, RobotUpdate
+from vinesim.physics.step import Physics
+from vinesim.robot.description import Description, Mount
+from vinesim.world.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
 
 
 class Interface(enum.IntEnum):
-    """What a joint is commanded by; D6.4 section 5.2 names these three."""
+    """What a joint is commanded by; D6.4 names the first three in section 5.2, elastic elements in section 3.1."""
 
     POSITION = 0
     VELOCITY = 1
     EFFORT = 2
+    ELASTIC = 3
 
 
 class CommandError(ValueError):
@@ -58,6 +65,7 @@ class Embodied:
         self._start_turn = frames.matrix(back)
         self._start_left = frames.multiply(back, np.eye(4)).T
         """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
+        self._odometer = Odometer(*description.base_limits.slip, spec.pose)
 
     def leave(self) -> None:
         """Take it out of the world."""
@@ -72,7 +80,7 @@ class Embodied:
             joints=JointSample(time, self.description.joints, position, velocity, effort, contact),
             base_q=base_q,
             base_qd=base_qd,
-            odom_q=np.concatenate([self._start_turn @ (base_q[:3] - self._start), self._start_left @ base_q[3:]]),
+            odom_q=self._odometry(base_q),
             transforms=self.description.moving.frames,
             transform_q=self.description.moving.poses(position),
             contacts=tuple(c for c in contacts if c.actor == self.name),
@@ -81,6 +89,41 @@ class Embodied:
     def frame_pose(self, frame: str) -> np.ndarray:
         """World pose [7] of any link of the URDF: where a sensor sits now."""
         return self.rigid.link_pose(self.name, frame)
+
+    def _odometry(self, base_q: np.ndarray) -> np.ndarray:
+        """Pose [7] since the start as the tracks tell it: exact, unless they slip."""
+        if any(self.description.base_limits.slip):
+            return self._odometer.roll(base_q)
+        return np.concatenate([self._start_turn @ (base_q[:3] - self._start), self._start_left @ base_q[3:]])
+
+
+class Odometer:
+    """Dead reckoning of tracks that slip: they travel farther than the base, and believe in what they travelled."""
+
+    def __init__(self, ahead: float, turning: float, pose: np.ndarray) -> None:
+        """``ahead``, ``turning``: shares of the travel that are lost; ``pose`` [7] of the base at the start."""
+        self._gain = 1.0 / (1.0 - ahead), 1.0 / (1.0 - turning)
+        self._seen = float(pose[0]), float(pose[1]), _heading(pose)
+        self._believed = 0.0, 0.0, 0.0
+
+    def roll(self, base_q: np.ndarray) -> np.ndarray:
+        """Count the way to ``base_q`` [7] and return the pose [7] since the start as odometry believes it."""
+        x, y, yaw = self._seen
+        self._seen = float(base_q[0]), float(base_q[1]), _heading(base_q)
+        turn = (self._seen[2] - yaw + np.pi) % (2.0 * np.pi) - np.pi
+        c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
+        way = self._seen[0] - x, self._seen[1] - y
+        ahead, left = self._gain[0] * (c * way[0] + s * way[1]), c * way[1] - s * way[0]
+        turn *= self._gain[1]
+        x, y, yaw = self._believed
+        c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
+        self._believed = x + c * ahead - s * left, y + s * ahead + c * left, yaw + turn
+        return frames.pose([*self._believed[:2], 0.0], frames.yaw(self._believed[2]))
+
+
+def _heading(pose: np.ndarray) -> float:
+    """[rad] of a pose [7] that stands upright."""
+    return 2.0 * float(np.arctan2(pose[5], pose[6]))
 
 
 class Robot(Embodied):
@@ -104,8 +147,35 @@ class Robot(Embodied):
         """[joint] largest efforts [N m or N]"""
         self._stiffness = np.array([drive.stiffness for drive in drives])
         self._damping = np.array([drive.damping for drive in drives])
+        self._compliant = np.zeros(len(drives), bool)
+        """[joint] whose gains were asked for, so that they must be right to the letter"""
+        self._limit = self.effort.copy()
+        self.spring = np.array([drive.elastic or drive.stiffness for drive in drives])
+        """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
+        self._spring_damping = np.array([drive.elastic_damping if drive.elastic else drive.damping for drive in drives])
         self._order = {drive.joint: i for i, drive in enumerate(drives)}
+        self._grippers: dict[str, np.ndarray] = {}
+        """Fingers that close together: a hand that drifted with what it holds would be two hands."""
+        self._cutters: dict[str, list[Blade]] = {}
+        self._physics: Physics | None = None
+        for mount in (*description.wrenches, *description.imus):
+            rigid.instrument(self.name, mount.frame)
+        self._beyond = {mount.frame: _links_beyond(description, mount.frame) for mount in description.wrenches}
         self.stop()
+
+    def fit_cutters(self, physics: Physics) -> None:
+        """Give the robot the cutters of its description, to cut what grows in ``physics``."""
+        self._physics = physics
+        for cutter in self.description.cutters:
+            blade = physics.blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
+            self._cutters.setdefault(cutter.group, []).append(blade)
+
+    def leave(self) -> None:
+        """Take it out of the world, its cutters with it."""
+        if self._physics is not None:
+            self._physics.remove_robot(self.name)
+        else:
+            super().leave()
 
     def stop(self) -> None:
         """Forget all commands and hold every joint and the base where they are."""
@@ -114,6 +184,8 @@ class Robot(Embodied):
         self.interface = np.full(len(self.setpoint), Interface.POSITION)
         """[joint] :class:`Interface` by which each was commanded last"""
         self._goal = self.setpoint.copy()
+        self._velocity = np.zeros(len(self.setpoint))
+        self._braked = np.zeros(len(self.setpoint), bool)
         self._retuned = True
         self._base_goal = np.zeros(2)
         self._base_velocity = np.zeros(2)
@@ -157,10 +229,38 @@ class Robot(Embodied):
         self._goal[i] = np.clip(values, -self.effort[i], self.effort[i])
         self._switch(i, Interface.EFFORT)
 
-    def command_gripper(self, group: str, opening: float) -> None:
-        """Open a gripper's fingers to ``opening`` [m] between them (sum over prismatic fingers) or [rad]."""
-        fingers = self.description.indices(group)
+    def command_elastic(
+        self, motor: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None = None
+    ) -> None:
+        """Hold the motors at positions [rad or m]; each link hangs on its spring and sags by load over stiffness.
+
+        Nothing makes up for the weight, as nothing but the spring connects the two (D6.4 section 3.1).
+        """
+        i, values = self._checked(motor, joints)
+        self._goal[i] = values
+        self._switch(i, Interface.ELASTIC)
+
+    def command_gripper(self, group: str, opening: float, effort: float | None = None) -> None:
+        """Open a gripper's fingers to ``opening`` [m] between them (sum over prismatic fingers) or [rad].
+
+        ``effort`` is the most that each finger may give [N or N m], the drives' own unless it is given. What lies
+        between the fingers is held by friction alone.
+        """
+        fingers = self._gripper(group)
+        if effort is not None and not effort > 0.0:
+            raise CommandError(f"{self.name}: gripper effort {effort}; give more than 0, or none for all there is")
         self.command_position(np.full(len(fingers), opening / len(fingers)), fingers)
+        self._grippers[group] = fingers
+        self._limit[fingers] = self.effort[fingers] if effort is None else np.minimum(effort, self.effort[fingers])
+        self._retuned = True
+
+    def command_cutter(self, group: str) -> None:
+        """Close the cutter of a gripper, and open it again: what is in its mouth at the end of the tick is cut."""
+        if group not in self._cutters:
+            known = ", ".join(sorted(self._cutters)) or "none"
+            raise CommandError(f"{self.name} has no cutter at {group!r}; cutters fitted: {known}")
+        for blade in self._cutters[group]:
+            blade.close()
 
     def command_base(self, linear: float, angular: float, time: float) -> None:
         """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left; lapses after the timeout."""
@@ -188,12 +288,35 @@ class Robot(Embodied):
         if (stiff < 0.0).any() or (damp < 0.0).any():
             raise CommandError(f"{self.name}: gains below zero would feed energy in; give 0 or more")
         self._stiffness[i], self._damping[i] = stiff, damp
+        self._compliant[i] = True
         self._retuned = True
 
+    def stiffen(self, joints: Sequence[str] | np.ndarray | None = None) -> None:
+        """Give joints back the stiff servos of their description."""
+        i, drives = self.joint_indices(joints), self.description.drives
+        self._stiffness[i] = [drives[j].stiffness for j in i]
+        self._damping[i] = [drives[j].damping for j in i]
+        self._compliant[i] = False
+        self._retuned = True
+
+    def _gripper(self, group: str) -> np.ndarray:
+        if group not in self.description.groups:
+            known = ", ".join(self.description.groups)
+            raise CommandError(f"{self.name} has no gripper {group!r}; its groups are: {known}")
+        return self.description.indices(group)
+
     def _switch(self, joints: np.ndarray, interface: Interface) -> None:
-        if interface == Interface.EFFORT or (self.interface[joints] == Interface.EFFORT).any():
-            self._retuned = True
+        before = self.interface[joints] == Interface.ELASTIC
+        if before.any() or interface == Interface.ELASTIC:  # from motors to links, or back
+            position, _, effort, _ = self.rigid.read(self.name)
+            motor = position + effort / self.spring
+            self.setpoint[joints] = np.where(
+                before == (interface == Interface.ELASTIC),
+                self.setpoint[joints],
+                np.where(before, position[joints], motor[joints]),
+            )
         self.interface[joints] = interface
+        self._retuned = True
 
     def _checked(
         self, values: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None
@@ -211,37 +334,102 @@ class Robot(Embodied):
     def control(self, time: float) -> None:
         """Hand set-points for the tick that starts at ``time`` [s] to the servos; call it before physics steps."""
         dt = self.rigid.dt
-        position = self.rigid.read(self.name)[0]
+        position, velocity = self.rigid.read(self.name)[:2]
         by_velocity = self.interface == Interface.VELOCITY
         by_effort = self.interface == Interface.EFFORT
+        by_motor = self.interface == Interface.ELASTIC
 
         # A servo that already gives all it has gives no more when asked for more, but would overshoot when let go.
-        lead = self.effort / np.maximum(self._stiffness, 1e-9) + self.speed * dt
-        start = np.where(by_effort, position, np.clip(self.setpoint, position - lead, position + lead))
+        stiffness = np.where(by_motor, self.spring, self._stiffness)
+        lead = self._limit / np.maximum(stiffness, 1e-9) + self.speed * dt
+        middle = position
+        if self._grippers:
+            middle = position.copy()
+            for fingers in self._grippers.values():
+                middle[fingers] = position[fingers].mean()
+        start = np.where(by_effort, position, np.clip(self.setpoint, middle - lead, middle + lead))
         step = np.where(by_velocity, self._goal * dt, np.where(by_effort, 0.0, self._goal - start))
         target = np.clip(start + np.clip(step, -self.speed * dt, self.speed * dt), self.lower, self.upper)
         self.setpoint = target
-        self.rigid.command(self.name, target, np.where(by_effort, 0.0, (target - start) / dt))
-        if self._retuned:
+        rate = np.where(by_effort, 0.0, (target - start) / dt)
+        changing = by_effort.any() or by_motor.any()
+        if changing or self._retuned:
+            # An effort that would drive the joint too fast gives way to a brake: 90 % of the largest speed are free.
+            # Looking a tick ahead, and no stronger than it may be: at its limit a servo acts all through the tick.
+            brake = 10.0 * self.effort / self.speed
+            soon = 2.0 * velocity - self._velocity
+            still = self._braked & (np.abs(velocity) > 0.5 * self.speed)
+            fast = by_effort & (self._goal > brake * (self.speed - soon)) | still & (velocity > 0.0)
+            back = by_effort & (self._goal < -brake * (self.speed + soon)) | still & (velocity < 0.0)
+            braked = self._braked = (fast | back) & by_effort & (self._goal * velocity >= 0.0)
+            rate = np.where(braked, np.where(fast, self.speed, -self.speed), rate)
+            most = 0.8 * np.where(np.abs(velocity) < self.speed, np.abs(self._goal), self.effort)
+            brake = np.minimum(brake, most / np.maximum(np.abs(rate - velocity), 1e-9))
+            damping = np.where(by_motor, self._spring_damping, self._damping)
             self.rigid.tune(
                 self.name,
-                np.where(by_effort, 0.0, self._stiffness),
-                np.where(by_effort, 0.0, self._damping),
-                np.where(by_effort, self._goal, 0.0),
+                np.where(by_effort, 0.0, stiffness),
+                np.where(braked, brake, np.where(by_effort, 0.0, damping)),
+                np.where(by_effort & ~braked, self._goal, np.where(by_motor, -self.rigid.weight(self.name), 0.0)),
+                limit=self._limit,
+                exact=by_motor | (self._compliant & ~by_effort),
             )
             self._retuned = False
+        self._velocity = velocity
+        self.rigid.command(self.name, target, rate)
 
         limits = self.description.base_limits
         goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
         change = dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
         self._base_velocity += np.clip(goal - self._base_velocity, -change, change)
         self.rigid.drive_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
+        self._odometry(self.rigid.base(self.name)[0])
+
+    def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
+        """What the robot knows of itself at ``time`` [s], sensors and elastic elements included."""
+        known = super().sample(time, contacts)
+        effort = known.joints.effort
+        deflection = effort / self.spring
+        elements = ElasticSample(
+            time, self.description.joints, self.spring, known.joints.position + deflection, deflection,
+            self.spring * deflection,
+        )  # fmt: skip
+        return dataclasses.replace(
+            known,
+            elements=elements,
+            wrenches=tuple(self._wrench(mount, time, known.contacts) for mount in self.description.wrenches),
+            imus=tuple(self._imu(mount, time) for mount in self.description.imus),
+        )
+
+    def _wrench(self, mount: Mount, time: float, contacts: Sequence[Contact]) -> Wrench:
+        wrench, pose = self.rigid.wrench(self.name, mount.frame).copy(), self.frame_pose(mount.frame)
+        back = frames.conjugate(pose[3:])
+        for contact in contacts:  # with plants, which the rigid world does not know
+            if contact.link in self._beyond[mount.frame]:
+                wrench[:3] += frames.rotate(back, contact.force)
+                wrench[3:] += frames.rotate(back, frames.cross(contact.position - pose[:3], contact.force))
+        return Wrench(time, mount.name, mount.frame, wrench[:3], wrench[3:])
+
+    def _imu(self, mount: Mount, time: float) -> Imu:
+        turn = self.frame_pose(mount.frame)[3:]
+        spin = self.rigid.angular_velocity(self.name, mount.frame)
+        acceleration = self.rigid.acceleration(self.name, mount.frame)[3:].copy()
+        return Imu(time, mount.name, mount.frame, turn, spin, acceleration)
 
     def update(self, time: float) -> RobotUpdate:
         """What other clients are told: actual joints, never commands."""
         position, velocity, _, _ = self.rigid.read(self.name)
         base_q, base_qd = self.rigid.base(self.name)
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)
+
+
+def _links_beyond(description: Description, frame: str) -> frozenset[str]:
+    """A link and all that hangs on it."""
+    beyond = {frame}
+    joints = (*description.fixed, *description.moving.frames)
+    while more := {child for parent, child in joints if parent in beyond} - beyond:
+        beyond |= more
+    return frozenset(beyond)
 
 
 class RemoteRobot(Embodied):

@@ -62,6 +62,10 @@ class Drive:
 
     A stiff servo at its effort limit needs it: a bare hand of 0.02 kg m2 under 40 N m gains 20 rad/s in a tick.
     """
+    elastic: float = 0.0
+    """Stiffness of the spring between gear and joint [N m/rad or N/m]; 0: the position gain stands for it."""
+    elastic_damping: float = 0.0
+    """Damping of that spring [N m s/rad or N s/m]; of no meaning if ``elastic`` is 0."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -158,6 +162,50 @@ class JointSample:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class ElasticSample:
+    """The series elastic element of every joint at one instant (D6.4 section 3.1): a spring between motor and link."""
+
+    time: float
+    names: tuple[str, ...]
+    stiffness: np.ndarray
+    """[joint] N m/rad or N/m"""
+    motor: np.ndarray
+    """[joint] rad or m: the motor, seen from behind its gear; the link is at ``motor - deflection``."""
+    deflection: np.ndarray
+    """[joint] rad or m"""
+    torque: np.ndarray
+    """[joint] N m or N: stiffness times deflection, all that the joint carries."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Wrench:
+    """What a force-torque sensor measures: the pull of all that lies beyond it, weight and inertia included."""
+
+    time: float
+    name: str
+    frame: str
+    force: np.ndarray
+    """[3] N on the sensor, in its frame: a hand at rest weighs down."""
+    torque: np.ndarray
+    """[3] N m about the frame's origin."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Imu:
+    """What an inertial measurement unit measures (sensor_msgs/Imu), without noise."""
+
+    time: float
+    name: str
+    frame: str
+    orientation: np.ndarray
+    """[4] of the frame in the world."""
+    angular_velocity: np.ndarray
+    """[3] rad/s in the frame."""
+    linear_acceleration: np.ndarray
+    """[3] m/s2 in the frame; at rest it reads 9.81 upwards (REP-145)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class RobotSample:
     """What a robot knows of itself at one instant."""
 
@@ -174,6 +222,9 @@ class RobotSample:
     transform_q: np.ndarray
     """[transform, 7] child in parent."""
     contacts: tuple[Contact, ...] = ()
+    elements: ElasticSample | None = None
+    wrenches: tuple[Wrench, ...] = ()
+    imus: tuple[Imu, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

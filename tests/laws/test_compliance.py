@@ -1,0 +1,327 @@
+"""Compliant joints against mechanics: static deflection F / K, log-decrement of D, springs in series (D6.4, 3.1).
+
+Inertias and weights come from the URDF's text, by hand, not from the engine that moves the joints.
+"""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.physics.rigid import Rigid
+from vinesim.robot.description import Description, load
+from vinesim.robot.drives import Robot
+from vinesim.world.grow import assemble
+
+DT = 0.01
+ARM = tuple(f"arm_left_{i}_joint" for i in range(1, 8))
+GATE = """<robot name="gate">
+<link name="post"><inertial><mass value="80"/>
+ <inertia ixx="3" iyy="3" izz="3" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="leaf"><inertial><origin xyz="0.5 0 0"/><mass value="4"/>
+ <inertia ixx="0.01" iyy="0.2" izz="0.2" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge_joint" type="revolute"><parent link="post"/><child link="leaf"/><origin xyz="0 0 1"/>
+ <axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="200" velocity="20"/></joint>
+</robot>"""
+GATE_INERTIA = 0.2 + 4.0 * 0.5**2
+ROTOR = 0.3
+"""[kg m2] of the gate's motor."""
+
+
+@pytest.fixture(scope="module")
+def vinebot() -> Description:
+    return load("vinebot")
+
+
+@pytest.fixture(scope="module")
+def gate(tmp_path_factory: pytest.TempPathFactory) -> Description:
+    """A single hinge about the vertical."""
+    folder = tmp_path_factory.mktemp("gate")
+    (folder / "gate.urdf").write_text(GATE)
+    (folder / "gate.toml").write_text(
+        "[base]\neffort = [1e8, 1e8]\n"  # a post in the ground: tracks would give way and damp the swing
+        f'[groups.hinge]\njoints = ["hinge_joint"]\nstiffness = [2000.0]\ndamping = [100.0]\nrotor = [{ROTOR}]\n'
+        "elastic = [150.0]\nelastic_damping = [3.0]\n"
+    )
+    return load(folder / "gate.urdf")
+
+
+class Stand:
+    """A robot, and a clock."""
+
+    def __init__(self, description: Description) -> None:
+        self.rigid = Rigid(assemble([]), dt=DT)
+        self.robot = Robot(self.rigid, description, "anna")
+        self.time = 0.0
+
+    def run(self, seconds: float) -> np.ndarray:
+        """Positions [tick, joint]."""
+        rows = []
+        for _ in range(round(seconds / DT)):
+            self.robot.control(self.time)
+            self.rigid.prep()
+            self.rigid.finish()
+            self.time += DT
+            rows.append(self.rigid.read("anna")[0].copy())
+        return np.array(rows)
+
+    def push(self, link: str, force: np.ndarray) -> None:
+        """A steady force at a link's centre of mass."""
+        self.rigid.push("anna", link, np.asarray(force, float))
+
+    def lever(self, link: str) -> np.ndarray:
+        """[3, joint] Jacobian of a link's centre of mass, by differences of the description's own kinematics."""
+        robot, step = self.robot, 1e-6
+        position = self.rigid.read("anna")[0].copy()
+        centre = next(
+            np.array(found.find("inertial/origin").get("xyz").split(), float)
+            for found in ElementTree.fromstring(robot.description.urdf).iterfind("link")
+            if found.get("name") == link
+        )
+        columns = []
+        for joint in range(len(position)):
+            there = []
+            for sign in (-1.0, 1.0):
+                moved = position.copy()
+                moved[joint] += sign * step
+                pose = robot.description.frame_poses(moved)[link]
+                there.append(pose[:3] + frames.rotate(pose[3:], centre))
+            columns.append((there[1] - there[0]) / (2.0 * step))
+        base = self.rigid.base("anna")[0]
+        return frames.matrix(base[3:])[:3, :3] @ np.array(columns).T
+
+
+def weight_beyond(stand: Stand, joint: str) -> float:
+    """Moment [N m] of the weight of all that a joint carries, about its axis: how much its drive must give."""
+    description, position = stand.robot.description, stand.rigid.read("anna")[0]
+    i = description.joints.index(joint)
+    height = []
+    for sign in (-1.0, 1.0):
+        moved = position.copy()
+        moved[i] += sign * 1e-6
+        poses, energy = description.frame_poses(moved), 0.0
+        for link in ElementTree.fromstring(description.urdf).iterfind("link"):
+            if (mass := link.find("inertial/mass")) is not None:
+                origin = link.find("inertial/origin")
+                centre = np.array(origin.get("xyz", "0 0 0").split(), float) if origin is not None else np.zeros(3)
+                pose = poses[link.get("name")]
+                energy += float(mass.get("value")) * 9.81 * (pose[:3] + frames.rotate(pose[3:], centre))[2]
+        height.append(energy)
+    return (height[1] - height[0]) / 2e-6
+
+
+def decrement(position: np.ndarray) -> tuple[float, float]:
+    """Log-decrement over a whole period, and the period [s], of a decaying swing about zero [tick]."""
+    peaks, times = [], []
+    for k in range(1, len(position) - 1):
+        before, here, after = position[k - 1 : k + 2]
+        if (here - before) * (after - here) <= 0.0:
+            bend = before - 2.0 * here + after
+            shift = 0.5 * (before - after) / bend
+            peaks.append(abs(here - 0.25 * (before - after) * shift))
+            times.append(k + shift)
+    first = position[0]
+    good = [i for i, peak in enumerate(peaks) if peak > 0.02 * abs(first)]
+    assert len(good) >= 3, "it hardly swings"
+    slope = np.polyfit(good, np.log(np.array(peaks)[good]), 1)[0]
+    return -2.0 * slope, 2.0 * DT * float(np.polyfit(good, np.array(times)[good], 1)[0])
+
+
+def expected(stiffness: float, damping: float, inertia: float) -> tuple[float, float]:
+    """The same for an oscillator."""
+    zeta = damping / (2.0 * np.sqrt(stiffness * inertia))
+    root = np.sqrt(1.0 - zeta**2)
+    return 2.0 * np.pi * zeta / root, 2.0 * np.pi / np.sqrt(stiffness / inertia) / root
+
+
+# ---------------------------------------------------------------------- F19, F21: impedance, with no ROS
+
+
+@pytest.mark.parametrize("zeta", [0.02, 0.05, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize("stiffness", [15.0, 60.0, 240.0])
+def test_log_decrement_is_that_of_the_damping_asked_for(gate: Description, stiffness: float, zeta: float) -> None:
+    """2 %, from 0.5 to 2 Hz: the implicit servo alone would add dt K, at 2 Hz twice what zeta 0.05 asks for."""
+    inertia = GATE_INERTIA + ROTOR
+    damping = 2.0 * zeta * np.sqrt(stiffness * inertia)
+    stand = Stand(gate)
+    stand.robot.command_impedance([stiffness], [damping])
+    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
+    swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, 0]
+    found, wanted = decrement(swing), expected(stiffness, damping, inertia)
+    assert found[0] == pytest.approx(wanted[0], rel=0.02)
+    assert found[1] == pytest.approx(wanted[1], rel=0.02)
+
+
+def test_an_undamped_joint_swings_on(gate: Description) -> None:
+    stand = Stand(gate)
+    stand.robot.command_impedance([60.0], [0.0])
+    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
+    swing = np.abs(stand.run(60.0)[:, 0])
+    assert swing[-500:].max() == pytest.approx(0.3, rel=0.01)
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5, 1e6, 1e8])
+def test_no_stiffness_blows_up(gate: Description, stiffness: float) -> None:
+    """Whatever the gains, even without any damping, no energy comes from the scheme."""
+    stand = Stand(gate)
+    stand.robot.command_impedance([stiffness], [0.0])
+    stand.run(0.02)
+    stand.push("leaf", np.array([0.0, 60.0, 0.0]))
+    stand.run(0.3)
+    stand.push("leaf", np.zeros(3))
+    swing = np.abs(stand.run(10.0)[:, 0])
+    bound = 60.0 * 0.5 / stiffness
+    assert swing[:200].max() < 3.0 * bound
+    assert swing[-200:].max() <= swing[:200].max() * 1.001
+
+
+def test_a_whole_arm_gives_way_by_f_over_k(vinebot: Description) -> None:
+    """All seven joints compliant: K times deflection is J^T F at the place where the arm comes to rest."""
+    stand = Stand(vinebot)
+    joints = stand.robot.joint_indices(ARM)
+    stiffness = np.array([60.0, 60.0, 40.0, 40.0, 15.0, 15.0, 15.0])
+    stand.robot.command_impedance(stiffness, 0.25 * stiffness, joints)
+    start = stand.run(0.1)[-1, joints]
+    force = np.array([4.0, -3.0, 5.0])
+    stand.push("arm_left_7_link", force)
+    end = stand.run(8.0)[-1, joints]
+    moment = (stand.lever("arm_left_7_link").T @ force)[joints]
+    assert np.abs(end - start).max() > 0.03
+    np.testing.assert_allclose(stiffness * (end - start), moment, rtol=0.02, atol=0.005)
+
+
+@pytest.mark.parametrize(("joint", "stiffness", "zeta"), [(0, 80.0, 0.08), (3, 30.0, 0.15), (5, 40.0, 0.25)])
+def test_a_joint_of_an_arm_swings_as_asked(vinebot: Description, joint: int, stiffness: float, zeta: float) -> None:
+    """The robot's own hinge friction (URDF) adds to the damping asked for; inertia from the URDF and the rotor."""
+    stand, name = Stand(vinebot), ARM[joint]
+    inertia = inertia_about(vinebot, name) + next(d.rotor for d in vinebot.drives if d.joint == name)
+    friction = next(
+        float(found.find("dynamics").get("damping"))
+        for found in ElementTree.fromstring(vinebot.urdf).iterfind("joint")
+        if found.get("name") == name
+    )
+    total = 2.0 * zeta * np.sqrt(stiffness * inertia)
+    stand.robot.command_impedance([stiffness], [total - friction], [name])
+    i, start = stand.robot.joint_indices([name])[0], vinebot.home.copy()
+    start[i] += 0.05
+    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), start)
+    swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, i] - vinebot.home[i]
+    found, wanted = decrement(swing), expected(stiffness, total, inertia)
+    assert found[0] == pytest.approx(wanted[0], rel=0.02)
+    assert found[1] == pytest.approx(wanted[1], rel=0.02)
+
+
+def inertia_about(description: Description, joint: str) -> float:
+    """[kg m2] of all that a joint carries at home, about its axis, from the URDF's text."""
+    root, poses = ElementTree.fromstring(description.urdf), description.frame_poses(description.home)
+    joints = {found.get("name"): found for found in root.iterfind("joint")}
+    carried = {joints[joint].find("child").get("link")}
+    while (
+        more := {
+            found.find("child").get("link") for found in joints.values() if found.find("parent").get("link") in carried
+        }
+        - carried
+    ):
+        carried |= more
+    pose = poses[joints[joint].find("child").get("link")]
+    axis = frames.rotate(pose[3:], np.array(joints[joint].find("axis").get("xyz").split(), float))
+    total = 0.0
+    for link in root.iterfind("link"):
+        inertial = link.find("inertial")
+        if link.get("name") not in carried or inertial is None:
+            continue
+        mass, tensor = float(inertial.find("mass").get("value")), inertial.find("inertia")
+        at = poses[link.get("name")]
+        centre = at[:3] + frames.rotate(at[3:], np.array(inertial.find("origin").get("xyz").split(), float))
+        xx, yy, zz, xy, xz, yz = (float(tensor.get(key)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+        own = frames.rotate(frames.conjugate(at[3:]), axis)
+        total += own @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ own
+        arm = centre - pose[:3]
+        total += mass * (arm @ arm - (arm @ axis) ** 2)
+    return float(total)
+
+
+# ---------------------------------------------------------------------- F20: a series elastic element per joint
+
+
+def test_a_locked_motor_lets_the_gate_swing_on_its_spring(gate: Description) -> None:
+    stand, inertia = Stand(gate), GATE_INERTIA + ROTOR
+    stand.robot.command_elastic([0.0])
+    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.2]))
+    swing = stand.run(3.0)[:, 0]
+    found, wanted = decrement(swing), expected(150.0, 3.0, inertia)
+    assert found[0] == pytest.approx(wanted[0], rel=0.02)
+    assert found[1] == pytest.approx(wanted[1], rel=0.02)
+
+
+def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: Description) -> None:
+    """Locked motors behind their springs: each joint carries its weight and a push, known from the URDF alone."""
+    stand = Stand(vinebot)
+    joints = stand.robot.joint_indices(ARM)
+    motor = vinebot.home[joints]
+    stand.robot.command_elastic(motor, joints)
+    force = np.array([0.0, 10.0, -15.0])
+    stand.push("arm_left_7_link", force)
+    stand.run(4.0)
+    elements = stand.robot.sample(stand.time).elements
+    pushed = stand.lever("arm_left_7_link").T @ force
+    load = np.array([weight_beyond(stand, name) for name in ARM]) - pushed[joints]
+    assert np.abs(load).max() > 10.0
+    np.testing.assert_allclose(elements.torque[joints], load, rtol=0.02, atol=0.02)
+    position = stand.rigid.read("anna")[0][joints]
+    springs = np.array([d.elastic or d.stiffness for d in vinebot.drives])[joints]
+    np.testing.assert_allclose(springs * (motor - position), load, rtol=0.02, atol=0.02)
+    np.testing.assert_allclose(elements.motor[joints], motor, atol=1e-4)
+    np.testing.assert_array_equal(elements.torque, elements.stiffness * elements.deflection)
+    assert elements.names == vinebot.joints
+
+
+def test_motor_command_is_followed_by_the_link(gate: Description) -> None:
+    stand = Stand(gate)
+    stand.robot.command_elastic([0.4])
+    stand.run(12.0)
+    elements = stand.robot.sample(stand.time).elements
+    assert stand.rigid.read("anna")[0][0] == pytest.approx(0.4, abs=1e-3)
+    assert elements.motor[0] == pytest.approx(0.4, abs=1e-3)
+    stand.push("leaf", np.array([0.0, 20.0, 0.0]))  # turned away by 0.4 rad: its lever is 0.5 cos
+    stand.run(12.0)
+    elements, angle = stand.robot.sample(stand.time).elements, stand.rigid.read("anna")[0][0]
+    assert elements.torque[0] == pytest.approx(-20.0 * 0.5 * np.cos(angle), rel=0.02)
+    assert angle - 0.4 == pytest.approx(20.0 * 0.5 * np.cos(angle) / 150.0, rel=0.02)
+
+
+# ---------------------------------------------------------------------- F15, F17: effort and stiffness under a push
+
+
+def test_effort_is_weight_less_j_transposed_f(vinebot: Description) -> None:
+    stand = Stand(vinebot)
+    force = np.array([-20.0, 30.0, 25.0])
+    stand.push("arm_left_7_link", force)
+    stand.run(3.0)
+    effort = stand.rigid.read("anna")[2]
+    moment = stand.lever("arm_left_7_link").T @ force
+    for name in ("torso_lift_joint", *ARM):
+        i = stand.robot.joint_indices([name])[0]
+        assert effort[i] == pytest.approx(weight_beyond(stand, name) - moment[i], rel=0.02, abs=0.02), name
+
+
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, -1)])
+def test_pose_is_held_against_50_newtons(vinebot: Description, direction: tuple[int, int, int]) -> None:
+    """F17: no further than the servos' stiffness says, J K^-1 J^T F to first order, and back after it."""
+    stand = Stand(vinebot)
+    start = stand.run(0.2)[-1]
+    force = 50.0 * np.array(direction, float)
+    place = stand.robot.frame_pose("arm_left_7_link")[:3]
+    J = stand.lever("arm_left_7_link")
+    stiffness = np.array([d.stiffness for d in vinebot.drives])
+    bound = np.linalg.norm(J @ ((J.T @ force) / stiffness)) + 0.004  # the tracks give, too
+    stand.push("arm_left_7_link", force)
+    stand.run(2.0)
+    moved = np.linalg.norm(stand.robot.frame_pose("arm_left_7_link")[:3] - place)
+    assert 1e-4 < moved < 1.3 * bound < 0.03
+    stand.push("arm_left_7_link", np.zeros(3))
+    back = stand.run(2.0)[-1]
+    np.testing.assert_allclose(back, start, atol=1e-4)
