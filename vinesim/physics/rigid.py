@@ -1,4 +1,4 @@
-"""Everything rigid, in one MuJoCo world: ground, poles and trunks, picking boxes, robots.
+"""Everything rigid, in one MuJoCo world: ground, poles and trunks, picking boxes, robots, people.
 
 A tick is split in two, with the shared contact solve of :mod:`vinesim.physics.touching` between the halves:
 :meth:`Rigid.prep` predicts the velocity at the end of the tick as if no plant were there, :meth:`Rigid.inverse`
@@ -21,10 +21,11 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.people import PARTS, Hand, HumanError, Person, figure, hand_shapes
 from vinesim.physics.urdf import RobotError, check, shapes_of, touchable
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
-from vinesim.world.values import Link, RobotSpec, Shape
+from vinesim.world.values import HandSample, HumanPose, HumanSpec, Link, RobotSpec, Shape
 
 FRICTION = 0.8
 """Coulomb coefficient of rubber pads, plastic crates and bark alike."""
@@ -176,6 +177,7 @@ class Rigid:
         self.model = model
         self.dt = dt
         self._robots: dict[str, _Robot] = {}
+        self._people: dict[str, Person] = {}
         self._bunches: dict[int, Loose] = {}
         self._waiting = 0
         self._slot: dict[int, int] = {}
@@ -201,24 +203,17 @@ class Rigid:
 
         Raises :class:`RobotError` and leaves the world as it was if the URDF does not compile.
         """
-        if spec.name in self._robots:
-            raise RobotError(f"robot {spec.name!r} is already here; give the newcomer another name")
-        if "/" in spec.name or not spec.name:
-            raise RobotError(f"robot name {spec.name!r} must not be empty nor contain '/', which parts actor and link")
-        used = {robot.bit for robot in self._robots.values()}
-        free = [bit for bit in range(_FIRST_ROBOT, _LAST_BIT + 1) if bit not in used]
-        if not free:
-            raise RobotError(f"robot {spec.name!r} is one too many: {len(used)} robots share this world, remove one")
+        bit = self._admit("robot", spec.name, RobotError)
         check(spec)
         pose = np.asarray(spec.pose, float)
         try:
-            parsed = _parsed(spec, 1 << free[0])
+            parsed = _parsed(spec, 1 << bit)
         except ValueError as error:
             raise RobotError(f"robot {spec.name!r}: MuJoCo cannot read its URDF: {error}") from error
         robot = _Robot(
             spec=spec,
             parsed=parsed,
-            bit=free[0],
+            bit=bit,
             shapes=shapes_of(spec.urdf),
             stiffness=np.array([d.stiffness for d in spec.drives], float),
             damping=np.array([d.damping for d in spec.drives], float),
@@ -259,6 +254,91 @@ class Rigid:
             polynomial = np.polynomial.Polynomial(coefficients)
             self.data.joint(joint).qpos[0] = polynomial(self.data.joint(source).qpos[0])
         self._fresh = False
+
+    @property
+    def people(self) -> tuple[str, ...]:
+        """Names in the order of arrival."""
+        return tuple(self._people)
+
+    @property
+    def actors(self) -> tuple[str, ...]:
+        """Robots and people."""
+        return (*self._robots, *self._people)
+
+    def person(self, name: str) -> Person:
+        """The body of a person who is here."""
+        try:
+            return self._people[name]
+        except KeyError:
+            raise HumanError(f"no human {name!r} here; there are: {', '.join(self._people) or 'none'}") from None
+
+    def add_human(self, spec: HumanSpec) -> None:
+        """Let a person join, at ``spec.pose``; all others go on exactly where they are. Raises :class:`HumanError`."""
+        self._people[spec.name] = Person(spec, self._admit("human", spec.name, HumanError))
+        self._compile()
+
+    def remove_human(self, name: str) -> None:
+        """Let a person leave, and whatever the hands hold."""
+        self.person(name)
+        del self._people[name]
+        self._compile()
+
+    def move_human(self, name: str, pose: HumanPose) -> None:
+        """Tell where a person's tracked points are at the end of the coming tick."""
+        self.person(name).move(pose)
+
+    def hand(self, name: str, side: str) -> HandSample:
+        """A person's ``"left"`` or ``"right"`` hand after the last tick."""
+        person = self.person(name)
+        return person.sample(person.hand(side), self.data)
+
+    def hold(self, name: str, side: str, actor: str, link: str) -> None:
+        """Let a hand hold a link of an actor, a box or a loose bunch (as :class:`Geoms` names them) as it lies now."""
+        person, body = self.person(name), self._body_of(actor, link)
+        hand = person.hand(side)
+        self._refresh()
+        pose = np.concatenate([self.data.xpos[[body, hand.body]], self.data.xquat[[body, hand.body]]], -1)
+        pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
+        hand.grip, hand.holds = frames.compose(frames.inverse(pose[0]), pose[1]), (actor, link)
+        person.grasp(self.world, self.data, hand, body)
+        self._list()
+
+    def ride(self, name: str, side: str, body: int) -> None:
+        """Let a hand hold a plant's ``body``: it meets nothing, and goes where :meth:`put_hand` says."""
+        person = self.person(name)
+        hand = person.hand(side)
+        hand.holds = ("plants", f"body/{body}")
+        person.grasp(self.world, self.data, hand, None)
+        self._list()
+
+    def put_hand(self, name: str, side: str, pose: np.ndarray) -> None:
+        """Put a hand somewhere, at rest: ``pose`` [7]."""
+        hand = self.person(name).hand(side)
+        self.data.qpos[hand.q] = np.concatenate([pose[:3], frames.to_wxyz(pose[3:])])
+        self.data.qvel[hand.v] = 0.0
+        self._fresh = False
+
+    def let_go(self, name: str, side: str) -> None:
+        """Open a hand."""
+        person = self.person(name)
+        person.release(self.world, self.data, person.hand(side))
+        self._list()
+
+    def near_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
+        """What a palm could close on: gap [m] below ``reach``, actor and link of the nearest thing; not the ground."""
+        person = self.person(name)
+        self._refresh()
+        m, d, g = self.world, self.data, self.geoms
+        palm = int(m.body_geomadr[person.hand(side).body])
+        best: tuple[float, str, str] | None = None
+        for of in (g, self.standing):
+            apart = np.linalg.norm(d.geom_xpos[of.id] - d.geom_xpos[palm], axis=1)
+            for i in np.flatnonzero(apart - of.radius - m.geom_rbound[palm] < reach):
+                if of.kind[i] != mujoco.mjtGeom.mjGEOM_PLANE and of.actor[i] != name:
+                    gap = mujoco.mj_geomDistance(m, d, palm, int(of.id[i]), reach, None)
+                    if gap < reach and (best is None or gap < best[0]):
+                        best = (gap, of.actor[i], of.link[i])
+        return best
 
     @property
     def loose(self) -> tuple[int, ...]:
@@ -439,6 +519,8 @@ class Rigid:
         pose = np.empty((len(body), 7))
         pose[:, :3] = d.xpos[body]
         pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
+        for person in self._people.values():  # bit by bit: MuJoCo makes quaternions unit anew
+            pose[self._link_row[person.part_bodies]] = person.parts
         return pose
 
     # ------------------------------------------------------------------ the tick, in two halves
@@ -447,12 +529,16 @@ class Rigid:
         """First half: positions, native contacts, and the velocity that the tick would end with without plants."""
         m, d = self.world, self.data
         self._servo()
+        for person in self._people.values():
+            person.drive(m, d, self.dt)
         self._sound[:] = d.qpos
         # still applied from the last tick: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
         d.qfrc_applied[:] = 0.0
         # the whole forward pass behind the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
+        for person in self._people.values():
+            person.sweep(d, self.dt)
 
     @property
     def velocity_free(self) -> np.ndarray:
@@ -521,9 +607,36 @@ class Rigid:
             mujoco.mj_mulJacTVec(m, d, out, native)
             self._contact += out
         self._feel()
+        for person in self._people.values():
+            person.feel(d)
         self._fresh = False
 
     # ------------------------------------------------------------------ inside
+
+    def _admit(self, kind: str, name: str, error: type[ValueError]) -> int:
+        """The collision bit of a newcomer."""
+        if name in self.actors:
+            raise error(f"{kind} {name!r} is already here; give the newcomer another name")
+        if "/" in name or not name:
+            raise error(f"{kind} name {name!r} must not be empty nor contain '/', which parts actor and link")
+        used = {actor.bit for actor in (*self._robots.values(), *self._people.values())}
+        free = [bit for bit in range(_FIRST_ROBOT, _LAST_BIT + 1) if bit not in used]
+        if not free:
+            raise error(f"{kind} {name!r} is one too many: {len(used)} robots and people share this world, remove one")
+        return free[0]
+
+    def _body_of(self, actor: str, link: str) -> int:
+        """MuJoCo body of anything that has a name."""
+        if actor in self._people:
+            return self._people[actor].bodies[link]
+        if actor in self._robots:
+            return self._body(actor, link)
+        kind, _, number = actor.partition("/")
+        return (
+            0
+            if actor == "world"
+            else self.world.body(f"loose/{self._slot[int(number)]}" if kind == "bunch" else actor).id
+        )
 
     def _robot(self, name: str) -> _Robot:
         try:
@@ -645,6 +758,8 @@ class Rigid:
         spec = self._scene.copy()
         for robot in self._robots.values():
             _attach(spec, robot)
+        for person in self._people.values():
+            person.attach(spec, _ALL & ~(1 << person.bit), _GROUND, [FRICTION, 0.005, 0.0001])
         self._waiting = max(self._slot.values(), default=-1) + 1 + WAITING
         for slot in range(self._waiting):
             _wait(spec, slot)
@@ -669,14 +784,32 @@ class Rigid:
         for robot in self._robots.values():
             self._locate(robot)
             self._set_gains(robot)
+        for person in self._people.values():
+            person.locate(world)
+        for person in self._people.values():
+            for hand in person.hands:
+                self._regrasp(person, hand)
         if before is None:
             self.standing = self._list_standing()
         self._list()
+
+    def _regrasp(self, person: Person, hand: Hand) -> None:
+        """In a world compiled anew: hold on to what was held, if it is still there."""
+        if hand.holds is None:
+            return
+        try:
+            body = None if hand.rides else self._body_of(*hand.holds)
+        except (KeyError, ValueError):
+            person.release(self.world, self.data, hand)
+        else:
+            person.grasp(self.world, self.data, hand, body)
 
     def _list(self) -> None:
         """List anew what is here; whoever keeps views of it takes notice of the new ``generation``."""
         self.generation += 1
         self._links, self._link_body = self._list_links()
+        self._link_row = np.zeros(self.world.nbody, int)
+        self._link_row[self._link_body] = np.arange(len(self._link_body))
         self.geoms = self._list_geoms()
 
     def _embody(self, bunch: int, alone: mujoco.MjModel) -> None:
@@ -735,6 +868,12 @@ class Rigid:
                 if shapes:
                     links.append(Link(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                     bodies.append(robot.bodies[link])
+        for name, person in self._people.items():
+            shapes = dict(zip(PARTS, ((shape,) for shape in figure(person.spec.height)), strict=True))
+            shapes |= {hand.link: hand_shapes(hand.side) for hand in person.hands}
+            for link, drawn in shapes.items():
+                links.append(Link(f"{name}/{link}", Organ.HUMAN, person.spec.index, drawn))
+                bodies.append(person.bodies[link])
         for bunch, loose in self._bunches.items():
             links.append(Link(f"bunch/{bunch}", Organ.BUNCH, bunch, loose.shapes))
             bodies.append(self.world.body(f"loose/{self._slot[bunch]}").id)
@@ -745,6 +884,8 @@ class Rigid:
         owner = {m.body(f"box/{i}").id: ("box/" + str(i), "box") for i in range(len(self.model.box_size))}
         for name, robot in self._robots.items():
             owner.update({body: (name, link) for link, body in robot.bodies.items()})
+        for name, person in self._people.items():
+            owner.update({body: (name, link) for link, body in person.bodies.items()})
         owner.update({m.body(f"loose/{slot}").id: (f"bunch/{i}", "bunch") for i, slot in self._slot.items()})
         ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] in owner and m.geom_contype[g]], int)
         return self._geoms(ids, [owner[int(b)] for b in m.geom_bodyid[ids]])

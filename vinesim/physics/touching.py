@@ -455,7 +455,7 @@ class Touching:
         self._actor_first = np.array([*first, self._movable], np.int32)
         self._actor_copy = np.array([g.actor[i] in self.copies for i in first], np.bool_)
         self._geom_copy = np.array([actor in self.copies for actor in g.actor], np.bool_)
-        self._actor_lies = np.array([g.actor[i] not in self.rigid.robots for i in first], np.bool_)
+        self._actor_lies = np.array([g.actor[i] not in self.rigid.actors for i in first], np.bool_)
         self._actor_low, self._actor_high = np.zeros((len(first), 3), np.float32), np.zeros((len(first), 3), np.float32)
         self._make_room(max(self._room, 64))
 

@@ -91,6 +91,78 @@ class RobotSpec:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class HumanPose:
+    """Where a person's tracked points are at one instant: all that crosses the network (CANOPIES D6.4, section 5.3).
+
+    All poses [7] in the world, x forward, z up for a person who stands upright.
+    """
+
+    root: np.ndarray
+    """Floor of the tracked space."""
+    head: np.ndarray
+    """Head-mounted display: between the eyes."""
+    left: np.ndarray
+    """Controller of the left hand, in the middle of the palm: x along the fingers, z out of the back of the hand."""
+    right: np.ndarray
+    hips: np.ndarray
+    """Middle between the hip joints."""
+    left_foot: np.ndarray
+    """Ankle, x to the toes."""
+    right_foot: np.ndarray
+    left_closed: bool = False
+    """Whether the hand closes on what it touches; what it holds it keeps until this is false again."""
+    right_closed: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class HumanSpec:
+    """A person as physics needs one."""
+
+    name: str
+    """The actor's name: prefix of everything it owns."""
+    index: int
+    """Index of its label."""
+    pose: HumanPose
+    """At the start."""
+    height: float = 1.75
+    """[m] It gives the limbs their lengths."""
+    stiffness: float = 100.0
+    """Force of a touching hand per offset from its controller [N/m] (CANOPIES D6.4, section 3.1.1)."""
+    force: float = 100.0
+    """The most that a hand can do [N]."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class HandSample:
+    """One hand at the end of a tick."""
+
+    pose: np.ndarray
+    """[7] of the palm in the world."""
+    controller: np.ndarray
+    """[7] where the person holds the controller."""
+    force: np.ndarray
+    """[3] N with which the hand pushes or pulls the world in this tick, world axes."""
+    touching: bool
+    holds: tuple[str, str] | None
+    """Actor and link of what it holds, named as in :class:`Contact`."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Haptic:
+    """One vibration that a person's controller is asked for."""
+
+    actor: str
+    hand: str
+    """``"left"`` or ``"right"``."""
+    onset: bool
+    """A touch has just begun; otherwise it goes on."""
+    amplitude: float
+    """0 to 1, the share of the hand's greatest force; an onset is never weaker than can be felt."""
+    duration: float
+    """[s]"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class View:
     """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
 

@@ -1,0 +1,380 @@
+"""People in the rigid world: hands that push and pull, and a body that nothing moves.
+
+A hand is a free body. While nothing touches it, it is where its controller is. From the first touch on it is pulled to
+its controller by a spring, so that the force it gives follows from how far it is held back: 100 N/m up to 100 N unless
+told otherwise (CANOPIES D6.4, section 3.1.1). What it closes on it holds by a weld, and what is lifted hangs from the
+same spring: the heavier, the further the real hand must go. A hand's own weight is never felt.
+
+Head, trunk and legs are kinematic: exactly where the tracked points put them, whoever pushes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.world.values import HandSample, HumanPose, HumanSpec, Shape
+
+SIDES = ("left", "right")
+MASS = 0.4
+"""[kg] A hand (0.6 % of a person's mass: Winter, Biomechanics and Motor Control, 2009)."""
+INERTIA = 0.02
+"""[kg m2] With it turns the forearm."""
+TURN = 10.0
+"""Moment of a touching hand per angle from its controller [N m/rad]: GUESSED, as is the most that a wrist can do."""
+MOMENT = 10.0
+"""[N m]"""
+LINGER = 5
+"""[tick] So long after its last touch a hand still hangs on its spring: what bounces is not set free in between."""
+RETURN = 0.1
+"""[s] Set free, a hand closes this fast on its controller, by :data:`HURRY` at most."""
+HURRY = 1.5
+"""[m/s]"""
+THICK = 0.012
+"""[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
+SKIN = (0.85, 0.62, 0.5, 1.0)
+CLOTH = (0.98, 0.47, 0.16, 1.0)
+
+PARTS = (
+    "head", "chest", "hips", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot",
+)  # fmt: skip
+"""What of a person is kinematic, in the order of :func:`posture`."""
+# shares of a person's height (Winter 2009, after Drillis and Contini)
+THIGH, SHANK, ANKLE, HIP, TRUNK = 0.245, 0.246, 0.039, 0.095, 0.288
+_BACK, _DOWN = 0.09, 0.02
+"""[m] From between the eyes to the middle of the head."""
+_SHARES = {"head": 0.939, "hips": 0.53}
+"""Height of the eyes and of the hip joints of somebody who stands."""
+_KINDS = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "box": mujoco.mjtGeom.mjGEOM_BOX,
+}  # fmt: skip
+TURN_DAMPING = 2.0 * math.sqrt(TURN * INERTIA)
+_Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
+
+
+_STILL = np.zeros((len(PARTS) + len(SIDES), 3))
+
+
+class HumanError(ValueError):
+    """A person that cannot join or move as asked."""
+
+
+# ---------------------------------------------------------------------- what a body looks like and where it is
+
+
+def standing(root: np.ndarray, height: float = 1.75) -> HumanPose:
+    """Somebody who stands on ``root`` [7] and holds the hands out in front of the hips, palms down."""
+
+    def at(x: float, y: float, z: float) -> np.ndarray:
+        return frames.compose(root, frames.pose(np.array([x, y, z])))
+
+    side, hip = HIP * height, _SHARES["hips"] * height
+    return HumanPose(
+        root=np.asarray(root, float), head=at(_BACK, 0.0, _SHARES["head"] * height), hips=at(0.0, 0.0, hip),
+        left=at(0.35, 0.2, hip + 0.1), right=at(0.35, -0.2, hip + 0.1),
+        left_foot=at(0.0, side, ANKLE * height), right_foot=at(0.0, -side, ANKLE * height),
+    )  # fmt: skip
+
+
+@functools.cache
+def figure(height: float) -> tuple[Shape, ...]:
+    """One shape for each of :data:`PARTS`, in its frame: x along a limb, origin where it begins."""
+
+    def limb(share: float, radius: float) -> Shape:
+        half = 0.5 * share * height
+        return Shape("capsule", (radius, half), frames.pose(np.array([half, 0.0, 0.0]), _Z_TO_X), CLOTH)
+
+    legs = (
+        limb(THIGH, 0.07), limb(SHANK, 0.05),
+        Shape("box", (0.13, 0.045, 0.5 * ANKLE * height), frames.pose(np.array([0.06, 0.0, -0.5 * ANKLE * height])),
+              CLOTH),
+    )  # fmt: skip
+    half = 0.5 * TRUNK * height
+    return (
+        Shape("ellipsoid", (0.1, 0.078, 0.115), frames.pose(np.array([-_BACK, 0.0, -_DOWN])), SKIN),
+        Shape("ellipsoid", (0.12, 0.17, half + 0.03), frames.pose(np.array([0.0, 0.0, half])), CLOTH),
+        Shape("ellipsoid", (0.12, 0.16, 0.12), frames.pose(np.zeros(3)), CLOTH),
+        *legs, *legs,
+    )  # fmt: skip
+
+
+@functools.cache
+def hand_shapes(side: str) -> tuple[Shape, ...]:
+    """Palm, fingers and thumb in the frame of the palm."""
+    thumb = np.array([0.02, 0.05 if side == "right" else -0.05, -0.006])
+    # flat faces: MuJoCo lets a capsule that lies along another touch it in one point only, and it rocks
+    return (
+        Shape("box", (0.05, 0.04, THICK), frames.pose(np.zeros(3)), SKIN),
+        Shape("box", (0.04, 0.036, THICK - 0.003), frames.pose(np.array([0.085, 0.0, 0.0])), SKIN),
+        Shape("capsule", (0.01, 0.025), frames.pose(thumb, _Z_TO_X), SKIN),
+    )  # fmt: skip
+
+
+def posture(height: float, pose: HumanPose) -> np.ndarray:
+    """Poses [part, 7] of :data:`PARTS`: knees bend forward by as much as hips and ankles ask."""
+    head, hips = np.asarray(pose.head, float), np.asarray(pose.hips, float)
+    forward, left = frames.rotate(hips[3:], np.eye(3)[:2])
+    neck = frames.compose(head, np.array([-_BACK, 0.0, -0.2, 0.0, 0.0, 0.0, 1.0]))[:3]
+    up = frames.multiply(frames.aligned(neck - hips[:3], -forward), frames.conjugate(_Z_TO_X))
+    feet = np.stack([pose.left_foot, pose.right_foot]).astype(float)
+    joint = hips[:3] + HIP * height * left * np.array([[1.0], [-1.0]])
+    thigh, shank = THIGH * height, SHANK * height
+    apart = feet[:, :3] - joint
+    distance = np.linalg.norm(apart, axis=1, keepdims=True)
+    down = apart / np.maximum(distance, 1e-9)
+    reach = np.clip(distance, abs(thigh - shank) + 1e-3, thigh + shank - 1e-6)
+    along = (thigh**2 - shank**2 + reach**2) / (2.0 * reach)
+    front = frames.rotate(feet[:, 3:], np.array([1.0, 0.0, 0.0])) + forward
+    front = frames.normalize(front - (front * down).sum(1, keepdims=True) * down)
+    knee = joint + along * down + np.sqrt(np.maximum(thigh**2 - along**2, 0.0)) * front
+    ankle = joint + reach * down
+    upper, lower = frames.aligned(knee - joint, front), frames.aligned(ankle - knee, front)
+    return np.stack([
+        head, np.concatenate([hips[:3], up]), hips,
+        *(part for i in range(2) for part in (
+            np.concatenate([joint[i], upper[i]]), np.concatenate([knee[i], lower[i]]), feet[i])),
+    ])  # fmt: skip
+
+
+# ---------------------------------------------------------------------- one person
+
+
+@dataclasses.dataclass(eq=False)
+class Hand:
+    """One hand: where it is wanted, what it holds, and where its numbers lie in MuJoCo's arrays."""
+
+    side: str
+    closed: bool = False
+    free: int = LINGER
+    """[tick] since the last touch."""
+    force: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    holds: tuple[str, str] | None = None
+    """Actor and link."""
+    grip: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(7))
+    """[7] of the hand in what it holds."""
+    rides: bool = False
+    """On a plant, to which it gives its force: see :mod:`vinesim.physics.holding`."""
+    body: int = -1
+    weld: int = -1
+    q: slice = dataclasses.field(default_factory=lambda: slice(0))
+    v: slice = dataclasses.field(default_factory=lambda: slice(0))
+
+    @property
+    def link(self) -> str:
+        """Name of the hand's link."""
+        return f"{self.side}_hand"
+
+
+class Person:
+    """One person in MuJoCo's world: two hands that are free bodies, and a kinematic body."""
+
+    def __init__(self, spec: HumanSpec, bit: int) -> None:
+        for name in ("height", "stiffness", "force"):
+            value = getattr(spec, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise HumanError(f"human {spec.name!r}: {name} is {value}; give a number above 0")
+        self.spec, self.bit = spec, bit
+        self.damping = 2.0 * math.sqrt(spec.stiffness * MASS)
+        """[N s/m] of the hand against its controller: an empty hand comes back without swinging over."""
+        self.hands = tuple(Hand(side) for side in SIDES)
+        self.bodies: dict[str, int] = {}
+        self.part_bodies = np.zeros(0, int)
+        """MuJoCo's bodies of :data:`PARTS`."""
+        self._mocap = self._hand_q = np.zeros(0, int)
+        self._meets = 0
+        self._fresh = True
+        self.move(spec.pose)
+        self._before = self._now
+        self._way = self._turn = _STILL
+
+    @property
+    def parts(self) -> np.ndarray:
+        """Poses [part, 7] of :data:`PARTS`."""
+        return self._now[: len(PARTS)]
+
+    def controller(self, hand: Hand) -> np.ndarray:
+        """Pose [7] that a hand is wanted at."""
+        return self._now[len(PARTS) + self.hands.index(hand)]
+
+    def move(self, pose: HumanPose) -> None:
+        """Take over where the tracked points are: the body is there at once, the hands try to be."""
+        for field in dataclasses.fields(pose):
+            value = getattr(pose, field.name)
+            if isinstance(value, bool | np.bool_):
+                continue
+            if np.shape(value) != (7,) or not np.isfinite(value).all() or abs(np.linalg.norm(value[3:]) - 1.0) > 1e-3:
+                raise HumanError(
+                    f"human {self.spec.name!r}: {field.name} is {value}; give seven finite numbers, position and unit "
+                    "quaternion (x, y, z, w)"
+                )
+        self._now = np.concatenate([posture(self.spec.height, pose), [pose.left, pose.right]])
+        """Poses of :data:`PARTS`, then of both controllers."""
+        for hand in self.hands:
+            hand.closed = bool(getattr(pose, f"{hand.side}_closed"))
+
+    def hand(self, side: str) -> Hand:
+        """The left or the right hand."""
+        if side not in SIDES:
+            raise HumanError(f"human {self.spec.name!r} has no {side!r} hand; it has: {', '.join(SIDES)}")
+        return self.hands[SIDES.index(side)]
+
+    # ------------------------------------------------------------------ in MuJoCo
+
+    def attach(self, spec: mujoco.MjSpec, meets: int, ground: int, friction: list[float]) -> None:
+        """Add the person's bodies: they meet whatever has a bit in ``meets``, of which ``ground`` only hands do."""
+        name, self._meets = self.spec.name, meets
+        for part, shape, pose in zip(PARTS, figure(self.spec.height), self.parts, strict=True):
+            body = spec.worldbody.add_body(name=f"{name}/{part}", mocap=True)
+            body.pos, body.quat = pose[:3], frames.to_wxyz(pose[3:])
+            _add(body, shape, 1 << self.bit, meets & ~ground, friction)
+        for hand in self.hands:
+            at = self.controller(hand)
+            body = spec.worldbody.add_body(
+                name=f"{name}/{hand.link}", pos=at[:3], quat=frames.to_wxyz(at[3:]), mass=MASS, ipos=np.zeros(3),
+                inertia=[INERTIA] * 3,
+                explicitinertial=True, gravcomp=1.0, sleep=mujoco.mjtSleepPolicy.mjSLEEP_NEVER,
+            )  # fmt: skip
+            body.add_freejoint(name=f"{name}/{hand.link}")
+            for shape in hand_shapes(hand.side):
+                _add(body, shape, 1 << self.bit, meets, friction)
+            spec.add_equality(
+                name=f"{name}/{hand.link}", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
+                name1=f"{name}/{hand.link}", active=False, solref=[0.02, 1.0], solimp=[0.99, 0.999, 0.001, 0.5, 2.0],
+            )  # fmt: skip
+
+    def locate(self, m: mujoco.MjModel) -> None:
+        """Find the person's numbers in a world that was compiled anew."""
+        name = self.spec.name
+        self.part_bodies = np.array([m.body(f"{name}/{part}").id for part in PARTS], int)
+        self._mocap = m.body_mocapid[self.part_bodies]
+        self.bodies = dict(zip(PARTS, self.part_bodies.tolist(), strict=True))
+        for hand in self.hands:
+            joint = m.joint(f"{name}/{hand.link}")
+            hand.body = self.bodies[hand.link] = m.body(f"{name}/{hand.link}").id
+            hand.weld = m.equality(f"{name}/{hand.link}").id
+            hand.q = slice(joint.qposadr[0], joint.qposadr[0] + 7)
+            hand.v = slice(joint.dofadr[0], joint.dofadr[0] + 6)
+        self._hand_q = np.stack([np.arange(hand.q.start, hand.q.stop) for hand in self.hands])
+        self._fresh = True
+
+    def drive(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
+        """Before a tick: the body where it is told to be, each hand free at its controller or on its spring."""
+        moved = self._before is not self._now
+        self._way, self._turn = _apart(self._before, self._now) if moved else (_STILL, _STILL)
+        if moved or self._fresh:
+            d.mocap_pos[self._mocap] = self.parts[:, :3]
+            d.mocap_quat[self._mocap] = frames.to_wxyz(self.parts[:, 3:])
+            self._fresh = False
+        at = d.qpos[self._hand_q]
+        at[:, 3:] = frames.from_wxyz(at[:, 3:])
+        held = np.array([hand.free < LINGER for hand in self.hands])
+        goal = np.where(held[:, None], self._now[len(PARTS) :], self._before[len(PARTS) :])
+        offsets, angles = _apart(at, goal)
+        steps, turns = self._way[len(PARTS) :], self._turn[len(PARTS) :]
+        for hand, here, offset, angle, step, turn in zip(self.hands, at, offsets, angles, steps, turns, strict=True):
+            velocity = d.qvel[hand.v]
+            if hand.rides:
+                velocity[:] = d.xfrc_applied[hand.body] = 0.0
+            elif hand.free < LINGER:
+                turning = frames.rotate(here[3:], velocity[3:])
+                force = self.spec.stiffness * offset + self.damping * (step / dt - velocity[:3])
+                moment = TURN * angle + TURN_DAMPING * (turn / dt - turning)
+                d.xfrc_applied[hand.body, :3] = _at_most(self.spec.force, force)
+                d.xfrc_applied[hand.body, 3:] = _at_most(MOMENT, moment)
+            else:
+                step = step + offset * dt / max(RETURN, math.sqrt(offset @ offset) / HURRY)
+                velocity[:3] = self._look(m, d, hand, here[:3], step) / dt
+                velocity[3:] = frames.rotate(frames.conjugate(here[3:]), turn / dt + angle / RETURN)
+                d.xfrc_applied[hand.body] = 0.0
+
+    def _look(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand, at: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """A step [3] m of a fast free hand, shortened if something is in its way."""
+        length = float(np.linalg.norm(step))
+        if length < THICK:
+            return step
+        way, gone, geom = step / length, 0.0, np.zeros(1, np.int32)
+        while gone < length + THICK:
+            ahead = mujoco.mj_ray(m, d, at + gone * way, way, None, 1, hand.body, geom)
+            if ahead < 0.0 or gone + ahead > length + THICK:
+                return step
+            if m.geom_contype[geom[0]] & ~(1 << self.bit):  # neither one's own body nor what is only to be seen
+                return way * max(gone + ahead - 0.8 * THICK, 0.0)
+            gone += ahead + 1e-3
+        return step
+
+    def sweep(self, d: mujoco.MjData, dt: float) -> None:
+        """After positions are known: how fast the body moves, which MuJoCo does not know of bodies without joints."""
+        if self._way is not _STILL:
+            way, turn = self._way[: len(PARTS)], self._turn[: len(PARTS)]
+            arm = d.subtree_com[self.part_bodies] - self.parts[:, :3]
+            d.cvel[self.part_bodies, :3] = turn / dt
+            d.cvel[self.part_bodies, 3:] = (way + frames.cross(turn, arm)) / dt
+
+    def feel(self, d: mujoco.MjData) -> None:
+        """After a tick: with what force the hands met the world, held it, or were held."""
+        self._before = self._now
+        for hand in self.hands:
+            if not hand.rides:
+                felt = d.qfrc_constraint[hand.v] + d.qfrc_applied[hand.v]
+                hand.force = -felt[:3]
+                hand.free = 0 if hand.holds is not None or felt.any() else hand.free + 1
+
+    def sample(self, hand: Hand, d: mujoco.MjData) -> HandSample:
+        """What is known of a hand."""
+        pose = np.concatenate([d.qpos[hand.q][:3], frames.from_wxyz(d.qpos[hand.q][3:])])
+        return HandSample(pose, self.controller(hand).copy(), hand.force.copy(), hand.free == 0, hand.holds)
+
+    # ------------------------------------------------------------------ holding
+
+    def grasp(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand, body: int | None) -> None:
+        """Weld a hand to a MuJoCo body at ``hand.grip``; None: it only stops touching, and rides on a plant.
+
+        A hand that holds meets nothing: what it holds does.
+        """
+        hand.rides, hand.free = body is None, 0
+        d.eq_active[hand.weld] = body is not None
+        if body is not None:
+            m.eq_obj2id[hand.weld] = body
+            m.eq_data[hand.weld, :3], m.eq_data[hand.weld, 3:6] = hand.grip[:3], 0.0
+            m.eq_data[hand.weld, 6:10] = frames.to_wxyz(frames.conjugate(hand.grip[3:]))
+            m.eq_data[hand.weld, 10] = 1.0
+            if m.body_treeid[body] >= 0:
+                d.tree_awake[m.body_treeid[body]] = 1
+        self._touchable(m, hand, yes=False)
+
+    def release(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand) -> None:
+        """Open a hand; it hangs on its spring a little longer and then returns to its controller."""
+        hand.holds, hand.rides, hand.free = None, False, 0
+        d.eq_active[hand.weld] = 0
+        self._touchable(m, hand, yes=True)
+
+    def _touchable(self, m: mujoco.MjModel, hand: Hand, *, yes: bool) -> None:
+        geoms = slice(m.body_geomadr[hand.body], m.body_geomadr[hand.body] + m.body_geomnum[hand.body])
+        bit, meets = (1 << self.bit, self._meets) if yes else (0, 0)
+        m.geom_contype[geoms] = m.body_contype[hand.body] = bit
+        m.geom_conaffinity[geoms] = m.body_conaffinity[hand.body] = meets
+
+
+def _add(body: mujoco.MjsBody, shape: Shape, contype: int, conaffinity: int, friction: list[float]) -> None:
+    size = [*shape.size, 0.0, 0.0][:3]
+    body.add_geom(
+        type=_KINDS[shape.kind], size=size, pos=shape.pose[:3], quat=frames.to_wxyz(shape.pose[3:]), mass=0.0,
+        contype=contype, conaffinity=conaffinity, friction=friction, priority=1,
+        solimp=[0.99, 0.999, 0.001, 0.5, 2.0],
+    )  # fmt: skip
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Way [..., 3] m and turn [..., 3] rad from pose ``a`` to pose ``b``, world axes."""
+    return b[..., :3] - a[..., :3], frames.log(frames.multiply(b[..., 3:], frames.conjugate(a[..., 3:])))
+
+
+def _at_most(limit: float, vector: np.ndarray) -> np.ndarray:
+    length = float(np.linalg.norm(vector))
+    return vector * (limit / length) if length > limit else vector
