@@ -337,9 +337,9 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
     urdf.link(
         f"{prefix}_base_link",
         (
-            box((0.05, 0.12, 0.06), (0.035, 0, 0), colour="dark"),
+            box((0.05, 0.15, 0.06), (0.035, 0, 0), colour="dark"),
             cylinder(0.04, 0.02, (0.008, 0, 0), ALONG, colour="dark"),
-            box((0.04, 0.122, 0.012), (0.035, 0, 0.015), colour="red", solid=False),
+            box((0.04, 0.152, 0.012), (0.035, 0, 0.015), colour="red", solid=False),
         ),
         mass=0.75,
     )
@@ -353,16 +353,16 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
         urdf.link(f"{prefix}_{finger}_finger_link", pad, mass=0.12)
         urdf.move(
             f"{prefix}_{finger}_finger_joint", "prismatic", f"{prefix}_base_link", f"{prefix}_{finger}_finger_link",
-            xyz=(0.06, 0, 0), axis=(0, outward, 0), lower=0.0, upper=0.06, effort=60.0, velocity=0.10, damping=5.0,
+            xyz=(0.06, 0, 0), axis=(0, outward, 0), lower=0.0, upper=0.075, effort=60.0, velocity=0.10, damping=5.0,
         )  # fmt: skip
     urdf.link(f"{prefix}_grasping_link")
     urdf.fix(f"{prefix}_grasping_link", f"{prefix}_base_link", (0.125, 0, 0))
-    blade = (
-        box((0.10, 0.02, 0.008), (-0.05, 0, 0.006), colour="dark"),
-        box((0.03, 0.05, 0.003), (-0.005, 0, 0), colour="red"),
-    )
-    urdf.link(f"{prefix}_cutter_link", blade, mass=0.15)
-    urdf.fix(f"{prefix}_cutter_link", f"{prefix}_base_link", (0.135, 0, 0.035))
+    # Two prongs above the fingers, between which the stalk comes to stand while they hold the bunch by its thickest
+    # part; the link's origin is the middle of the mouth.
+    reach = (box((0.114, 0.006, 0.006), (-0.032, side * 0.023, 0), colour="red") for side in (1.0, -1.0))
+    cutter = (box((0.03, 0.06, 0.046), (-0.09, 0, -0.02), colour="dark"), *reach)
+    urdf.link(f"{prefix}_cutter_link", cutter, mass=0.15)
+    urdf.fix(f"{prefix}_cutter_link", f"{prefix}_base_link", (0.125, 0, 0.072))
 
 
 if __name__ == "__main__":
