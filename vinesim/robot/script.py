@@ -1,0 +1,85 @@
+"""A job told in the order in which it happens: a generator that commands, then yields once a tick.
+
+    class Wave(Script):
+        def steps(self):
+            yield from self.until(lambda: self.hand_is_up, patience=5.0, phase="raise", otherwise="the hand stays down")
+
+What goes wrong ends the job with a reason in words.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+
+from vinesim.robot.drives import Robot
+
+log = logging.getLogger(__name__)
+
+
+class Failed(Exception):
+    """The job cannot go on; the text says why."""
+
+
+class Script:
+    """Runs :meth:`steps` one tick at a time. ``reason`` is empty as long as all goes well."""
+
+    def __init__(self, robot: Robot, *, seconds: float) -> None:
+        """Given up after ``seconds`` [s]."""
+        self.robot, self.seconds = robot, seconds
+        self.time = 0.0
+        """Of the present tick [s]."""
+        self.phase = ""
+        """What it is at."""
+        self.durations: dict[str, float] = {}
+        """How long each phase took, in their order [s]."""
+        self.done = False
+        self.reason = ""
+        """Why it failed, if it did."""
+        self._started: float | None = None
+        self._steps = self.steps()
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether it came to its end."""
+        return self.done and not self.reason
+
+    def steps(self) -> Iterator[str]:
+        """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`Failed`."""
+        raise NotImplementedError
+
+    def control(self, time: float) -> None:
+        """Command the robot for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
+        if self.done:
+            return
+        if self._started is None:
+            self._started = time
+        self.time = time
+        try:
+            if time - self._started > self.seconds:
+                raise Failed(f"not done after {self.seconds:.0f} s")
+            self.phase = next(self._steps)
+            self.durations[self.phase] = self.durations.get(self.phase, 0.0) + self.robot.rigid.dt
+        except StopIteration:
+            self.done = True
+        except Failed as failure:
+            self.done = True
+            self.reason = f"{self.phase}: {failure}"
+            log.warning("%s: %s", self.robot.name, self.reason)
+
+    def until(
+        self, there: Callable[[], bool], phase: str, patience: float, otherwise: Callable[[], str]
+    ) -> Iterator[str]:
+        """Wait, at least a tick, until ``there`` says so; after ``patience`` [s] the job fails for the reason given."""
+        end = self.time + patience
+        yield phase
+        while not there():
+            if self.time > end:
+                raise Failed(otherwise())
+            yield phase
+
+    def wait(self, seconds: float, phase: str) -> Iterator[str]:
+        """Let ``seconds`` [s] pass."""
+        end = self.time + seconds
+        while self.time < end:
+            yield phase
