@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -46,10 +47,12 @@ CARRY = np.array([0.45, 0.12, 1.20])
 """Where the left hand is while the base drives, in the base's axes [m]; the right one's is mirrored."""
 OVER = 0.50
 """From so far above its rim the hand goes down into a box [m]."""
-SINK = 0.20
+SINK = 0.19
 """Height of the hand above the bottom of the box when it lets go [m]: vinebot's arm reaches no deeper beside its base,
 and the lower end of a bunch hangs some 0.12 m below the hand.
 """
+CALM = 0.20
+"""Speed of a hand that carries [m/s]."""
 RELEASE = 0.05
 """The fingers let go by opening this much further [m]; more would touch the walls."""
 LOST = 0.12
@@ -106,6 +109,16 @@ class Pick(Script):
         """Whether the bunch came to lie in the box."""
         return self.succeeded
 
+    def report(self) -> dict[str, Any]:
+        """See :class:`Script`."""
+        where = {"bunch": self.task.bunch, "side": self.task.side, "box": self.task.box}
+        return {"picked": self.picked, **where, "bunch_kg": round(self.mass, 4), **super().report()}
+
+    @property
+    def mass(self) -> float:
+        """Of the bunch [kg]."""
+        return float(self.physics.model.body_mass[self._body])
+
     @property
     def bunch_pose(self) -> np.ndarray:
         """Where the bunch is [7]: its upper end, x along its axis."""
@@ -140,7 +153,7 @@ class Pick(Script):
         yield from self._part()
         back = self.hand.point - AWAY * ahead + [0.0, 0.0, -0.03]
         yield from self._lead("back", lambda: back, ahead, speed=0.15, patience=6.0)
-        yield from self._lead("tuck", lambda: self._of_base(CARRY), ahead, patience=10.0, near=0.03)
+        yield from self._lead("tuck", lambda: self._of_base(CARRY), ahead, speed=CALM, patience=10.0, near=0.03)
         yield from self._drive()
         yield from self._lay()
         yield from self.wait(1.0, "rest")
@@ -192,7 +205,7 @@ class Pick(Script):
         # turned down, the bunch points back to where the base looks from
         middle = self.box_pose[:3] + (0.5 * self._length - self._depth) * along
         over, low = middle - (rim + OVER) * down, middle - (CRATE_WALL + SINK) * down
-        yield from self._lead("over", lambda: over, along, patience=12.0)
+        yield from self._lead("over", lambda: over, along, speed=CALM, patience=12.0)
         self._up = along
         yield from self._lead("turn", lambda: over, down, patience=6.0)
         yield from self._lead("lower", lambda: low, down, speed=0.15, patience=8.0, near=0.03)

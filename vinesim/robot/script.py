@@ -2,7 +2,9 @@
 
     class Wave(Script):
         def steps(self):
-            yield from self.until(lambda: self.hand_is_up, patience=5.0, phase="raise", otherwise="the hand stays down")
+            for angle in (0.5, -0.5, 0.0):
+                self.robot.command_position([angle], ["arm_left_3_joint"])
+                yield from self.wait(1.0, "wave")
 
 What goes wrong ends the job with a reason in words.
 """
@@ -10,7 +12,8 @@ What goes wrong ends the job with a reason in words.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import Any
 
 from vinesim.robot.drives import Robot
 
@@ -44,6 +47,11 @@ class Script:
         """Whether it came to its end."""
         return self.done and not self.reason
 
+    def report(self) -> dict[str, Any]:
+        """How it went, as plain values for JSON."""
+        phases = {phase: round(seconds, 2) for phase, seconds in self.durations.items()}
+        return {"succeeded": self.succeeded, "reason": self.reason, "phase": self.phase, "phases_s": phases}
+
     def steps(self) -> Iterator[str]:
         """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`Failed`."""
         raise NotImplementedError
@@ -66,17 +74,6 @@ class Script:
             self.done = True
             self.reason = f"{self.phase}: {failure}"
             log.warning("%s: %s", self.robot.name, self.reason)
-
-    def until(
-        self, there: Callable[[], bool], phase: str, patience: float, otherwise: Callable[[], str]
-    ) -> Iterator[str]:
-        """Wait, at least a tick, until ``there`` says so; after ``patience`` [s] the job fails for the reason given."""
-        end = self.time + patience
-        yield phase
-        while not there():
-            if self.time > end:
-                raise Failed(otherwise())
-            yield phase
 
     def wait(self, seconds: float, phase: str) -> Iterator[str]:
         """Let ``seconds`` [s] pass."""
