@@ -11,7 +11,8 @@ from vinesim import frames
 from vinesim.physics.rigid import Rigid
 from vinesim.robot.description import Description, DescriptionError, load
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.reach import Phase, ReachAndPush, prioritized
+from vinesim.robot.hand import prioritized
+from vinesim.robot.reach import Phase, ReachAndPush
 from vinesim.world.grow import assemble
 
 HERE = frames.pose([0.0, 0.0, 0.0])

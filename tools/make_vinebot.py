@@ -337,32 +337,36 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
     urdf.link(
         f"{prefix}_base_link",
         (
-            box((0.05, 0.12, 0.06), (0.035, 0, 0), colour="dark"),
+            box((0.05, 0.15, 0.06), (0.035, 0, 0), colour="dark"),
             cylinder(0.04, 0.02, (0.008, 0, 0), ALONG, colour="dark"),
-            box((0.04, 0.122, 0.012), (0.035, 0, 0.015), colour="red", solid=False),
+            box((0.04, 0.152, 0.012), (0.035, 0, 0.015), colour="red", solid=False),
         ),
         mass=0.75,
     )
     urdf.fix(f"{prefix}_base_link", f"wrist_{side}_ft_link", (0, 0, -0.028), (0, math.pi / 2, 0))
     for finger, outward in (("left", 1.0), ("right", -1.0)):
+        # two faces that slope towards each other: a round thing comes to rest between them and cannot slide out ahead
+        slope, face, deep = math.radians(20.0), 0.0287, 0.008
+        back, aside = 0.5 * (face * math.sin(slope) + deep * math.cos(slope)), 0.5 * deep * math.sin(slope)
         pad = (
-            box((0.08, 0.014, 0.024), (0.04, outward * 0.007, 0), colour="steel"),
-            cylinder(0.012, 0.014, (0.08, outward * 0.007, 0), ACROSS, colour="steel"),
-            box((0.05, 0.002, 0.022), (0.06, 0, 0), colour="rubber", solid=False),
+            box((face, deep, 0.03), (0.0515 - aside, outward * back, 0), (0, 0, outward * slope), colour="rubber"),
+            box((face, deep, 0.03), (0.0785 + aside, outward * back, 0), (0, 0, -outward * slope), colour="rubber"),
+            box((0.092, 0.008, 0.02), (0.046, outward * 0.020, 0), colour="steel"),
+            box((0.01, 0.02, 0.02), (0.01, outward * 0.014, 0), colour="steel", solid=False),
         )
         urdf.link(f"{prefix}_{finger}_finger_link", pad, mass=0.12)
         urdf.move(
             f"{prefix}_{finger}_finger_joint", "prismatic", f"{prefix}_base_link", f"{prefix}_{finger}_finger_link",
-            xyz=(0.06, 0, 0), axis=(0, outward, 0), lower=0.0, upper=0.06, effort=60.0, velocity=0.10, damping=5.0,
+            xyz=(0.06, 0, 0), axis=(0, outward, 0), lower=0.0, upper=0.075, effort=60.0, velocity=0.10, damping=5.0,
         )  # fmt: skip
     urdf.link(f"{prefix}_grasping_link")
     urdf.fix(f"{prefix}_grasping_link", f"{prefix}_base_link", (0.125, 0, 0))
-    blade = (
-        box((0.10, 0.02, 0.008), (-0.05, 0, 0.006), colour="dark"),
-        box((0.03, 0.05, 0.003), (-0.005, 0, 0), colour="red"),
-    )
-    urdf.link(f"{prefix}_cutter_link", blade, mass=0.15)
-    urdf.fix(f"{prefix}_cutter_link", f"{prefix}_base_link", (0.135, 0, 0.035))
+    # Two prongs above the fingers, between which the stalk comes to stand while they hold the bunch by its thickest
+    # part; the link's origin is the middle of the mouth.
+    reach = (box((0.114, 0.006, 0.006), (-0.032, side * 0.023, 0), colour="red") for side in (1.0, -1.0))
+    cutter = (box((0.03, 0.06, 0.046), (-0.09, 0, -0.02), colour="dark"), *reach)
+    urdf.link(f"{prefix}_cutter_link", cutter, mass=0.15)
+    urdf.fix(f"{prefix}_cutter_link", f"{prefix}_base_link", (0.125, 0, 0.072))
 
 
 if __name__ == "__main__":

@@ -75,14 +75,22 @@ def checked_bunch(model: Model, bunch: int | None) -> int | None:
     return bunch
 
 
-def free_room(model: Model, points: np.ndarray) -> np.ndarray:
-    """Distance on the ground from points [n, 2] to the nearest post, trunk or box [n] m (infinite if there is none)."""
+def free_room(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
+    """Distance on the ground from points [n, 2] to the nearest post, trunk or box [n] m (infinite if there is none).
+
+    ``without``: a box that does not count.
+    """
     solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
-    middles = np.concatenate([model.fixed_start[solid, :2], model.box_pose[:, :2]])
-    radii = np.concatenate([model.fixed_radius[solid].max(1), 0.5 * np.hypot(*model.box_size[:, :2].T)])
-    if not len(middles):
-        return np.full(len(points), np.inf)
-    return (np.linalg.norm(points[:, None] - middles, axis=-1) - radii).min(1)
+    room = np.full(len(points), np.inf)
+    if solid.any():
+        middles, radii = model.fixed_start[solid, :2], model.fixed_radius[solid].max(1)
+        room = (np.linalg.norm(points[:, None] - middles, axis=-1) - radii).min(1)
+    for box, pose in enumerate(model.box_pose.astype(float)):
+        if box != without:
+            beside = np.pad(points - pose[:2], ((0, 0), (0, 1)))
+            local = np.abs(frames.rotate(frames.conjugate(pose[3:]), beside))[:, :2]
+            room = np.minimum(room, np.linalg.norm(np.maximum(local - 0.5 * model.box_size[box, :2], 0.0), axis=1))
+    return room
 
 
 def stand_before_a_bunch(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:

@@ -1,0 +1,82 @@
+"""A job told in the order in which it happens: a generator that commands, then yields once a tick.
+
+    class Wave(Script):
+        def steps(self):
+            for angle in (0.5, -0.5, 0.0):
+                self.robot.command_position([angle], ["arm_left_3_joint"])
+                yield from self.wait(1.0, "wave")
+
+What goes wrong ends the job with a reason in words.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+from vinesim.robot.drives import Robot
+
+log = logging.getLogger(__name__)
+
+
+class Failed(Exception):
+    """The job cannot go on; the text says why."""
+
+
+class Script:
+    """Runs :meth:`steps` one tick at a time. ``reason`` is empty as long as all goes well."""
+
+    def __init__(self, robot: Robot, *, seconds: float) -> None:
+        """Given up after ``seconds`` [s]."""
+        self.robot, self.seconds = robot, seconds
+        self.time = 0.0
+        """Of the present tick [s]."""
+        self.phase = ""
+        """What it is at."""
+        self.durations: dict[str, float] = {}
+        """How long each phase took, in their order [s]."""
+        self.done = False
+        self.reason = ""
+        """Why it failed, if it did."""
+        self._started: float | None = None
+        self._steps = self.steps()
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether it came to its end."""
+        return self.done and not self.reason
+
+    def report(self) -> dict[str, Any]:
+        """How it went, as plain values for JSON."""
+        phases = {phase: round(seconds, 2) for phase, seconds in self.durations.items()}
+        return {"succeeded": self.succeeded, "reason": self.reason, "phase": self.phase, "phases_s": phases}
+
+    def steps(self) -> Iterator[str]:
+        """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`Failed`."""
+        raise NotImplementedError
+
+    def control(self, time: float) -> None:
+        """Command the robot for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
+        if self.done:
+            return
+        if self._started is None:
+            self._started = time
+        self.time = time
+        try:
+            if time - self._started > self.seconds:
+                raise Failed(f"not done after {self.seconds:.0f} s")
+            self.phase = next(self._steps)
+            self.durations[self.phase] = self.durations.get(self.phase, 0.0) + self.robot.rigid.dt
+        except StopIteration:
+            self.done = True
+        except Failed as failure:
+            self.done = True
+            self.reason = f"{self.phase}: {failure}"
+            log.warning("%s: %s", self.robot.name, self.reason)
+
+    def wait(self, seconds: float, phase: str) -> Iterator[str]:
+        """Let ``seconds`` [s] pass."""
+        end = self.time + seconds
+        while self.time < end:
+            yield phase
