@@ -367,6 +367,14 @@ def test_a_box_slides_from_mu_m_g_on():
         assert (rigid.data.body("box/0").xpos[0] > 0.005) == moves
 
 
+def test_what_was_held_still_falls_when_it_is_let_go():
+    """It was so still that the solver would have let it sleep: not in the air."""
+    rigid, _ = lifted(0.8, 0.3)
+    rigid.let_go("eva", "right")
+    step(rigid, 100)
+    assert rigid.data.body("box/0").xpos[2] < 0.01
+
+
 def test_a_robot_is_taken_by_the_link_and_let_go():
     rigid, spec = soft_arm()
     rigid.move_human("eva", put(spec.pose, (-0.1, 0.0, 1.1)))

@@ -37,6 +37,8 @@ HURRY = 1.5
 """[m/s]"""
 THICK = 0.012
 """[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
+ROUSED = -1 - mujoco.mjMINAWAKE
+"""What MuJoCo counts up in ``tree_asleep`` of who has just been woken: so many ticks must pass before he may sleep."""
 SKIN = (0.85, 0.62, 0.5, 1.0)
 CLOTH = (0.98, 0.47, 0.16, 1.0)
 
@@ -351,6 +353,9 @@ class Person:
     def release(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand) -> None:
         """Open a hand; it hangs on its spring a little longer and then returns to its controller."""
         hand.holds, hand.rides, hand.free = None, False, 0
+        held = m.body_treeid[m.eq_obj2id[hand.weld]]
+        if d.eq_active[hand.weld] and held >= 0:
+            d.tree_asleep[held] = ROUSED  # held still for long, it would fall asleep where it hangs
         d.eq_active[hand.weld] = 0
         self._touchable(m, hand, yes=True)
 

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.people import PARTS, Hand, HumanError, Person, figure, hand_shapes
+from vinesim.physics.people import PARTS, ROUSED, Hand, HumanError, Person, figure, hand_shapes
 from vinesim.physics.urdf import RobotError, check, shapes_of, touchable
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
@@ -677,7 +677,7 @@ class Rigid:
                 # MuJoCo gives it about the centre of mass of the whole robot, and as what the parent does
                 x, y, z = (d.subtree_com[m.body_rootid[body]] - d.xpos[body]).tolist()
                 u, v, w = inner[3:].tolist()
-                moment = inner[:3] + (y * w - z * v, z * u - x * w, x * v - y * u)
+                moment = inner[:3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
                 wrench[:3], wrench[3:] = -inner[3:] @ turn, -moment @ turn
                 mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, acceleration, 1)
 
@@ -1114,7 +1114,7 @@ def _drop(spec: mujoco.MjSpec, loose: Loose) -> None:
             kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
         body.add_geom(
             type=kind, size=[float(radius), 0, 0], mass=0.0, contype=_BOX, conaffinity=_ALL, condim=6,
-            friction=[FRICTION, 0.005, ROLLING], priority=1, solref=SOFT, solimp=[0.9, 0.95, 0.001, 0.5, 2], **place,
+            friction=[FRICTION, 0.005, ROLLING], priority=1, solref=SOFT, solimp=[0.99, 0.999, 0.001, 0.5, 2], **place,
         )  # fmt: skip
     for _ in range(LUMPS - len(loose.radius)):
         body.add_geom(
@@ -1186,6 +1186,7 @@ def _carried(
     joints = {old.joint(i).name: i for i in range(old.njnt)}
     pairs = [(i, joints[name]) for i in range(new.njnt) if (name := new.joint(i).name) in joints and name not in parked]
     asleep = _sleepers(old, old_data, new, pairs)
+    leaning = _leaning(old, old_data, pairs)
     # Only making its data lets MuJoCo take things for asleep. They lie where they are and depend on nothing.
     for i, j in pairs:
         if new.jnt_type[i] == _FREE:
@@ -1208,7 +1209,7 @@ def _carried(
         if tree in asleep:
             data.tree_asleep[tree] = asleep[tree]
         elif old_data.tree_asleep[was] < 0:
-            data.tree_asleep[tree] = old_data.tree_asleep[was]
+            data.tree_asleep[tree] = ROUSED if was in leaning else old_data.tree_asleep[was]
     bodies = {old.body(i).name: i for i in range(1, old.nbody)}
     for i in range(1, new.nbody):
         if (j := bodies.get(new.body(i).name)) is not None and new.body(i).name not in parked:
@@ -1217,6 +1218,13 @@ def _carried(
                 data.mocap_pos[new.body_mocapid[i]] = old_data.mocap_pos[old.body_mocapid[j]]
                 data.mocap_quat[new.body_mocapid[i]] = old_data.mocap_quat[old.body_mocapid[j]]
     return data, contact
+
+
+def _leaning(old: mujoco.MjModel, old_data: mujoco.MjData, pairs: list[tuple[int, int]]) -> set[int]:
+    """Trees of the old world that were in touch with one that is gone, or held by it: they may not sleep at once."""
+    gone = np.setdiff1d(np.arange(old.ntree), old.dof_treeid[old.jnt_dofadr[[j for _, j in pairs]]])
+    islands = np.unique(old_data.tree_island[gone])
+    return set(np.flatnonzero(np.isin(old_data.tree_island, islands[islands >= 0])).tolist())
 
 
 def _sleepers(
