@@ -104,9 +104,12 @@ def test_split_step_is_mj_step_to_the_bit():
         assert (twin.qvel == rigid.data.qvel).all()
 
 
-def test_prediction_and_response_are_what_the_second_half_does():
+@pytest.mark.parametrize("exact", [False, True])
+def test_prediction_and_response_are_what_the_second_half_does(exact):
     rigid = Rigid(yard())
     rigid.add_robot(arm())
+    if exact:
+        rigid.tune("anna", np.full(3, 60.0), np.full(3, 5.0), np.zeros(3), exact=np.ones(3, bool))
     rigid.command("anna", HOME + np.array([0.2, -0.3, 0.02]))
     step(rigid, 5)
     rng = np.random.default_rng(1)
