@@ -365,6 +365,11 @@ class Rigid:
         """[joint] what the drives give to carry the robot's own weight [N m or N], part of their effort."""
         return self.data.qfrc_gravcomp[self._robot(name).v]
 
+    def inertia(self, name: str) -> np.ndarray:
+        """[joint] what each drive has to speed up if the others stand, rotor included [kg m2 or kg], in this pose."""
+        m = self.world
+        return self.data.M[m.M_rowadr + m.M_rownnz - 1][self._robot(name).v]
+
     def base(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (world axes) of the base link."""
         robot, d = self._robot(name), self.data
@@ -540,7 +545,7 @@ class Rigid:
                 # MuJoCo gives it about the centre of mass of the whole robot, and as what the parent does
                 x, y, z = (d.subtree_com[m.body_rootid[body]] - d.xpos[body]).tolist()
                 u, v, w = inner[3:].tolist()
-                moment = inner[:3] + (y * w - z * v, z * u - x * w, x * v - y * u)
+                moment = inner[:3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
                 wrench[:3], wrench[3:] = -inner[3:] @ turn, -moment @ turn
                 mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, acceleration, 1)
 
