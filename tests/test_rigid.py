@@ -135,6 +135,18 @@ def test_response_holds_the_stiffness_of_a_limit_that_is_active():
     np.testing.assert_allclose(rigid.data.qvel, predicted, atol=1e-7)
 
 
+def test_new_gains_do_not_change_what_was_felt():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.command("anna", HOME + 0.02)
+    step(rigid, 10)
+    before = rigid.read("anna")[2].copy()
+    assert np.abs(before).max() > 1.0
+    rigid.tune("anna", np.full(3, 50.0), np.full(3, 5.0), np.full(3, 7.0), exact=np.ones(3, bool))
+    rigid.command("anna", HOME - 1.0)
+    np.testing.assert_allclose(rigid.read("anna")[2], before, atol=1e-9)
+
+
 def test_gravity_compensation_holds_the_pose_and_effort_is_the_weight():
     rigid = Rigid(yard())
     rigid.add_robot(arm())

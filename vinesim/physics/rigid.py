@@ -310,12 +310,16 @@ class Rigid:
         stiffness, as stiff servos should be. All stay until they are given anew.
         """
         robot = self._robot(name)
+        before = robot.stiffness.copy()
         robot.stiffness[:], robot.damping[:], robot.forward[:] = stiffness, damping, effort
         if limit is not None:
             robot.effort[:] = np.minimum(limit, robot.most)
         if exact is not None:
             robot.exact[:] = exact
+        q, v = self.data.qpos[robot.q], self.data.qvel[robot.v]
+        given = robot.control - before * q - robot.soon * v
         self._set_gains(robot)
+        robot.control[:] = given + robot.stiffness * q + robot.soon * v  # what was given in the last tick stays so
 
     def drive_base(self, name: str, velocity: tuple[float, float, float]) -> None:
         """Ask the tracks for (vx, vy, wz) [m/s, m/s, rad/s] in the base's axes; zero holds the place."""
