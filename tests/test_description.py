@@ -102,7 +102,7 @@ def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: Description) -> Non
         off = frames.compose(frames.inverse(mouth), tips)[:3]
         assert abs(off[0]) < cutter.half[0]
         assert abs(off[1]) < cutter.half[1]
-        assert -0.05 < off[2] < -0.02
+        assert -0.10 < off[2] < -0.02
 
 
 def test_bunches_are_within_reach(vinebot: Description) -> None:

@@ -496,6 +496,7 @@ class Rigid:
         if force is not None:
             np.add(force, 0.0, out=d.qfrc_applied)  # +0 for -0, which would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
+        self._feel()
         if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
             self._roll_back()
             force = None
@@ -505,7 +506,6 @@ class Rigid:
             out = np.zeros(m.nv)
             mujoco.mj_mulJacTVec(m, d, out, native)
             self._contact += out
-        self._feel()
         self._fresh = False
 
     # ------------------------------------------------------------------ inside
@@ -651,7 +651,6 @@ class Rigid:
             self._rouse(self._slot[bunch])
         for robot in self._robots.values():
             self._locate(robot)
-            self._set_gains(robot)
         self._list()
 
     def _list(self) -> None:
@@ -708,6 +707,7 @@ class Rigid:
         robot.base_actuator = np.array([m.actuator(f"{name}:{axis}").id for axis in _PLANAR], int)
         names = [m.body(i).name for i in range(m.nbody)]
         robot.bodies = {n.removeprefix(name + "/"): i for i, n in enumerate(names) if n.startswith(name + "/")}
+        self._set_gains(robot)
 
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []
@@ -890,8 +890,8 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
     for axis, kind, direction in axes:
         base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
     spec.attach(child, prefix=f"{name}/", frame=base.add_frame())
-    for drive in given.drives:  # their gains follow once joints have their numbers
-        _add_servo(spec, f"{name}/{drive.joint}", drive.stiffness, drive.damping, drive.effort)
+    for drive, stiffness, damping in zip(given.drives, robot.stiffness, robot.damping, strict=True):
+        _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
     stiffness, damping = robot.tracks
     for i, axis in enumerate(_PLANAR):
         _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
