@@ -92,6 +92,19 @@ def test_inertias_are_those_of_the_shapes(parsed: yourdfpy.Robot) -> None:
     assert checked == 32
 
 
+def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: Description) -> None:
+    """Wood that stands across the finger tips passes through the mouth."""
+    assert [cutter.group for cutter in vinebot.cutters] == ["gripper_left", "gripper_right"]
+    poses = vinebot.frame_poses(vinebot.home)
+    for cutter in vinebot.cutters:
+        tips = poses[f"{cutter.group}_grasping_link"]
+        mouth = frames.compose(poses[cutter.frame], frames.pose(np.array(cutter.origin)))
+        off = frames.compose(frames.inverse(mouth), tips)[:3]
+        assert abs(off[0]) < cutter.half[0]
+        assert abs(off[1]) < cutter.half[1]
+        assert -0.10 < off[2] < -0.02
+
+
 def test_bunches_are_within_reach(vinebot: Description) -> None:
     """From the shoulder, with the lift inside its range, the arm's length covers 0.45-0.9 m ahead, 1.3-1.8 m high."""
     zero = vinebot.home.copy()
@@ -310,6 +323,18 @@ def test_missing_file_lists_what_there_is() -> None:
         load("vinbot")
 
 
+def test_springs_and_slip_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
+    file = write(tmp_path, robot())
+    assert load(file).drives[0].elastic == 0.0
+    file.with_suffix(".toml").write_text(
+        "[base]\nslip = [0.1, 0.2]\n"
+        "[groups.arm]\njoints = ['shoulder_joint']\nelastic = [800.0]\nelastic_damping = [4.0]\n"
+    )
+    found = load(file)
+    assert (found.drives[0].elastic, found.drives[0].elastic_damping) == (800.0, 4.0)
+    assert found.base_limits.slip == (0.1, 0.2)
+
+
 @pytest.mark.parametrize(
     ("toml", "words"),
     [
@@ -317,6 +342,18 @@ def test_missing_file_lists_what_there_is() -> None:
         ("[groups.arm]\njoints = ['shoulder_joint']\nhome = [0.0, 1.0]", "2 of home for 1 joints"),
         ("[[cameras]]\nname = 'c'\nframe = 'nose'", "sits in 'nose'"),
         ("[base]\nspeed = 3", "speed"),
+        ("[base]\nslip = [1.0, 0.0]", "slip of (1.0, 0.0)"),
+        ("[groups.arm]\njoints = ['shoulder_joint']\nelastic = [1.0]", "only half of its springs"),
+        ("[groups.arm]\njoints = ['shoulder_joint']\nelastic = [-1.0]\nelastic_damping = [0.0]", "below zero"),
+        ("[[cutters]]\ngroup = 'hand'\nframe = 'arm'\nhalf = [1, 1, 1]", "belongs to 'hand'"),
+        (
+            "[groups.arm]\njoints = ['shoulder_joint']\n[[cutters]]\ngroup = 'arm'\nframe = 'claw'\nhalf = [1, 1, 1]",
+            "sits in 'claw'",
+        ),
+        (
+            "[groups.arm]\njoints = ['shoulder_joint']\n[[cutters]]\ngroup = 'arm'\nframe = 'arm'\nhalf = [1, 0, 1]",
+            "a mouth of",
+        ),
         ("[base", "Expected"),
     ],
 )

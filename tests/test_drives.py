@@ -62,6 +62,7 @@ def test_step_command_ramps_at_the_speed_limit(yard: Yard) -> None:
     position, velocity, _, setpoint = yard.run(1.0)[:, :, joint].T
     steps = np.abs(np.diff(setpoint, prepend=start))
     assert steps.max() <= limit * yard.rigid.dt * (1.0 + 1e-9)
+    assert np.abs(velocity).max() <= limit * 1.02, "faster than the URDF allows"
     cruise = slice(15, 45)
     np.testing.assert_allclose(velocity[cruise], -limit, rtol=0.02)
     arrived = np.flatnonzero(np.abs(setpoint - (start - 1.1)) < 1e-9)[0] * yard.rigid.dt

@@ -104,9 +104,12 @@ def test_split_step_is_mj_step_to_the_bit():
         assert (twin.qvel == rigid.data.qvel).all()
 
 
-def test_prediction_and_response_are_what_the_second_half_does():
+@pytest.mark.parametrize("exact", [False, True])
+def test_prediction_and_response_are_what_the_second_half_does(exact):
     rigid = Rigid(yard())
     rigid.add_robot(arm())
+    if exact:
+        rigid.tune("anna", np.full(3, 60.0), np.full(3, 5.0), np.zeros(3), exact=np.ones(3, bool))
     rigid.command("anna", HOME + np.array([0.2, -0.3, 0.02]))
     step(rigid, 5)
     rng = np.random.default_rng(1)
@@ -130,6 +133,18 @@ def test_response_holds_the_stiffness_of_a_limit_that_is_active():
     predicted = rigid.velocity_free + rigid.inverse(force[None])[:, 0] * rigid.dt
     rigid.finish(force)
     np.testing.assert_allclose(rigid.data.qvel, predicted, atol=1e-7)
+
+
+def test_new_gains_do_not_change_what_was_felt():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.command("anna", HOME + 0.02)
+    step(rigid, 10)
+    before = rigid.read("anna")[2].copy()
+    assert np.abs(before).max() > 1.0
+    rigid.tune("anna", np.full(3, 50.0), np.full(3, 5.0), np.full(3, 7.0), exact=np.ones(3, bool))
+    rigid.command("anna", HOME - 1.0)
+    np.testing.assert_allclose(rigid.read("anna")[2], before, atol=1e-9)
 
 
 def test_gravity_compensation_holds_the_pose_and_effort_is_the_weight():

@@ -15,13 +15,16 @@ from vinesim.physics.rigid import Rigid
 from vinesim.robot.description import Description, load
 from vinesim.robot.drives import Robot
 from vinesim.world.grow import assemble
+from vinesim.world.ids import Organ
 
 DT = 0.01
 ARM = tuple(f"arm_left_{i}_joint" for i in range(1, 8))
 GATE = """<robot name="gate">
 <link name="post"><inertial><mass value="80"/>
  <inertia ixx="3" iyy="3" izz="3" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="leaf"><inertial><origin xyz="0.5 0 0"/><mass value="4"/>
+<link name="leaf">
+<collision><origin xyz="0.5 0 0" rpy="0 1.57079632679 0"/><geometry><cylinder radius="0.03" length="1"/></geometry>
+</collision><inertial><origin xyz="0.5 0 0"/><mass value="4"/>
  <inertia ixx="0.01" iyy="0.2" izz="0.2" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="hinge_joint" type="revolute"><parent link="post"/><child link="leaf"/><origin xyz="0 0 1"/>
  <axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="200" velocity="20"/></joint>
@@ -52,8 +55,8 @@ def gate(tmp_path_factory: pytest.TempPathFactory) -> Description:
 class Stand:
     """A robot, and a clock."""
 
-    def __init__(self, description: Description) -> None:
-        self.rigid = Rigid(assemble([]), dt=DT)
+    def __init__(self, description: Description, **scene: np.ndarray) -> None:
+        self.rigid = Rigid(assemble([], **scene), dt=DT)
         self.robot = Robot(self.rigid, description, "anna")
         self.time = 0.0
 
@@ -176,6 +179,24 @@ def test_no_stiffness_blows_up(gate: Description, stiffness: float) -> None:
     bound = 60.0 * 0.5 / stiffness
     assert swing[:200].max() < 3.0 * bound
     assert swing[-200:].max() <= swing[:200].max() * 1.001
+
+
+@pytest.mark.parametrize("stiffness", [40.0, 400.0])
+def test_against_a_pole_it_presses_as_its_stiffness_says(gate: Description, stiffness: float) -> None:
+    """A set-point behind a pole: K times what is missing is the moment of the contact, quietly."""
+    pole = {"fixed_start": [[0.9, 0.3, 0.0]], "fixed_end": [[0.9, 0.3, 2.0]], "fixed_radius": [[0.05, 0.05]]}
+    stand = Stand(gate, fixed_organ=[int(Organ.POLE)], **pole)
+    stand.robot.command_impedance([stiffness], [0.4 * np.sqrt(stiffness)])
+    stand.robot.command_position([0.6])
+    stand.run(6.0)
+    moments = []
+    for _ in range(100):
+        angle = stand.run(DT)[-1, 0]
+        moments.append(stand.rigid.read("anna")[3][0])
+    touching = np.arctan2(0.3, 0.9) - np.arcsin(0.08 / np.hypot(0.3, 0.9))
+    assert angle == pytest.approx(touching, abs=0.005)
+    assert -moments[-1] == pytest.approx(stiffness * (0.6 - angle), rel=0.005)
+    assert np.ptp(moments) < 1e-3 * abs(moments[-1])
 
 
 def test_a_whole_arm_gives_way_by_f_over_k(vinebot: Description) -> None:

@@ -69,7 +69,6 @@ class Client:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
-        self.robot.fit_cutters(self.physics)
         hello = Hello(
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=scene.name,
             digest=model.digest(), index=label_index(name), joints=len(description.joints),
@@ -87,6 +86,7 @@ class Client:
         self._copies: dict[int, TreeUpdate] = {}
         self._expected: dict[str, Hello] = {}
         """Robots that joined and whose place is not known yet."""
+        self.robot.fit_cutters(self.physics)
 
     def tick(self) -> None:
         """Ten milliseconds of the vineyard."""

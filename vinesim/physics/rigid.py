@@ -405,12 +405,16 @@ class Rigid:
         stiffness, as stiff servos should be. All stay until they are given anew.
         """
         robot = self._robot(name)
+        before = robot.stiffness.copy()
         robot.stiffness[:], robot.damping[:], robot.forward[:] = stiffness, damping, effort
         if limit is not None:
             robot.effort[:] = np.minimum(limit, robot.most)
         if exact is not None:
             robot.exact[:] = exact
+        q, v = self.data.qpos[robot.q], self.data.qvel[robot.v]
+        given = robot.control - before * q - robot.soon * v
         self._set_gains(robot)
+        robot.control[:] = given + robot.stiffness * q + robot.soon * v  # what was given in the last tick stays so
 
     def drive_base(self, name: str, velocity: tuple[float, float, float]) -> None:
         """Ask the tracks for (vx, vy, wz) [m/s, m/s, rad/s] in the base's axes; zero holds the place."""
@@ -459,6 +463,11 @@ class Rigid:
     def weight(self, name: str) -> np.ndarray:
         """[joint] what the drives give to carry the robot's own weight [N m or N], part of their effort."""
         return self.data.qfrc_gravcomp[self._robot(name).v]
+
+    def inertia(self, name: str) -> np.ndarray:
+        """[joint] what each drive has to speed up if the others stand, rotor included [kg m2 or kg], in this pose."""
+        m = self.world
+        return self.data.M[m.M_rowadr + m.M_rownnz - 1][self._robot(name).v]
 
     def base(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (world axes) of the base link."""
@@ -597,6 +606,7 @@ class Rigid:
         if force is not None:
             np.add(force, 0.0, out=d.qfrc_applied)  # +0 for -0, which would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
+        self._feel()
         if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
             self._roll_back()
             force = None
@@ -606,7 +616,6 @@ class Rigid:
             out = np.zeros(m.nv)
             mujoco.mj_mulJacTVec(m, d, out, native)
             self._contact += out
-        self._feel()
         for person in self._people.values():
             person.feel(d)
         self._fresh = False
@@ -783,7 +792,6 @@ class Rigid:
         self._fresh = False
         for robot in self._robots.values():
             self._locate(robot)
-            self._set_gains(robot)
         for person in self._people.values():
             person.locate(world)
         for person in self._people.values():
@@ -857,6 +865,7 @@ class Rigid:
         robot.base_actuator = np.array([m.actuator(f"{name}:{axis}").id for axis in _PLANAR], int)
         names = [m.body(i).name for i in range(m.nbody)]
         robot.bodies = {n.removeprefix(name + "/"): i for i, n in enumerate(names) if n.startswith(name + "/")}
+        self._set_gains(robot)
 
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []
@@ -1062,8 +1071,8 @@ def _attach(spec: mujoco.MjSpec, robot: _Robot) -> None:
         base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
     spec.copy_during_attach = True
     spec.attach(robot.parsed, prefix=f"{name}/", frame=base.add_frame())
-    for drive in given.drives:  # their gains follow once joints have their numbers
-        _add_servo(spec, f"{name}/{drive.joint}", drive.stiffness, drive.damping, drive.effort)
+    for drive, stiffness, damping in zip(given.drives, robot.stiffness, robot.damping, strict=True):
+        _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
     stiffness, damping = robot.tracks
     for i, axis in enumerate(_PLANAR):
         _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])

@@ -29,6 +29,9 @@ from vinesim.physics.step import Physics
 from vinesim.robot.description import Description, Mount
 from vinesim.world.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
 
+SPARE = 0.7
+"""Share of its effort that a drive may spend on gaining speed: the rest carries weight and meets resistance."""
+
 
 class Interface(enum.IntEnum):
     """What a joint is commanded by; D6.4 names the first three in section 5.2, elastic elements in section 3.1."""
@@ -185,6 +188,7 @@ class Robot(Embodied):
         """[joint] :class:`Interface` by which each was commanded last"""
         self._goal = self.setpoint.copy()
         self._velocity = np.zeros(len(self.setpoint))
+        self._rate = np.zeros(len(self.setpoint))
         self._braked = np.zeros(len(self.setpoint), bool)
         self._retuned = True
         self._base_goal = np.zeros(2)
@@ -349,9 +353,14 @@ class Robot(Embodied):
                 middle[fingers] = position[fingers].mean()
         start = np.where(by_effort, position, np.clip(self.setpoint, middle - lead, middle + lead))
         step = np.where(by_velocity, self._goal * dt, np.where(by_effort, 0.0, self._goal - start))
-        target = np.clip(start + np.clip(step, -self.speed * dt, self.speed * dt), self.lower, self.upper)
+        # nor may it run ahead faster than the drive can follow: at its limit the servo would shoot past the speed
+        gain = SPARE * dt * self._limit / np.maximum(self.rigid.inertia(self.name), 1e-9)
+        slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.speed)
+        fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.speed)
+        target = np.clip(start + np.clip(step, slowest * dt, fastest * dt), self.lower, self.upper)
         self.setpoint = target
-        rate = np.where(by_effort, 0.0, (target - start) / dt)
+        self._rate = rate = np.where(by_effort, velocity, (target - start) / dt)
+        rate = np.where(by_effort, 0.0, rate)
         changing = by_effort.any() or by_motor.any()
         if changing or self._retuned:
             # An effort that would drive the joint too fast gives way to a brake: 90 % of the largest speed are free.
