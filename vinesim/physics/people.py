@@ -121,7 +121,7 @@ def posture(height: float, pose: HumanPose) -> np.ndarray:
     head, hips = np.asarray(pose.head, float), np.asarray(pose.hips, float)
     forward, left = frames.rotate(hips[3:], np.eye(3)[:2])
     neck = frames.compose(head, np.array([-_BACK, 0.0, -0.2, 0.0, 0.0, 0.0, 1.0]))[:3]
-    up = frames.multiply(frames.aligned(neck - hips[:3], -forward), frames.conjugate(_Z_TO_X))
+    up = frames.multiply(frames.aligned(neck - hips[:3], -forward), _Z_TO_X)
     feet = np.stack([pose.left_foot, pose.right_foot]).astype(float)
     joint = hips[:3] + HIP * height * left * np.array([[1.0], [-1.0]])
     thigh, shank = THIGH * height, SHANK * height
@@ -217,6 +217,11 @@ class Person:
         """Poses of :data:`PARTS`, then of both controllers."""
         for hand in self.hands:
             hand.closed = bool(getattr(pose, f"{hand.side}_closed"))
+
+    def speed(self, hand: Hand, dt: float) -> np.ndarray:
+        """Velocity [3] of a controller in this tick, m/s."""
+        at = len(PARTS) + self.hands.index(hand)
+        return (self._now[at, :3] - self._before[at, :3]) / dt
 
     def hand(self, side: str) -> Hand:
         """The left or the right hand."""
@@ -344,13 +349,14 @@ class Person:
             m.eq_data[hand.weld, :3], m.eq_data[hand.weld, 3:6] = hand.grip[:3], 0.0
             m.eq_data[hand.weld, 6:10] = frames.to_wxyz(frames.conjugate(hand.grip[3:]))
             m.eq_data[hand.weld, 10] = 1.0
-            if m.body_treeid[body] >= 0:
-                d.tree_awake[m.body_treeid[body]] = 1
+            _rouse(m, d, body)
         self._touchable(m, hand, yes=False)
 
     def release(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand) -> None:
         """Open a hand; it hangs on its spring a little longer and then returns to its controller."""
         hand.holds, hand.rides, hand.free = None, False, 0
+        if d.eq_active[hand.weld]:
+            _rouse(m, d, m.eq_obj2id[hand.weld])
         d.eq_active[hand.weld] = 0
         self._touchable(m, hand, yes=True)
 
@@ -368,6 +374,18 @@ def _add(body: mujoco.MjsBody, shape: Shape, contype: int, conaffinity: int, fri
         contype=contype, conaffinity=conaffinity, friction=friction, priority=1,
         solimp=[0.99, 0.999, 0.001, 0.5, 2.0],
     )  # fmt: skip
+
+
+def _rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
+    """Wake a body: MuJoCo does when the two arrays that it keeps of sleep disagree.
+
+    One that is awake but still, as what is held is, would fall asleep in the very tick in which it is let go.
+    """
+    tree = m.body_treeid[body]
+    if tree >= 0:
+        d.tree_awake[tree] = 1
+        if d.tree_asleep[tree] < 0:
+            d.tree_asleep[tree] = -1 - mujoco.mjMINAWAKE
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
