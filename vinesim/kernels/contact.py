@@ -1047,9 +1047,6 @@ def couple(
     dof_free: wp.array(dtype=wp.float64),
     cdof: wp.array2d(dtype=wp.float64),
     subtree_com: wp.array(dtype=wp.vec3d),
-    geom_middle: wp.array(dtype=wp.vec3d),
-    geom_velocity: wp.array(dtype=wp.vec3d),
-    geom_spin: wp.array(dtype=wp.vec3d),
     known_count: wp.array(dtype=wp.int32),
     known_shape: wp.array(dtype=wp.int32),
     known_other: wp.array(dtype=wp.int32),
@@ -1094,8 +1091,6 @@ def couple(
         friction_out[c] = geom_friction[g]
         dof = geom_dof[g]
         about = x - subtree_com[geom_root[g]]
-        if dof < 0:  # it moves as it is told, or stands
-            approach = approach - (geom_velocity[g] + wp.cross(geom_spin[g], x - geom_middle[g]))
     else:
         other_lever = x - to_double(wp.transform_get_translation(body_q[other]))
         approach = approach - velocity_at(body_q[other], body_qd_free[other], x)

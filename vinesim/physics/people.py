@@ -35,6 +35,10 @@ RETURN = 0.1
 """[s] Set free, a hand closes this fast on its controller, by :data:`HURRY` at most."""
 HURRY = 1.5
 """[m/s]"""
+HEAVY = 1e4
+"""[kg, kg m2] Head, trunk and legs are moved as told. Within a tick they have a velocity, as bodies without joints have
+not in MuJoCo (a leg would run centimetres into what it kicks), and are so heavy that no force changes it.
+"""
 THICK = 0.012
 """[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
 SKIN = (0.85, 0.62, 0.5, 1.0)
@@ -186,9 +190,10 @@ class Person:
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
         """MuJoCo's bodies of :data:`PARTS`."""
-        self._mocap = self._hand_q = np.zeros(0, int)
+        self.part_dofs = np.zeros((0, 6), int)
+        """MuJoCo's degrees of freedom of the same."""
+        self._part_q = self._hand_q = np.zeros((0, 7), int)
         self._meets = 0
-        self._fresh = True
         self.move(spec.pose)
         self._before = self._now
         self._way = self._turn = _STILL
@@ -235,8 +240,11 @@ class Person:
         """Add the person's bodies: they meet whatever has a bit in ``meets``, of which ``ground`` only hands do."""
         name, self._meets = self.spec.name, meets
         for part, shape, pose in zip(PARTS, figure(self.spec.height), self.parts, strict=True):
-            body = spec.worldbody.add_body(name=f"{name}/{part}", mocap=True)
-            body.pos, body.quat = pose[:3], frames.to_wxyz(pose[3:])
+            body = spec.worldbody.add_body(
+                name=f"{name}/{part}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=HEAVY, ipos=np.zeros(3),
+                inertia=[HEAVY] * 3, explicitinertial=True, gravcomp=1.0, sleep=mujoco.mjtSleepPolicy.mjSLEEP_NEVER,
+            )  # fmt: skip
+            body.add_freejoint(name=f"{name}/{part}")
             _add(body, shape, 1 << self.bit, meets & ~ground, friction)
         for hand in self.hands:
             at = self.controller(hand)
@@ -257,7 +265,9 @@ class Person:
         """Find the person's numbers in a world that was compiled anew."""
         name = self.spec.name
         self.part_bodies = np.array([m.body(f"{name}/{part}").id for part in PARTS], int)
-        self._mocap = m.body_mocapid[self.part_bodies]
+        joints = [m.joint(f"{name}/{part}") for part in PARTS]
+        self._part_q = np.array([j.qposadr[0] for j in joints])[:, None] + np.arange(7)
+        self.part_dofs = np.array([j.dofadr[0] for j in joints])[:, None] + np.arange(6)
         self.bodies = dict(zip(PARTS, self.part_bodies.tolist(), strict=True))
         for hand in self.hands:
             joint = m.joint(f"{name}/{hand.link}")
@@ -266,16 +276,17 @@ class Person:
             hand.q = slice(joint.qposadr[0], joint.qposadr[0] + 7)
             hand.v = slice(joint.dofadr[0], joint.dofadr[0] + 6)
         self._hand_q = np.stack([np.arange(hand.q.start, hand.q.stop) for hand in self.hands])
-        self._fresh = True
 
     def drive(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
         """Before a tick: the body where it is told to be, each hand free at its controller or on its spring."""
         moved = self._before is not self._now
         self._way, self._turn = _apart(self._before, self._now) if moved else (_STILL, _STILL)
-        if moved or self._fresh:
-            d.mocap_pos[self._mocap] = self.parts[:, :3]
-            d.mocap_quat[self._mocap] = frames.to_wxyz(self.parts[:, 3:])
-            self._fresh = False
+        start = self._before[: len(PARTS)]
+        self._place(d, start)
+        d.qvel[self.part_dofs[:, :3]] = self._way[: len(PARTS)] / dt
+        d.qvel[self.part_dofs[:, 3:]] = (
+            frames.rotate(frames.conjugate(start[:, 3:]), self._turn[: len(PARTS)] / dt) if moved else 0.0
+        )
         at = d.qpos[self._hand_q]
         at[:, 3:] = frames.from_wxyz(at[:, 3:])
         held = np.array([hand.free < LINGER for hand in self.hands])
@@ -313,22 +324,19 @@ class Person:
             gone += ahead + 1e-3
         return step
 
-    def sweep(self, d: mujoco.MjData, dt: float) -> None:
-        """After positions are known: how fast the body moves, which MuJoCo does not know of bodies without joints."""
-        if self._way is not _STILL:
-            way, turn = self._way[: len(PARTS)], self._turn[: len(PARTS)]
-            arm = d.subtree_com[self.part_bodies] - self.parts[:, :3]
-            d.cvel[self.part_bodies, :3] = turn / dt
-            d.cvel[self.part_bodies, 3:] = (way + frames.cross(turn, arm)) / dt
-
     def feel(self, d: mujoco.MjData) -> None:
         """After a tick: with what force the hands met the world, held it, or were held."""
         self._before = self._now
+        self._place(d, self.parts)
         for hand in self.hands:
             if not hand.rides:
                 felt = d.qfrc_constraint[hand.v] + d.qfrc_applied[hand.v]
                 hand.force = -felt[:3]
                 hand.free = 0 if hand.holds is not None or felt.any() else hand.free + 1
+
+    def _place(self, d: mujoco.MjData, parts: np.ndarray) -> None:
+        d.qpos[self._part_q[:, :3]] = parts[:, :3]
+        d.qpos[self._part_q[:, 3:]] = frames.to_wxyz(parts[:, 3:])
 
     def sample(self, hand: Hand, d: mujoco.MjData) -> HandSample:
         """What is known of a hand."""

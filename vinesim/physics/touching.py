@@ -584,7 +584,7 @@ class Touching:
             kernels.couple,
             [dt, k, c, FRICTION, g_friction, g_dof, g_root, d_parent, *ints("hits"),
              *flat[1:], *ints("contact_shape", "contact_body", "other_body"), body_q,
-             body_qd_free, *doubles("dof_free"), cdof, com, *moving, *ints("known_count"), *known],
+             body_qd_free, *doubles("dof_free"), cdof, com, *ints("known_count"), *known],
             [*ints("other"), *doubles("gap", "friction"), *vectors("point"), axes,
              *doubles("plant_rows", "rigid_rows", "free", "offset", "impulse")],
         )  # fmt: skip
