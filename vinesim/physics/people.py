@@ -58,6 +58,7 @@ _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "box": mujoco.mjtGeom.mjGEOM_BOX,
 }  # fmt: skip
+_NECK = np.array([-_BACK, 0.0, -0.2])
 TURN_DAMPING = 2.0 * math.sqrt(TURN * INERTIA)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
@@ -122,28 +123,34 @@ def hand_shapes(side: str) -> tuple[Shape, ...]:
 
 def posture(height: float, pose: HumanPose) -> np.ndarray:
     """Poses [part, 7] of :data:`PARTS`: knees bend forward by as much as hips and ankles ask."""
-    head, hips = np.asarray(pose.head, float), np.asarray(pose.hips, float)
-    forward, left = frames.rotate(hips[3:], np.eye(3)[:2])
-    neck = frames.compose(head, np.array([-_BACK, 0.0, -0.2, 0.0, 0.0, 0.0, 1.0]))[:3]
-    up = frames.multiply(frames.aligned(neck - hips[:3], -forward), _Z_TO_X)
-    feet = np.stack([pose.left_foot, pose.right_foot]).astype(float)
+    tracked = np.stack([pose.head, pose.hips, pose.left_foot, pose.right_foot]).astype(float)
+    head, hips, feet = tracked[0], tracked[1], tracked[2:]
+    ahead = frames.rotate(tracked[:, 3:], np.array([1.0, 0.0, 0.0]))
+    left = frames.rotate(hips[3:], np.array([0.0, 1.0, 0.0]))
+    neck = head[:3] + frames.rotate(head[3:], _NECK)
     joint = hips[:3] + HIP * height * left * np.array([[1.0], [-1.0]])
     thigh, shank = THIGH * height, SHANK * height
     apart = feet[:, :3] - joint
-    distance = np.linalg.norm(apart, axis=1, keepdims=True)
+    distance = np.sqrt((apart * apart).sum(1, keepdims=True))
     down = apart / np.maximum(distance, 1e-9)
     reach = np.clip(distance, abs(thigh - shank) + 1e-3, thigh + shank - 1e-6)
     along = (thigh**2 - shank**2 + reach**2) / (2.0 * reach)
-    front = frames.rotate(feet[:, 3:], np.array([1.0, 0.0, 0.0])) + forward
+    front = ahead[2:] + ahead[1]
     front = frames.normalize(front - (front * down).sum(1, keepdims=True) * down)
     knee = joint + along * down + np.sqrt(np.maximum(thigh**2 - along**2, 0.0)) * front
-    ankle = joint + reach * down
-    upper, lower = frames.aligned(knee - joint, front), frames.aligned(ankle - knee, front)
-    return np.stack([
-        head, np.concatenate([hips[:3], up]), hips,
-        *(part for i in range(2) for part in (
-            np.concatenate([joint[i], upper[i]]), np.concatenate([knee[i], lower[i]]), feet[i])),
-    ])  # fmt: skip
+
+    # trunk, thighs and shanks: along each limb, and the way it looks
+    begin = np.concatenate([hips[None, :3], joint, knee])
+    limb = np.concatenate([[neck - hips[:3]], knee - joint, joint + reach * down - knee])
+    limb = frames.normalize(limb)
+    look = np.concatenate([ahead[1:2], front, front])
+    look = frames.normalize(look - (look * limb).sum(1, keepdims=True) * limb)
+    side = frames.cross(look, limb)
+    side[0] *= -1.0
+    axes = np.stack([limb, side, look], -1)
+    axes[0, :, 0], axes[0, :, 2] = look[0], limb[0]  # the chest's z is up, its x forward
+    chest, *legs = np.concatenate([begin, frames.from_matrix(axes)], -1)
+    return np.stack([head, chest, hips, legs[0], legs[2], feet[0], legs[1], legs[3], feet[1]])
 
 
 # ---------------------------------------------------------------------- one person
