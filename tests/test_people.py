@@ -258,6 +258,8 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
             assert forward @ (shank[:3] - 0.5 * (thigh[:3] + foot[:3])) >= -1e-6
     assert forward @ (shank[:3] - 0.5 * (thigh[:3] + foot[:3])) > 0.2
     np.testing.assert_allclose(np.linalg.norm(posture(1.8, crouched)[:, 3:], axis=1), 1.0, atol=1e-12)
+    chest = posture(1.8, pose)[PARTS.index("chest")]
+    np.testing.assert_allclose(frames.rotate(chest[3:], np.eye(3))[[0, 2]], [[*forward[:2], 0.0], [0, 0, 1]], atol=0.1)
 
 
 def test_nothing_moves_head_trunk_or_legs():
@@ -299,6 +301,24 @@ def test_a_base_stops_at_legs():
     assert deep < 0.01 * 0.5 + 2e-3
     assert max(deepest(rigid, f"eva/{part}") for part in PARTS) < 2e-3
     assert rigid._contact[rigid._robots["anna"].base_v[0]] == pytest.approx(-800.0, rel=0.05)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.4])
+def test_legs_that_walk_push_a_sleeping_box_along(speed):
+    rigid, spec = Rigid(crate_yard(1.6)), eva(-1.0, 5.0)
+    rigid.add_human(spec)
+    step(rigid, 200)
+    assert rigid.data.body_awake[rigid.world.body("box/0").id] == 0
+    names = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
+    deep = 0.0
+    for x in np.arange(0.0, 1.0, 0.01 * speed):
+        moved = {name: getattr(spec.pose, name) + np.array([x, 0, 0, 0, 0, 0, 0]) for name in names}
+        rigid.move_human("eva", dataclasses.replace(spec.pose, **moved))
+        step(rigid)
+        deep = max(deep, deepest(rigid, "box/0"))
+    toes = -1.0 + x + 0.19
+    assert rigid.data.body("box/0").xpos[0] - 0.3 > toes - 0.02 * speed
+    assert deep < 0.03 * speed
 
 
 def test_people_are_seen_as_people():

@@ -16,7 +16,7 @@ from vinesim.physics.plants import Plants
 from vinesim.physics.rigid import Loose, Rigid
 from vinesim.physics.touching import Touching
 from vinesim.world.ids import Organ
-from vinesim.world.values import Parting
+from vinesim.world.values import Contact, Parting
 
 STUB = 1e-3
 """What stays of a bunch on the tree [kg]."""
@@ -47,6 +47,8 @@ class Partings:
     def __init__(self, plants: Plants, rigid: Rigid, touching: Touching) -> None:
         self.plants, self.rigid, self.touching = plants, rigid, touching
         self.blades: list[Blade] = []
+        self.held: tuple[Contact, ...] = ()
+        """Hands that hold plants, as contacts; who holds a bunch may be the one who pulled it off."""
         model = plants.model
         self._strained = np.zeros(len(model.bunch_body), np.int32)
         self._bunch_of = model.bunch_of()
@@ -207,7 +209,7 @@ class Partings:
     def _toucher(self, bunch: int) -> str:
         """Who presses hardest on a bunch, nobody if none does."""
         pushes: dict[str, float] = {}
-        for contact in self.touching.contacts:
+        for contact in self.touching.contacts + self.held:
             if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")

@@ -35,6 +35,10 @@ RETURN = 0.1
 """[s] Set free, a hand closes this fast on its controller, by :data:`HURRY` at most."""
 HURRY = 1.5
 """[m/s]"""
+HEAVY = 1e4
+"""[kg, kg m2] Head, trunk and legs are moved as told. Within a tick they have a velocity, as bodies without joints have
+not in MuJoCo (a leg would run centimetres into what it kicks), and are so heavy that no force changes it.
+"""
 THICK = 0.012
 """[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
 ROUSED = -1 - mujoco.mjMINAWAKE
@@ -56,6 +60,7 @@ _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "box": mujoco.mjtGeom.mjGEOM_BOX,
 }  # fmt: skip
+_NECK = np.array([-_BACK, 0.0, -0.2])
 TURN_DAMPING = 2.0 * math.sqrt(TURN * INERTIA)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
@@ -120,28 +125,34 @@ def hand_shapes(side: str) -> tuple[Shape, ...]:
 
 def posture(height: float, pose: HumanPose) -> np.ndarray:
     """Poses [part, 7] of :data:`PARTS`: knees bend forward by as much as hips and ankles ask."""
-    head, hips = np.asarray(pose.head, float), np.asarray(pose.hips, float)
-    forward, left = frames.rotate(hips[3:], np.eye(3)[:2])
-    neck = frames.compose(head, np.array([-_BACK, 0.0, -0.2, 0.0, 0.0, 0.0, 1.0]))[:3]
-    up = frames.multiply(frames.aligned(neck - hips[:3], -forward), frames.conjugate(_Z_TO_X))
-    feet = np.stack([pose.left_foot, pose.right_foot]).astype(float)
+    tracked = np.stack([pose.head, pose.hips, pose.left_foot, pose.right_foot]).astype(float)
+    head, hips, feet = tracked[0], tracked[1], tracked[2:]
+    ahead = frames.rotate(tracked[:, 3:], np.array([1.0, 0.0, 0.0]))
+    left = frames.rotate(hips[3:], np.array([0.0, 1.0, 0.0]))
+    neck = head[:3] + frames.rotate(head[3:], _NECK)
     joint = hips[:3] + HIP * height * left * np.array([[1.0], [-1.0]])
     thigh, shank = THIGH * height, SHANK * height
     apart = feet[:, :3] - joint
-    distance = np.linalg.norm(apart, axis=1, keepdims=True)
+    distance = np.sqrt((apart * apart).sum(1, keepdims=True))
     down = apart / np.maximum(distance, 1e-9)
     reach = np.clip(distance, abs(thigh - shank) + 1e-3, thigh + shank - 1e-6)
     along = (thigh**2 - shank**2 + reach**2) / (2.0 * reach)
-    front = frames.rotate(feet[:, 3:], np.array([1.0, 0.0, 0.0])) + forward
+    front = ahead[2:] + ahead[1]
     front = frames.normalize(front - (front * down).sum(1, keepdims=True) * down)
     knee = joint + along * down + np.sqrt(np.maximum(thigh**2 - along**2, 0.0)) * front
-    ankle = joint + reach * down
-    upper, lower = frames.aligned(knee - joint, front), frames.aligned(ankle - knee, front)
-    return np.stack([
-        head, np.concatenate([hips[:3], up]), hips,
-        *(part for i in range(2) for part in (
-            np.concatenate([joint[i], upper[i]]), np.concatenate([knee[i], lower[i]]), feet[i])),
-    ])  # fmt: skip
+
+    # trunk, thighs and shanks: along each limb, and the way it looks
+    begin = np.concatenate([hips[None, :3], joint, knee])
+    limb = np.concatenate([[neck - hips[:3]], knee - joint, joint + reach * down - knee])
+    limb = frames.normalize(limb)
+    look = np.concatenate([ahead[1:2], front, front])
+    look = frames.normalize(look - (look * limb).sum(1, keepdims=True) * limb)
+    side = frames.cross(look, limb)
+    side[0] *= -1.0
+    axes = np.stack([limb, side, look], -1)
+    axes[0, :, 0], axes[0, :, 2] = look[0], limb[0]  # the chest's z is up, its x forward
+    chest, *legs = np.concatenate([begin, frames.from_matrix(axes)], -1)
+    return np.stack([head, chest, hips, legs[0], legs[2], feet[0], legs[1], legs[3], feet[1]])
 
 
 # ---------------------------------------------------------------------- one person
@@ -188,9 +199,10 @@ class Person:
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
         """MuJoCo's bodies of :data:`PARTS`."""
-        self._mocap = self._hand_q = np.zeros(0, int)
+        self.part_dofs = np.zeros((0, 6), int)
+        """MuJoCo's degrees of freedom of the same."""
+        self._part_q = self._hand_q = np.zeros((0, 7), int)
         self._meets = 0
-        self._fresh = True
         self.move(spec.pose)
         self._before = self._now
         self._way = self._turn = _STILL
@@ -220,6 +232,11 @@ class Person:
         for hand in self.hands:
             hand.closed = bool(getattr(pose, f"{hand.side}_closed"))
 
+    def speed(self, hand: Hand, dt: float) -> np.ndarray:
+        """Velocity [3] of a controller in this tick, m/s."""
+        at = len(PARTS) + self.hands.index(hand)
+        return (self._now[at, :3] - self._before[at, :3]) / dt
+
     def hand(self, side: str) -> Hand:
         """The left or the right hand."""
         if side not in SIDES:
@@ -232,8 +249,11 @@ class Person:
         """Add the person's bodies: they meet whatever has a bit in ``meets``, of which ``ground`` only hands do."""
         name, self._meets = self.spec.name, meets
         for part, shape, pose in zip(PARTS, figure(self.spec.height), self.parts, strict=True):
-            body = spec.worldbody.add_body(name=f"{name}/{part}", mocap=True)
-            body.pos, body.quat = pose[:3], frames.to_wxyz(pose[3:])
+            body = spec.worldbody.add_body(
+                name=f"{name}/{part}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=HEAVY, ipos=np.zeros(3),
+                inertia=[HEAVY] * 3, explicitinertial=True, gravcomp=1.0, sleep=mujoco.mjtSleepPolicy.mjSLEEP_NEVER,
+            )  # fmt: skip
+            body.add_freejoint(name=f"{name}/{part}")
             _add(body, shape, 1 << self.bit, meets & ~ground, friction)
         for hand in self.hands:
             at = self.controller(hand)
@@ -254,7 +274,9 @@ class Person:
         """Find the person's numbers in a world that was compiled anew."""
         name = self.spec.name
         self.part_bodies = np.array([m.body(f"{name}/{part}").id for part in PARTS], int)
-        self._mocap = m.body_mocapid[self.part_bodies]
+        joints = [m.joint(f"{name}/{part}") for part in PARTS]
+        self._part_q = np.array([j.qposadr[0] for j in joints])[:, None] + np.arange(7)
+        self.part_dofs = np.array([j.dofadr[0] for j in joints])[:, None] + np.arange(6)
         self.bodies = dict(zip(PARTS, self.part_bodies.tolist(), strict=True))
         for hand in self.hands:
             joint = m.joint(f"{name}/{hand.link}")
@@ -263,16 +285,17 @@ class Person:
             hand.q = slice(joint.qposadr[0], joint.qposadr[0] + 7)
             hand.v = slice(joint.dofadr[0], joint.dofadr[0] + 6)
         self._hand_q = np.stack([np.arange(hand.q.start, hand.q.stop) for hand in self.hands])
-        self._fresh = True
 
     def drive(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
         """Before a tick: the body where it is told to be, each hand free at its controller or on its spring."""
         moved = self._before is not self._now
         self._way, self._turn = _apart(self._before, self._now) if moved else (_STILL, _STILL)
-        if moved or self._fresh:
-            d.mocap_pos[self._mocap] = self.parts[:, :3]
-            d.mocap_quat[self._mocap] = frames.to_wxyz(self.parts[:, 3:])
-            self._fresh = False
+        start = self._before[: len(PARTS)]
+        self._place(d, start)
+        d.qvel[self.part_dofs[:, :3]] = self._way[: len(PARTS)] / dt
+        d.qvel[self.part_dofs[:, 3:]] = (
+            frames.rotate(frames.conjugate(start[:, 3:]), self._turn[: len(PARTS)] / dt) if moved else 0.0
+        )
         at = d.qpos[self._hand_q]
         at[:, 3:] = frames.from_wxyz(at[:, 3:])
         held = np.array([hand.free < LINGER for hand in self.hands])
@@ -310,22 +333,19 @@ class Person:
             gone += ahead + 1e-3
         return step
 
-    def sweep(self, d: mujoco.MjData, dt: float) -> None:
-        """After positions are known: how fast the body moves, which MuJoCo does not know of bodies without joints."""
-        if self._way is not _STILL:
-            way, turn = self._way[: len(PARTS)], self._turn[: len(PARTS)]
-            arm = d.subtree_com[self.part_bodies] - self.parts[:, :3]
-            d.cvel[self.part_bodies, :3] = turn / dt
-            d.cvel[self.part_bodies, 3:] = (way + frames.cross(turn, arm)) / dt
-
     def feel(self, d: mujoco.MjData) -> None:
         """After a tick: with what force the hands met the world, held it, or were held."""
         self._before = self._now
+        self._place(d, self.parts)
         for hand in self.hands:
             if not hand.rides:
                 felt = d.qfrc_constraint[hand.v] + d.qfrc_applied[hand.v]
                 hand.force = -felt[:3]
                 hand.free = 0 if hand.holds is not None or felt.any() else hand.free + 1
+
+    def _place(self, d: mujoco.MjData, parts: np.ndarray) -> None:
+        d.qpos[self._part_q[:, :3]] = parts[:, :3]
+        d.qpos[self._part_q[:, 3:]] = frames.to_wxyz(parts[:, 3:])
 
     def sample(self, hand: Hand, d: mujoco.MjData) -> HandSample:
         """What is known of a hand."""
@@ -346,16 +366,14 @@ class Person:
             m.eq_data[hand.weld, :3], m.eq_data[hand.weld, 3:6] = hand.grip[:3], 0.0
             m.eq_data[hand.weld, 6:10] = frames.to_wxyz(frames.conjugate(hand.grip[3:]))
             m.eq_data[hand.weld, 10] = 1.0
-            if m.body_treeid[body] >= 0:
-                d.tree_awake[m.body_treeid[body]] = 1
+            _rouse(m, d, body)
         self._touchable(m, hand, yes=False)
 
     def release(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand) -> None:
         """Open a hand; it hangs on its spring a little longer and then returns to its controller."""
         hand.holds, hand.rides, hand.free = None, False, 0
-        held = m.body_treeid[m.eq_obj2id[hand.weld]]
-        if d.eq_active[hand.weld] and held >= 0:
-            d.tree_asleep[held] = ROUSED  # held still for long, it would fall asleep where it hangs
+        if d.eq_active[hand.weld]:
+            _rouse(m, d, m.eq_obj2id[hand.weld])
         d.eq_active[hand.weld] = 0
         self._touchable(m, hand, yes=True)
 
@@ -373,6 +391,18 @@ def _add(body: mujoco.MjsBody, shape: Shape, contype: int, conaffinity: int, fri
         contype=contype, conaffinity=conaffinity, friction=friction, priority=1,
         solimp=[0.99, 0.999, 0.001, 0.5, 2.0],
     )  # fmt: skip
+
+
+def _rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
+    """Wake a body: MuJoCo does when the two arrays that it keeps of sleep disagree.
+
+    One that is awake but still, as what is held is, would fall asleep in the very tick in which it is let go.
+    """
+    tree = m.body_treeid[body]
+    if tree >= 0:
+        d.tree_awake[tree] = 1
+        if d.tree_asleep[tree] < 0:
+            d.tree_asleep[tree] = -1 - mujoco.mjMINAWAKE
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -57,6 +57,10 @@ FEW_MOVES = 100
 """[tree] The same for the move at the end of ``commit()``, which is twelve times as short."""
 
 
+HELD, HANDS = 16, 4
+"""So many bodies can be held at once, each in so many places; see :meth:`Plants.hold`."""
+
+
 class Plants:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
@@ -118,10 +122,17 @@ class Plants:
         """Acceleration over the last tick [body, 6] m/s^2, rad/s^2, world axes."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.wind`."""
-        self.tie_anchor = model.tie_anchor.copy()
-        """Where ties are held [tie, 3] m, in the world; move them as you like."""
-        self.tie_stiffness, self.tie_damping = model.tie_stiffness.copy(), model.tie_damping.copy()
+        of_body = np.bincount(model.tie_body, minlength=bodies)
+        self._most = int(of_body.max(initial=0))
+        room = HELD * (self._most + HANDS)
+        self.tie_anchor = np.append(model.tie_anchor, np.zeros((room, 3), np.float32), 0)
+        """Where ties are held [tie, 3] m, in the world; move them as you like. Behind the model's ties there is room
+        for those of :meth:`hold`."""
+        self.tie_stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
+        self.tie_damping = np.append(model.tie_damping, np.zeros(room, np.float32))
         """N/m, N s/m [tie]; a tie of zero is undone."""
+        self._tie_point = np.append(model.tie_point, np.zeros((room, 3), np.float32), 0)
+        self._held: dict[int, int] = {}
         self.body_mass, self.body_com = model.body_mass.copy(), model.body_com.copy()
         self.body_inertia, self.body_drag = model.body_inertia.copy(), model.body_drag.copy()
         """What moves now, in the model's units: the body of a bunch is its compound while the tree is coarse, its head
@@ -152,6 +163,7 @@ class Plants:
         self._moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
         ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
         self._ties = np.stack([ends[:-1], ends[1:]], -1)
+        self._ties_drawn = self._ties.copy()
         self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
         self.memory, self.threads = memory, threads
         """Where arrays live, for NumPy and for kernels."""
@@ -514,6 +526,48 @@ class Plants:
 
     # what one may ask
 
+    def hold(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
+        """Hold a body at ``point`` [3], in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
+
+        It pulls to ``tie_anchor`` of that tie, which starts where the point is; move it as you like.
+        """
+        if body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]:
+            raise ValueError(f"body {body} is a berry cluster, which cannot be held; hold its bunch")
+        room, first = self._most + HANDS, len(self.model.tie_body)
+        if body not in self._held:
+            free = [i for i in range(HELD) if i not in self._held.values()]
+            if not free:
+                raise ValueError(f"body {body} is one too many: {HELD} are held already, let go of one")
+            self._held[body] = free[0]
+            # its own ties come along: the ties of a body lie side by side
+            own = slice(*self._ties_drawn[body].tolist())
+            start = first + room * free[0]
+            here = slice(start, start + own.stop - own.start)
+            for ties in (self.tie_anchor, self.tie_stiffness, self.tie_damping, self._tie_point):
+                ties[start : start + room] = 0.0
+                ties[here] = ties[own]
+            self._ties[body] = start, start + room
+            self._renewed = True
+        start = first + room * self._held[body] + self._most
+        spare = np.flatnonzero(self.tie_stiffness[start : start + HANDS] == 0.0)
+        if len(spare) == 0:
+            raise ValueError(f"body {body} is held in {HANDS} places already; let go of one")
+        tie = start + int(spare[0])
+        self.kinematics(np.array([tree]))
+        pose = self.state.body_q[body].astype(float)
+        self.tie_anchor[tie] = pose[:3] + frames.rotate(pose[3:], np.asarray(point, float))
+        self._tie_point[tie], self.tie_stiffness[tie], self.tie_damping[tie] = point, stiffness, damping
+        return tie
+
+    def let_go(self, body: int, tie: int) -> None:
+        """Undo a tie of :meth:`hold`."""
+        self.tie_stiffness[tie] = self.tie_damping[tie] = 0.0
+        start = len(self.model.tie_body) + (self._most + HANDS) * self._held[body] + self._most
+        if not self.tie_stiffness[start : start + HANDS].any():
+            del self._held[body]
+            self._ties[body] = self._ties_drawn[body]
+            self._renewed = True
+
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Force [N] and moment [N m, about the body's origin, world axes] on bodies from their parents [n, 6].
 
@@ -641,7 +695,7 @@ class Plants:
             wp.bool: {"tree_awake": state.tree_awake},
             wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
-                      "joint_damping": self.joint_damping, "tie_point": model.tie_point,
+                      "joint_damping": self.joint_damping, "tie_point": self._tie_point,
                       "tie_anchor": self.tie_anchor, "tree_air": self.tree_air, "joint_x": state.joint_x,
                       "joint_xd": state.joint_xd, "joint_qd": state.joint_qd, "joint_xd_free": self._joint_xd_free,
                       "joint_qd_free": self._joint_qd_free},
@@ -656,7 +710,7 @@ class Plants:
         often = ("body_load", "wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
         self._seldom: list[str] = []
         self._renewed = False
-        constants = {id(model.tree_pose), id(model.tie_point)}
+        constants = {id(model.tree_pose)}
         memory.arrange(model.tree_first, model.tree_size)
         for dtype, arrays in kinds.items():
             for name, data in arrays.items():

@@ -546,8 +546,6 @@ class Rigid:
         d.qfrc_applied[:] = 0.0
         # the whole forward pass behind the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
-        for person in self._people.values():
-            person.sweep(d, self.dt)
 
     @property
     def velocity_free(self) -> np.ndarray:
@@ -794,6 +792,9 @@ class Rigid:
             self._locate(robot)
         for person in self._people.values():
             person.locate(world)
+        if self._people:  # MuJoCo's solver is as exact as what it takes for the usual inertia lets it be
+            heavy = np.concatenate([person.part_dofs.ravel() for person in self._people.values()])
+            world.stat.meaninertia = np.delete(world.dof_M0, heavy).mean()
         for person in self._people.values():
             for hand in person.hands:
                 self._regrasp(person, hand)

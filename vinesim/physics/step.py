@@ -8,6 +8,7 @@ import numpy as np
 
 from vinesim.physics.detail import Detail
 from vinesim.physics.guard import Guard
+from vinesim.physics.holding import Holding
 from vinesim.physics.parting import Blade, Partings
 from vinesim.physics.plants import Plants
 from vinesim.physics.rigid import Rigid
@@ -16,7 +17,7 @@ from vinesim.physics.touching import Touching
 from vinesim.physics.wind import Wind
 from vinesim.world.model import Model
 from vinesim.world.state import State
-from vinesim.world.values import Contact, Parting, RobotSpec, View
+from vinesim.world.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Parting, RobotSpec, View
 
 STIRRED = 4.0
 """[m] With robots about, wind moves only the trees whose foot is so near to one of them."""
@@ -38,6 +39,7 @@ class Physics:
         self.rigid = Rigid(model, dt=dt)
         self.touching = Touching(model, self.plants, self.rigid)
         self.parting = Partings(self.plants, self.rigid, self.touching)
+        self.holding = Holding(self.plants, self.rigid, self.touching)
         self._picking = picking
         self.detail = Detail(self.plants)
         self.sleep = Sleep(self.plants)
@@ -51,6 +53,7 @@ class Physics:
         self._fresh = True
         self.stages: tuple[tuple[str, Callable[[], None]], ...] = (
             ("wind: blow on what somebody may see", self._blow),
+            ("holding: close and open hands, pull at plants", self.holding.begin),
             ("rigid: predict without plants", self.rigid.prep),
             ("touching: wake what is near", self.touching.find),
             ("detail: berries move where somebody is near", self._refine),
@@ -60,6 +63,7 @@ class Physics:
             ("rigid: move, pushed by them", self._finish),
             ("guard: stop what went wrong", self._guard),
             ("parting: let go what was pulled, bent or cut off", self._part),
+            ("holding: hands go with what they hold, and feel it", self._hold),
             ("sleep: rest what nobody touches or reaches", self._sleep),
         )
 
@@ -78,13 +82,21 @@ class Physics:
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """Who pressed on which plant in the last tick, sorted by (tree, body, shape, geom)."""
-        return self.touching.contacts
+        """Who pressed on which plant in the last tick, sorted by (tree, body, shape, geom); then who held one."""
+        return self.touching.contacts + self.holding.contacts
 
     @property
     def touched(self) -> tuple[tuple[int, str], ...]:
-        """(tree, actor) for every tree pressed on in the last tick, sorted."""
-        return self.touching.touched
+        """(tree, actor) for every tree pressed on or held in the last tick, sorted."""
+        if not self.holding.contacts:
+            return self.touching.touched
+        held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.holding.contacts)
+        return tuple(sorted({*self.touching.touched, *held}))
+
+    @property
+    def haptics(self) -> tuple[Haptic, ...]:
+        """What the controllers of people are to vibrate with after the last tick."""
+        return self.holding.haptics
 
     def refresh(self) -> None:
         """Bring ``state.body_q`` from the start of the last tick to its end."""
@@ -117,6 +129,23 @@ class Physics:
         """See :meth:`Rigid.remove_robot`; its blades go with it."""
         self.rigid.remove_robot(name)
         self.parting.blades = [blade for blade in self.parting.blades if blade.actor != name]
+
+    def add_human(self, spec: HumanSpec) -> None:
+        """See :meth:`Rigid.add_human`."""
+        self.rigid.add_human(spec)
+
+    def remove_human(self, name: str) -> None:
+        """See :meth:`Rigid.remove_human`; what the hands held is let go."""
+        self.rigid.remove_human(name)
+        self.holding.forget(name)
+
+    def move_human(self, name: str, pose: HumanPose) -> None:
+        """Tell where a person's tracked points are at the end of the coming tick, and which hands are closed."""
+        self.rigid.move_human(name, pose)
+
+    def hand(self, name: str, side: str) -> HandSample:
+        """A person's ``"left"`` or ``"right"`` hand after the last tick."""
+        return self.rigid.hand(name, side)
 
     def pick(self, bunch: int) -> None:
         """Take a bunch off its vine, between ticks; see :meth:`Partings.pick`."""
@@ -168,5 +197,10 @@ class Physics:
         if self.partings:
             self._body_q = None
 
+    def _hold(self) -> None:
+        self.holding.end(self.partings)
+        self.parting.held = self.holding.contacts
+
     def _sleep(self) -> None:
-        self.sleep.update(self.touching.near)
+        held = self.holding.trees
+        self.sleep.update(np.union1d(self.touching.near, held) if len(held) else self.touching.near)

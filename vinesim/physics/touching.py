@@ -238,6 +238,34 @@ class Touching:
         """(tree, actor) for every tree that somebody presses on in the last tick, sorted."""
         return tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
 
+    def nearest(self, point: np.ndarray, reach: float) -> tuple[float, int] | None:
+        """What of the plants is nearest to a ``point`` [3]: distance [m] to its surface, below ``reach``, and its body.
+
+        Of a bunch the bunch's own body, whether or not its clusters move.
+        """
+        low, high = self._tree_low - reach, self._tree_high + reach
+        trees = np.flatnonzero(((low <= point) & (point <= high)).all(1))
+        if len(trees) == 0:
+            return None
+        self.plants.kinematics(trees)
+        s, state = self.shapes, self.plants.state
+        at = np.concatenate([np.arange(s.tree[tree], s.tree[tree + 1]) for tree in trees])
+        fine = state.tree_fine[self.model.body_tree[s.body[at]]]
+        at = at[(s.when[at] == 0) | (s.when[at] == 1 + fine)]
+        at = at[(s.bunch[at] < 0) | state.bunch_attached[s.bunch[at]]]
+        pose = state.body_q[s.body[at]].astype(float)
+        start = pose[:, :3] + frames.rotate(pose[:, 3:], s.start[at].astype(float))
+        along = frames.rotate(pose[:, 3:], (s.end[at] - s.start[at]).astype(float))
+        length = np.maximum((along * along).sum(1), 1e-12)
+        share = np.clip(((point - start) * along).sum(1) / length, 0.0, 1.0)
+        gap = np.linalg.norm(start + share[:, None] * along - point, axis=1) - s.radius[at]
+        best = int(np.argmin(gap)) if len(gap) else -1
+        if best < 0 or gap[best] >= reach:
+            return None
+        body, bunch = int(s.body[at[best]]), int(s.bunch[at[best]])
+        cluster = body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]
+        return float(gap[best]), int(self.model.bunch_body[bunch]) if cluster else body
+
     def _name(self, other: int) -> tuple[str, str]:
         """Actor and link of what a plant touches."""
         if other < 0:
