@@ -206,7 +206,9 @@ def test_defaults_without_a_sidecar(tmp_path: pathlib.Path) -> None:
     joints = """<joint name="turret_joint" type="continuous"><parent link="base"/><child link="camera_link"/>
       <axis xyz="0 0 2"/><limit effort="4" velocity="3"/></joint>
       <joint name="caster_1_joint" type="continuous"><parent link="base"/><child link="caster"/></joint>"""
-    camera = '<link name="camera_link"><inertial><mass value="0.2"/></inertial></link><link name="caster"/>'
+    moments = 'ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"'
+    camera = f'<link name="camera_link"><inertial><mass value="0.2"/><inertia {moments}/></inertial></link>'
+    camera += '<link name="caster"/>'
     simple = load(write(tmp_path, robot(links=camera, joints=joints)))
     assert simple.joints == ("shoulder_joint", "turret_joint")
     shoulder, turret = simple.drives
@@ -284,6 +286,22 @@ FAULTS = {
         ),
         "type 'floating'",
     ),
+    "unknown joint": (robot().replace("revolute", "screw"), "type 'screw'; use one of fixed, revolute"),
+    "joint of no type": (robot().replace('type="revolute"', ""), "type None"),
+    "half an axis": (robot().replace("0 0 1", "0 1"), "xyz=\"0 1\"> of joint 'shoulder_joint' has 2 of 3 numbers"),
+    "not a number": (robot(arm_mass="nan"), "is not finite"),
+    "a word": (robot(arm_mass="heavy"), "<mass value=\"heavy\"> of link 'arm' is no number"),
+    "no inertia": (robot().replace('"0.1"', '"0"'), "'base' moves but has no inertia"),
+    "endless effort": (robot(arm_joint="<limit lower='0' upper='1' effort='inf' velocity='1'/>"), "is not finite"),
+    "flat box": (
+        robot(links="<link name='s'><collision><geometry><box size='1 0 1'/></geometry></collision></link>"),
+        "is no size",
+    ),
+    "unknown shape": (
+        robot(links="<link name='s'><collision><geometry><cone radius='1'/></geometry></collision></link>"),
+        "cone",
+    ),
+    "everybody's world": (robot().replace('"base"', '"world"'), "is called 'world'"),
     "no limits": (robot(arm_joint="<dynamics damping='1'/>"), "moves without limits"),
     "half a limit": (robot(arm_joint="<limit effort='1' velocity='1'/>"), "lower, upper"),
     "upside-down limits": (robot(arm_joint="<limit lower='1' upper='0' effort='1' velocity='1'/>"), "limits 1 to 0"),

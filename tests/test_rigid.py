@@ -337,8 +337,9 @@ def test_links_for_sensors_ride_on_the_bodies():
 def test_what_is_wrong_with_a_robot_is_said_and_the_world_goes_on(change, says):
     rigid = Rigid(yard())
     rigid.add_robot(arm("other"))
-    with pytest.raises(RobotError, match=says):
+    with pytest.raises(RobotError, match=says) as caught:
         rigid.add_robot(dataclasses.replace(arm(), **change))
+    assert "\n" not in str(caught.value)
     assert rigid.robots == ("other",)
     step(rigid, 2)
     with pytest.raises(ValueError, match="there are: other"):
@@ -390,6 +391,18 @@ def test_a_mesh_is_touched_as_the_box_around_it(tmp_path):
     np.testing.assert_allclose(center, pose[:3] + frames.rotate(pose[3:], (low + high) / 2), atol=1e-6)
     shape = next(link for link in rigid.links() if link.name == "anna/slider").shapes[0]
     assert (shape.kind, shape.file, shape.size) == ("mesh", str(file), (1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("content", [b"", b"solid of nothing", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"])
+def test_a_mesh_that_is_none_is_named(content, tmp_path):
+    file = tmp_path / f"shell.{'obj' if content.startswith(b'v') else 'stl'}"
+    file.write_bytes(content)
+    urdf = ARM.replace('<sphere radius="0.04"/>', f'<mesh filename="{file}"/>')
+    rigid = Rigid(yard())
+    with pytest.raises(RobotError, match=r"'anna'.*shell") as caught:
+        rigid.add_robot(dataclasses.replace(arm(), urdf=urdf))
+    assert "\n" not in str(caught.value)
+    assert rigid.robots == ()
 
 
 def test_gains_can_be_tuned_and_survive_a_newcomer():

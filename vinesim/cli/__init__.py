@@ -83,7 +83,10 @@ def client(
     connect: Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")] = None,
     scene: Scene = "demo",
     seed: Seed = None,
-    robot: Robot = "vinebot",
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(help="As for demo; given several times, so many robots NAME_1, NAME_2, each under its namespace."),
+    ] = None,
     spawn: Annotated[int, typer.Option(min=0, help="Which of the scene's start places.")] = 0,
     place: Annotated[
         tuple[float, float, float] | None,
@@ -115,6 +118,7 @@ def client(
       vinesim client --role robot
       vinesim client --role robot --connect tcp/127.0.0.1:7447 --name picker --spawn 1
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
+      vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
     """
     options = dict(locals())
     from vinesim.cli.join import run

@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import pathlib
+import re
 import signal
 import sys
 import threading
@@ -26,9 +27,9 @@ class WrongUse(ValueError):
 
 
 def run(
-    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: str, spawn: int,
-    place: tuple[float, float, float] | None,
-    back: float, namespace: str, ros: bool, push: int | None, watch: int | None, near: float, device: str,
+    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: list[str] | None,
+    spawn: int, place: tuple[float, float, float] | None, back: float,
+    namespace: str, ros: bool, push: int | None, watch: int | None, near: float, device: str,
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
@@ -51,7 +52,7 @@ def run(
     from vinesim.client.client import Client
     from vinesim.client.jobs import DriveTo, LookAt
     from vinesim.client.pace import Pace
-    from vinesim.client.places import checked_bunch, placed, spawn_pose
+    from vinesim.client.places import checked_bunch, placed, start_pose
     from vinesim.client.senses import Senses
     from vinesim.client.status import Status
     from vinesim.client.trace import Trace
@@ -63,40 +64,57 @@ def run(
     from vinesim.world.scene import reseeded
 
     plan = reseeded(load_scene(scene), seed)
-    description = load_robot(robot)
+    descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:
         plan = placed(plan, *place)
         spawn = 0
-    start, goal = spawn_pose(plan, spawn, back), spawn_pose(plan, spawn)
     model = generate(plan)
     name = name or f"robot-{os.getpid()}"
+    names = [name] if len(descriptions) == 1 else [f"{name}_{i + 1}" for i in range(len(descriptions))]
     for bunch in (push, watch):
         checked_bunch(model, bunch)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
 
     with contextlib.ExitStack() as stack:
-        if connect is None:
-            bus: Any = stack.enter_context(MemoryHub().bus(name))
-        else:
+        hub = MemoryHub()
+
+        def bus(name: str) -> Any:
+            if connect is None:
+                return stack.enter_context(hub.bus(name))
             from vinesim.net.zenoh_bus import ZenohBus
 
-            bus = stack.enter_context(ZenohBus(name, connect=connect))
-        senses = stack.enter_context(
-            Senses(
-                name, plan, model, description,
-                namespace=namespace, ros=ros, keep_pictures=out is not None, sensor_hz=sensor_hz,
+            return stack.enter_context(ZenohBus(name, connect=connect))
+
+        perceptions = [
+            stack.enter_context(
+                Senses(
+                    one, plan, model, description,
+                    namespace=namespace if len(names) == 1 else "/".join(filter(None, (namespace, ros_name(one)))),
+                    ros=ros, keep_pictures=out is not None and i == 0, sensor_hz=sensor_hz,
+                    clock=not namespace and i == 0,
+                )
             )
+            for i, (one, description) in enumerate(zip(names, descriptions, strict=True))
+        ]  # fmt: skip
+        senses = perceptions[0]
+        client = Client(
+            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start_pose(plan, spawn, back),
+            near=near, device=device, threads=threads,
         )  # fmt: skip
-        client = Client(plan, model, description, bus, name=name, pose=start, near=near, device=device, threads=threads)
-        senses.attach(client)
+        for i in range(1, len(names)):
+            client.add_robot(descriptions[i], names[i], start_pose(plan, spawn, back, i), bus(names[i]))
+        for one, perception in zip(names, perceptions, strict=True):
+            perception.attach(client, client.robots[one])
         pace = Pace(client.physics.dt)
         watched = watch if watch is not None else push
         if watched is not None:
             body = int(model.bunch_body[watched])
             client.trace = Trace(model, watched, client.physics.state.body_q[body].copy(), 1 << 17)
         if back > 0.0:
-            client.jobs.append(DriveTo(client.robot, goal))
+            client.jobs += [
+                DriveTo(mine, start_pose(plan, spawn, queue=i)) for i, mine in enumerate(client.robots.values())
+            ]
         if push is not None and client.trace is not None:
             reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
             client.jobs.append(reach.control)
@@ -126,6 +144,11 @@ def run(
             partial.write_text(json.dumps(report, indent=2) + "\n")
             partial.replace(out / "report.json")
     return 0
+
+
+def ros_name(name: str) -> str:
+    """An actor's name as ROS allows it in topics."""
+    return re.sub(r"\W", "_", name)
 
 
 def _speak(reporter: Any, senses: Any, status: str, stop: threading.Event) -> None:

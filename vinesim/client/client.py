@@ -5,6 +5,8 @@
         client.tick()
 
 A tick is five steps: receive, control, step, sense, send. Nothing in it waits: not for the network, not for a picture.
+
+One client moves one robot, or several (D6.4 section 4.1): then each is an actor of its own on the network.
 """
 
 from __future__ import annotations
@@ -68,12 +70,13 @@ class Client:
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
-        self.robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
-        hello = Hello(
-            name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=scene.name,
-            digest=model.digest(), index=label_index(name), joints=len(description.joints),
-        )  # fmt: skip
-        self.exchange = Exchange(bus, hello, model, near=near)
+        self.robots: dict[str, Robot] = {}
+        """All that this client moves, by name; the first is :attr:`robot`."""
+        self.exchanges: dict[str, Exchange] = {}
+        """The share of each in the world, by name; the first is :attr:`exchange`."""
+        self._near = near
+        self.robot = self.add_robot(description, name, pose, bus)
+        self.exchange = self.exchanges[name]
         self.others: dict[str, RemoteRobot] = {}
         self.jobs: list[Callable[[float], None]] = []
         """Called every tick with the simulation time, before the drives: what the robot is to do."""
@@ -86,7 +89,20 @@ class Client:
         self._copies: dict[int, TreeUpdate] = {}
         self._expected: dict[str, Hello] = {}
         """Robots that joined and whose place is not known yet."""
-        self.robot.fit_cutters(self.physics)
+
+    def add_robot(self, description: Description, name: str, pose: np.ndarray, bus: Bus) -> Robot:
+        """Move one more robot, standing at ``pose`` [7]; ``bus`` is opened in its name."""
+        hello = Hello(
+            name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=self.scene.name,
+            digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
+        )  # fmt: skip
+        exchange = Exchange(bus, hello, self.model, near=self._near)
+        self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
+        robot.fit_cutters(self.physics)
+        self.exchanges[name] = exchange
+        for own, share in self.exchanges.items():
+            share.kin = self.exchanges.keys() - {own}
+        return robot
 
     def tick(self) -> None:
         """Ten milliseconds of the vineyard."""
@@ -101,7 +117,7 @@ class Client:
 
     def receive(self, now: float) -> None:
         """Let others come and go, move their copies, and hear of the trees they touch."""
-        inbox = self.exchange.receive(now)
+        inbox = self._inbox(now)
         for hello in inbox.joined:
             log.info("%s joined as %s", hello.name, hello.kind)
             if hello.kind == "robot":
@@ -123,7 +139,8 @@ class Client:
         """Do the jobs, then hand set-points to the drives."""
         for job in self.jobs:
             job(self.physics.time)
-        self.robot.control(self.physics.time)
+        for robot in self.robots.values():
+            robot.control(self.physics.time)
 
     def sense(self) -> None:
         """Note the watched bunch, and tell everybody who listens."""
@@ -142,14 +159,17 @@ class Client:
     def send(self, now: float) -> None:
         """Say where the robot is, and what it touches to those who are near."""
         physics = self.physics
-        touched = [tree for tree, actor in physics.touched if actor == self.name]
-        settled = self.exchange.send(
-            now, self.robot.update(now), touched=touched, moving=physics.sleep.moving, read=self._read,
-        )  # fmt: skip
-        for update in settled:
-            # the last word is what all copies hold: hold it too
-            physics.plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
-        self.far.note(self, bool(touched))
+        touching = False
+        for name, robot in self.robots.items():
+            touched = [tree for tree, actor in physics.touched if actor == name]
+            touching |= bool(touched)
+            settled = self.exchanges[name].send(
+                now, robot.update(now), touched=touched, moving=physics.sleep.moving, read=self._read,
+            )  # fmt: skip
+            for update in settled:
+                # the last word is what all copies hold: hold it too
+                physics.plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
+        self.far.note(self, touching)
 
     def side_of(self, point: np.ndarray) -> str:
         """The arm that is on the same side as a point [3] in the world."""
@@ -158,6 +178,30 @@ class Client:
         return "left" if local[1] >= 0.0 else "right"
 
     # ------------------------------------------------------------------ others
+
+    def _inbox(self, now: float) -> Inbox:
+        """What all exchanges brought: of another actor, what is heard where it is nearest."""
+        inboxes = {name: exchange.receive(now) for name, exchange in self.exchanges.items()}
+        inbox = inboxes[self.name]
+        if len(inboxes) == 1:
+            return inbox
+        here = {name: self.physics.rigid.base(name)[0][:2] for name in inboxes}
+        trees = {update.tree: update for update in inbox.trees}
+        nearest: dict[str, tuple[float, RobotUpdate]] = {}
+        for name, heard in inboxes.items():
+            for other, update in heard.robots.items():
+                away = float(np.hypot(*(update.base_q[:2] - here[name])))
+                if other not in nearest or away < nearest[other][0]:
+                    nearest[other] = away, update
+            trees.update((update.tree, update) for update in heard.trees)
+        inbox.robots = {other: update for other, (_, update) in sorted(nearest.items())}
+        inbox.trees = [trees[tree] for tree in sorted(trees)]
+        return inbox
+
+    def _told_by_others(self, tree: int) -> bool:
+        """Whether another client owns a tree: none of one's own robots does, and somebody is known to."""
+        owners = {exchange.owner(tree) for exchange in self.exchanges.values()} - {None}
+        return bool(owners) and not owners & self.robots.keys()
 
     def _embody(self, hello: Hello, update: RobotUpdate) -> None:
         """Let another client's robot stand where it is."""
@@ -180,7 +224,7 @@ class Client:
                 plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
                 told[update.tree] = True
             self._copies[update.tree] = update
-        for tree in [tree for tree in self._copies if self.exchange.owner(tree) in (None, self.name)]:
+        for tree in [tree for tree in self._copies if not self._told_by_others(tree)]:
             update = self._copies.pop(tree)
             told[tree] = False
             if update.resting:
@@ -210,12 +254,11 @@ class Faraway:
 
     def note(self, client: Client, touching: bool) -> None:
         """Judge one tick by where the others' copies stand."""
-        sent = client.exchange.counters.environment.bytes_out
-        here = client.robot.rigid.base(client.name)[0][:2]
-        distance = min(
-            (float(np.hypot(*(client.physics.rigid.base(name)[0][:2] - here))) for name in client.others),
-            default=np.inf,
-        )
+        sent = sum(exchange.counters.environment.bytes_out for exchange in client.exchanges.values())
+        rigid = client.physics.rigid
+        here = [rigid.base(name)[0][:2] for name in client.robots]
+        there = [rigid.base(name)[0][:2] for name in client.others]
+        distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
         if distance > client.exchange.near + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching

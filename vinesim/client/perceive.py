@@ -46,6 +46,7 @@ class Setup:
     ros: bool
     keep_pictures: bool
     sensor_hz: float | None
+    clock: bool
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -119,7 +120,7 @@ class _Perception:
                 setup.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=setup.namespace,
                 static_transforms=fixed, cameras=[m.name for m in description.cameras],
                 lidars=[m.name for m in description.lidars], base=description.base,
-                clock=not setup.namespace,  # one clock in a ROS domain: that of the client without a namespace
+                clock=setup.clock,
             )
         )  # fmt: skip
         poles = np.flatnonzero(setup.model.fixed_organ == Organ.POLE)

@@ -20,6 +20,8 @@ ROOM = 0.55
 """A robot's base needs this much around its middle [m]."""
 
 
+QUEUE = 1.5
+"""Between robots of one client that wait behind one another [m]."""
 CANDIDATES = 200
 """So many of the nearest bunches are tried."""
 
@@ -38,6 +40,12 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
     spawn = scene.spawns[number]
     ahead = np.array([np.cos(spawn.yaw), np.sin(spawn.yaw), 0.0])
     return frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.yaw(spawn.yaw))
+
+
+def start_pose(scene: Scene, number: int, back: float = 0.0, queue: int = 0) -> np.ndarray:
+    """Pose [7] of the ``queue``-th robot of a client: the next start places, then in line behind the first ones."""
+    lap, place = divmod(number + queue, max(len(scene.spawns), 1)) if queue else (0, number)
+    return spawn_pose(scene, place, back + QUEUE * lap)
 
 
 def placed(scene: Scene, x: float, y: float, yaw: float) -> Scene:

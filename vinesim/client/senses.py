@@ -22,6 +22,7 @@ from vinesim.client.jobs import Obey
 from vinesim.client.mailbox import Mailbox, poller
 from vinesim.client.perceive import Letter, Setup, perceive
 from vinesim.robot.description import Description
+from vinesim.robot.drives import Robot
 from vinesim.ros import environment
 from vinesim.ros.types import Command
 from vinesim.world.model import Model
@@ -59,11 +60,13 @@ class Senses:
         ros: bool = True,
         keep_pictures: bool = False,
         sensor_hz: float | None = None,
+        clock: bool | None = None,
     ) -> None:
         """Starts the process; :meth:`attach` gives it something to perceive.
 
         ``keep_pictures`` renders the first camera even if no ROS peer listens, and keeps the picture of the greatest
-        displacement of the watched bunch for :meth:`save`. ``sensor_hz`` replaces the sensors' own rates.
+        displacement of the watched bunch for :meth:`save`. ``sensor_hz`` replaces the sensors' own rates. ``clock``:
+        publish /clock; unless given, whoever has no namespace does, since a ROS domain has one clock.
         """
         self.name = name
         self._attached = False
@@ -82,7 +85,8 @@ class Senses:
         self._mailbox = Mailbox(40 * len(model.body_mass) + (4 << 20), context)
         self._pipe, theirs = context.Pipe()
         sun = scene.sun.direction()
-        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz)
+        clock = not namespace if clock is None else clock
+        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz, clock)
         self._process = context.Process(
             target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {name}", daemon=True
         )
@@ -90,14 +94,15 @@ class Senses:
         theirs.close()
         self._has_news = poller(self._pipe)
 
-    def attach(self, client: Client) -> None:
-        """Perceive this client's world from now on; waits until the process is ready."""
+    def attach(self, client: Client, robot: Robot | None = None) -> None:
+        """Perceive this client's world from now on, as its first robot unless told; waits for the process."""
         self.client = client
+        self.robot = robot or client.robot
         self._wait_for("ready", START)
         self._attached = True
         client.senses.append(self._every_tick)
         if self._ros:
-            client.jobs.insert(0, Obey(client.robot, self._take_commands))
+            client.jobs.insert(0, Obey(self.robot, self._take_commands))
 
     # ------------------------------------------------------------------ the tick
 
@@ -115,12 +120,12 @@ class Senses:
             body_q = physics.state.body_q[bodies]
         if looks:
             link_q = physics.rigid.link_q()
-            poses = {name: client.robot.frame_pose(frame) for name, frame in self._sensors.items()}
+            poses = {name: self.robot.frame_pose(frame) for name, frame in self._sensors.items()}
             if physics.rigid.links() is not self._links:
                 links = physics.rigid.links()
         letter = Letter(
             number=self._letters + 1, tick=physics.tick, time=physics.time,
-            sample=client.robot.sample(physics.time, physics.contacts),
+            sample=self.robot.sample(physics.time, physics.contacts),
             bodies=bodies, body_q=body_q, trees=trees, attached=np.packbits(physics.state.bunch_attached),
             links=links, link_q=link_q, poses=poses, displacement=0.0 if trace is None else trace.displacement,
         )  # fmt: skip

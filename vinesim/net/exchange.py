@@ -162,6 +162,8 @@ class Exchange:
             raise ValueError(f"greeting of {me.name!r} on the bus of {bus.name!r}: one actor has one name")
         self.bus, self.me, self.model = bus, me, model
         self.near = interest.checked(near)
+        self.kin: set[str] = set()
+        """Actors of the same client: they share its world and need not be told of it, nor heard."""
         self.counters = Counters()
         self.clock = Clock()
         greeting = messages.encode_hello(me)
@@ -251,6 +253,8 @@ class Exchange:
             traffic.bytes_in += len(payload)
             actor = self._actors.get(sender)
             if actor is None:
+                if sender in self.kin:
+                    continue
                 self.counters.dropped += 1
                 continue
             try:
@@ -276,7 +280,7 @@ class Exchange:
 
     def _roster(self, now: float, inbox: Inbox) -> None:
         """Notice who came and who went."""
-        alive = self.bus.alive()
+        alive = self.bus.alive() - self.kin
         for name in sorted(self._actors.keys() - alive):
             self._leave(name, now + self.clock.offset)
             inbox.left.append(name)

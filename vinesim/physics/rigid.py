@@ -209,7 +209,7 @@ class Rigid:
         try:
             parsed = _parsed(spec, 1 << bit)
         except ValueError as error:
-            raise RobotError(f"robot {spec.name!r}: MuJoCo cannot read its URDF: {error}") from error
+            raise _unfit(spec, error) from error
         robot = _Robot(
             spec=spec,
             parsed=parsed,
@@ -233,7 +233,7 @@ class Rigid:
             self._compile()
         except ValueError as error:
             del self._robots[spec.name]
-            raise RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {error}") from error
+            raise _unfit(spec, error) from error
         self.place(spec.name, pose, spec.home)
 
     def remove_robot(self, name: str) -> None:
@@ -974,6 +974,11 @@ class _Block:
                 J[row[entry], column[entry]] = d.efc_J[: len(row)][entry]
                 H += J.T @ (d.efc_D[:, None] * J)
         return H
+
+
+def _unfit(spec: RobotSpec, error: ValueError) -> RobotError:
+    """What MuJoCo says against a robot, in one line."""
+    return RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {' '.join(str(error).split())}")
 
 
 def _yaw(pose: np.ndarray) -> float:

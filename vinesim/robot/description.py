@@ -222,6 +222,7 @@ def load(name: str | pathlib.Path) -> Description:
     """
     file = _locate(str(name))
     root = _read(file)
+    _check_numbers(root, file)
     notes: list[str] = []
     _resolve_meshes(root, file, notes)
     _fix_wheels(root, notes)
@@ -281,6 +282,40 @@ def _read(file: pathlib.Path) -> etree._Element:
     if root.tag != "robot":
         raise _error(file, f"its root is <{root.tag}>, not <robot>", "give a URDF (MJCF and SDF are not read)")
     return root
+
+
+def _check_numbers(root: etree._Element, file: pathlib.Path) -> None:
+    """Every number is one, finite, as many as there must be, and every size is above zero."""
+    for element in root.iter(*{tag for tag, _ in _NUMBERS}):
+        for (tag, key), count in _NUMBERS.items():
+            text = element.get(key) if element.tag == tag else None
+            if text is None:
+                continue
+            owner = next((up for up in element.iterancestors() if up.get("name")), root)
+            where = f'<{tag} {key}="{text}"> of {owner.tag} {owner.get("name")!r}'
+            try:
+                numbers = [float(word) for word in text.split()]
+            except ValueError as error:
+                raise _error(
+                    file, f"{where} is no number", "write decimal numbers (is it a xacro? expand it)"
+                ) from error
+            if len(numbers) != count:
+                raise _error(file, f"{where} has {len(numbers)} of {count} numbers", "give all of them")
+            if not all(map(math.isfinite, numbers)):
+                raise _error(file, f"{where} is not finite", "give a number")
+            if tag in _SOLIDS and min(map(abs, numbers) if tag == "mesh" else numbers) <= 0.0:
+                raise _error(file, f"{where} is no size", "give numbers above 0")
+
+
+_SOLIDS = ("box", "sphere", "cylinder", "capsule", "mesh")
+_NUMBERS = {
+    ("origin", "xyz"): 3, ("origin", "rpy"): 3, ("axis", "xyz"): 3, ("mass", "value"): 1,
+    **{("inertia", key): 1 for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")},
+    **{("limit", key): 1 for key in ("lower", "upper", "effort", "velocity")},
+    ("mimic", "multiplier"): 1, ("mimic", "offset"): 1, ("box", "size"): 3, ("sphere", "radius"): 1,
+    **{(solid, key): 1 for solid in ("cylinder", "capsule") for key in ("radius", "length")}, ("mesh", "scale"): 3,
+}  # fmt: skip
+"""How many numbers an attribute has."""
 
 
 def _mesh_file(uri: str, file: pathlib.Path) -> pathlib.Path | None:
@@ -379,6 +414,8 @@ def _check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Join
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise _error(file, f"{kind} {twice[0]!r} is there twice", "rename one")
+    if "world" in links:
+        raise _error(file, "a link is called 'world', which is the name of everybody's world", "rename it")
     if not robot.joints:
         raise _error(file, "no joints", "give a robot with at least one joint that moves")
     parent_of: dict[str, yourdfpy.Joint] = {}
@@ -467,6 +504,7 @@ def _origin(joint: yourdfpy.Joint) -> np.ndarray:
 def _check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: pathlib.Path, notes: list[str]) -> None:
     """Whatever moves has a mass, and no inertia contradicts itself."""
     carried: dict[str, float] = {}
+    turning: dict[str, float] = {}
     anchors = _anchors(order[0].parent, order)
     lopsided = []
     for link in robot.links:
@@ -477,6 +515,8 @@ def _check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: path
         if mass < 0.0 or not math.isfinite(mass):
             raise _error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give it its mass")
         carried[anchors[link.name][0]] = carried.get(anchors[link.name][0], 0.0) + mass
+        own = float(np.abs(inertia).max()) if inertia is not None else 0.0
+        turning[anchors[link.name][0]] = turning.get(anchors[link.name][0], 0.0) + own
         if inertia is not None and mass > 0.0:
             moments = np.linalg.eigvalsh(inertia)
             if moments[0] <= 0.0 and moments[2] > 0.0:
@@ -490,6 +530,8 @@ def _check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: path
     for link in [order[0].parent, *(joint.child for joint in order if joint.type != "fixed")]:
         if carried.get(link, 0.0) <= 0.0:
             raise _error(file, f"link {link!r} moves but has no mass", "give it an <inertial> with a mass above 0")
+        if turning[link] <= 0.0:
+            raise _error(file, f"link {link!r} moves but has no inertia", "give it an <inertia> that is not all 0")
     if lopsided:
         notes.append(f"{len(lopsided)} inertias no real body has (triangle inequality), first {lopsided[0]!r}")
 

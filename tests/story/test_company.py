@@ -1,0 +1,138 @@
+"""F54: one client moves several robots; each is an actor of its own to everybody else, and its topics have a prefix."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.client.client import Client
+from vinesim.client.places import QUEUE, bunch_centres, bunch_in_reach, spawn_pose, start_pose
+from vinesim.net.bus import MemoryHub
+from vinesim.robot.description import load as load_robot
+from vinesim.robot.reach import ReachAndPush
+from vinesim.world.generate import generate
+from vinesim.world.scene import load
+
+DT = 0.01
+
+
+class Farm:
+    """A client with two robots, and a visitor: the second robot stands before the vines."""
+
+    def __init__(self, visitor_back: float = 0.0) -> None:
+        self.now = 100.0
+        self.scene = load("demo")
+        self.model = generate(self.scene)
+        self.hub = MemoryHub(delay=0.02)
+        self.vinebot = load_robot("vinebot")
+        start = spawn_pose(self.scene, 0)
+        self.bunch = bunch_in_reach(self.model, start)
+        self.tree = int(self.model.body_tree[self.model.bunch_body[self.bunch]])
+        self.farm = self.client("farm_1", start_pose(self.scene, 0, 4.0))
+        self.farm.add_robot(self.vinebot, "farm_2", start, self.hub.bus("farm_2"))
+        self.visitor = self.client("visitor", spawn_pose(self.scene, 1, visitor_back))
+
+    def client(self, name: str, pose: np.ndarray) -> Client:
+        bus = self.hub.bus(name)
+        return Client(self.scene, self.model, self.vinebot, bus, name=name, pose=pose, clock=lambda: self.now)
+
+    def reach(self) -> None:
+        """The second robot pushes a bunch."""
+        centre = bunch_centres(self.model)[self.bunch]
+        robot = self.farm.robots["farm_2"]
+        base, _ = self.farm.physics.rigid.base("farm_2")
+        local = frames.rotate(frames.conjugate(base[3:]), centre - base[:3])
+        side = "left" if local[1] >= 0.0 else "right"
+        self.farm.jobs.append(ReachAndPush(robot, side, lambda: centre, repeat=False).control)
+
+    def until(self, condition, limit: float) -> None:
+        for _ in range(round(limit / DT)):
+            self.farm.tick()
+            self.visitor.tick()
+            self.hub.advance(DT)
+            self.now += DT
+            if condition():
+                return
+        pytest.fail(f"did not come true within {limit} s of simulated time")
+
+
+def test_two_robots_of_one_client_are_two_actors_to_the_others():
+    world = Farm()
+    farm, visitor = world.farm, world.visitor
+    world.until(lambda: len(visitor.others) == 2 and len(farm.others) == 1, 3.0)
+    assert set(visitor.others) == {"farm_1", "farm_2"}
+    assert set(farm.others) == {"visitor"}
+    assert farm.physics.rigid.robots == ("farm_1", "farm_2", "visitor")
+
+    # each moves by its own commands, in both worlds
+    first, second = farm.robots.values()
+    first.command_position([0.5], ["head_1_joint"])
+    second.command_position([-0.5], ["head_1_joint"])
+    head = world.vinebot.joints.index("head_1_joint")
+    world.until(lambda: visitor.physics.rigid.read("farm_2")[0][head] < -0.49, 3.0)
+    assert visitor.physics.rigid.read("farm_1")[0][head] == pytest.approx(0.5, abs=0.02)
+
+    # what the second one touches is told by it, and moves on the visitor's side
+    world.reach()
+    world.until(lambda: visitor.exchange.owner(world.tree) == "farm_2", 15.0)
+    assert farm.exchanges["farm_2"].owner(world.tree) == "farm_2"
+    here = world.model.bodies_of(world.tree)
+    rest = world.model.joint_settled[here]
+
+    def moved(client: Client) -> float:
+        """Largest turn of a joint of the touched tree [rad]."""
+        alike = np.abs((client.physics.state.joint_q[here] * rest).sum(1))
+        return float(2.0 * np.arccos(np.clip(alike, 0.0, 1.0)).max())
+
+    world.until(lambda: moved(farm) > 0.2, 10.0)
+    world.until(lambda: moved(visitor) > 0.15, 1.0)
+    assert farm.exchange.counters.environment.bytes_out == 0
+    assert farm.exchanges["farm_2"].counters.environment.bytes_out > 0
+
+
+def test_a_companion_is_nobody_that_must_be_told():
+    """With the visitor 20 m away, one robot touches a vine beside its companion: not one byte leaves."""
+    world = Farm(visitor_back=20.0)
+    world.reach()
+    world.until(lambda: world.farm.far.ticks_touching > 20, 15.0)
+    assert world.farm.far.bytes == 0
+    assert sum(e.counters.environment.bytes_out for e in world.farm.exchanges.values()) == 0
+
+
+def test_robots_of_one_client_start_side_by_side_then_in_line():
+    scene = load("demo")
+    poses = [start_pose(scene, 0, 0.0, i) for i in range(2 * len(scene.spawns))]
+    first, behind = poses[0], poses[len(scene.spawns)]
+    assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE)
+    apart = [np.linalg.norm(a[:2] - b[:2]) for i, a in enumerate(poses) for b in poses[:i]]
+    assert min(apart) > 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_each_has_its_topics_under_its_name():
+    """A stranger with stock rclpy hears both, each under its own prefix, and one clock."""
+    topics = [
+        "/clock",
+        *(f"/farm_{i}/{topic}" for i in (1, 2) for topic in ("joint_states", "mobile_base_controller/odom", "tf")),
+    ]
+    witness = subprocess.Popen(
+        [sys.executable, "-m", "vinesim.ros.witness", *(word for topic in topics for word in ("--topic", topic))],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        two = ["--robot", "vinebot", "--robot", "vinebot", "--name", "farm", "--seconds", "8", "--status", "none"]
+        done = subprocess.run(
+            [sys.executable, "-m", "vinesim.cli", "client", *two], capture_output=True, text=True, timeout=240
+        )
+        assert done.returncode == 0, done.stderr
+        heard, _ = witness.communicate(timeout=30)
+    finally:
+        witness.kill()
+    report = json.loads(heard)
+    for topic in topics:
+        assert report[topic]["count"] > 20, (topic, report)
+    assert report["/clock"]["lost"] is not None, "one publisher"
