@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from vinesim import frames
-from vinesim.client import picking
+from vinesim.client import logistics, picking
 from vinesim.physics.step import Physics
 from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.exchange import Exchange, Swap
 from vinesim.robot.pick import Pick
 from vinesim.robot.script import Script
 from vinesim.ros.types import BaseVelocity, Command, JointPositions, JointTrajectory
@@ -33,7 +34,16 @@ def plan_job(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physic
     if job == "pick":
         task = next(picking.tasks(model, near[:2]))
         return functools.partial(Pick, task=task), task.stand
+    if job == "exchange":
+        boxes = logistics.swap(model, near)
+        return functools.partial(_exchange, swap=boxes), near
     raise UnknownJob(f"no job {job!r}; give pick or exchange")
+
+
+def _exchange(physics: Physics, robot: Robot, swap: Swap) -> Exchange:
+    """Fill the box that is to be full, and exchange it."""
+    logistics.fill(physics, swap.full)
+    return Exchange(physics, robot, swap)
 
 
 class DriveTo:
