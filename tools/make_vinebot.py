@@ -345,12 +345,15 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
     )
     urdf.fix(f"{prefix}_base_link", f"wrist_{side}_ft_link", (0, 0, -0.028), (0, math.pi / 2, 0))
     for finger, outward in (("left", 1.0), ("right", -1.0)):
-        # two faces that slope towards each other: a round thing comes to rest between them and cannot slide out ahead
+        # two faces that slope towards each other: a round thing comes to rest between them and cannot slide out ahead;
+        # they reach down to where a bunch that is held below its upper end is thickest
         slope, face, deep = math.radians(20.0), 0.0287, 0.008
         back, aside = 0.5 * (face * math.sin(slope) + deep * math.cos(slope)), 0.5 * deep * math.sin(slope)
         pad = (
-            box((face, deep, 0.03), (0.0515 - aside, outward * back, 0), (0, 0, outward * slope), colour="rubber"),
-            box((face, deep, 0.03), (0.0785 + aside, outward * back, 0), (0, 0, -outward * slope), colour="rubber"),
+            box((face, deep, 0.06), (0.0515 - aside, outward * back, -0.015), (0, 0, outward * slope), colour="rubber"),
+            box(
+                (face, deep, 0.06), (0.0785 + aside, outward * back, -0.015), (0, 0, -outward * slope), colour="rubber"
+            ),
             box((0.092, 0.008, 0.02), (0.046, outward * 0.020, 0), colour="steel"),
             box((0.01, 0.02, 0.02), (0.01, outward * 0.014, 0), colour="steel", solid=False),
         )

@@ -4,7 +4,7 @@ This module knows the commands and their options and nothing else; a command imp
 so that ``vinesim --help`` opens at once.
 
 Exit codes: 0 done; 2 wrong use or bad input; 3 a part is missing on this machine; 4 the network or the server;
-130 stopped by Ctrl-C where stopping is not the ordinary end.
+5 a job was not done; 130 stopped by Ctrl-C where stopping is not the ordinary end.
 """
 
 from __future__ import annotations
@@ -30,34 +30,54 @@ app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
 
 Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
-Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, tendone, vsp.")]
-Robot = Annotated[str, typer.Option(help="A URDF file, or the name of one that ships: vinebot.")]
+Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, harvest, tendone, vsp.")]
+Robot = Annotated[str, typer.Option(help="A URDF file, or the name of one that ships: vinebot, logistic.")]
 
 
 @app.command()
 def demo(
-    seconds: Annotated[float, typer.Option(min=6.0, help="How long the robots work [s].")] = 20.0,
+    job: Annotated[
+        str,
+        typer.Option(help="push: on and on. pick: a bunch into a box. exchange: a full box for an empty one."),
+    ] = "push",
+    seconds: Annotated[
+        float | None, typer.Option(min=6.0, help="How long the robots push, 20; or how long a job may take, 120 [s].")
+    ] = None,
     seed: Seed = None,
-    scene: Scene = "demo",
-    robot: Robot = "vinebot",
+    scene: Annotated[
+        str | None, typer.Option(help="A scene file, or the name of one that ships; demo, or harvest for the jobs.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="A URDF file, or the name of one that ships; vinebot, or logistic to exchange.")
+    ] = None,
     headless: Annotated[bool, typer.Option(help="No live table; one line a second.")] = False,
     out: Annotated[pathlib.Path, typer.Option(help="Folder for pictures, plot and summary.json.")] = pathlib.Path(
         "out"
     ),
 ) -> None:
-    """A robot pushes a bunch, another client sees it move, ROS topics carry it.
+    """A robot pushes a bunch, another client sees it move, ROS topics carry it; or a robot does a job.
 
-    Starts a server, two robot clients and a plain rclpy listener, each a process of its own, on free ports.
+    Starts a server, two robot clients (one for a job) and a plain rclpy listener, each a process of its own, on free
+    ports. summary.json says what was measured; of a job whether it was done ("picked", "exchanged") and if not, why.
 
     \b
     Examples:
       vinesim demo
       vinesim demo --seconds 30 --seed 3 --out /tmp/run
       vinesim demo --scene my-block.toml --robot my-robot.urdf --headless
+      vinesim demo --job pick --seed 5
+      vinesim demo --job exchange
     """
-    from vinesim.cli.demo import run
+    from vinesim.cli.demo import do, run
 
-    raise typer.Exit(run(seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out))
+    if job != "push":
+        raise typer.Exit(do(job, seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out))
+    raise typer.Exit(
+        run(
+            seconds=seconds or 20.0, seed=seed, scene=scene or "demo", robot=robot or "vinebot", headless=headless,
+            out=out,
+        )
+    )  # fmt: skip
 
 
 @app.command()
@@ -96,6 +116,7 @@ def client(
     namespace: Annotated[str, typer.Option(help="Prefix of all ROS topics.")] = "",
     ros: Annotated[bool, typer.Option(help="Talk ROS 2, if it is installed.")] = True,
     push: Annotated[int | None, typer.Option(help="Reach for this bunch and push it, again and again.")] = None,
+    job: Annotated[str | None, typer.Option(help="Do a job and stop: pick or exchange.")] = None,
     watch: Annotated[int | None, typer.Option(help="Record force and displacement of this bunch.")] = None,
     near: Annotated[
         float, typer.Option(min=0.1, max=5.0, help="Others nearer than this to a thing hear of it [m].")
@@ -128,7 +149,7 @@ def client(
 
 @scene_app.command("show")
 def scene_show(
-    file: Annotated[str, typer.Argument(help="A scene file, or demo, tendone, vsp.")],
+    file: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
     seed: Seed = None,
     out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; NAME.png unless given.")] = None,
 ) -> None:

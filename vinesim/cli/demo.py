@@ -195,6 +195,61 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
     return 0
 
 
+JOBS = {"pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged")}
+"""Jobs: the robot that does them unless another is named, and the word for that it was done."""
+
+
+def do(
+    job: str, *, seconds: float | None, seed: int | None, scene: str | None, robot: str | None, headless: bool,
+    out: pathlib.Path,
+) -> int:  # fmt: skip
+    """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
+    from vinesim.client.jobs import UnknownJob
+    from vinesim.robot.description import load as load_robot
+    from vinesim.world.scene import load as load_scene
+    from vinesim.world.scene import reseeded
+
+    if job not in JOBS:
+        raise UnknownJob(f"no job {job!r}; give push, {' or '.join(JOBS)}")
+    console = Console(stderr=True)
+    robot, scene = robot or JOBS[job][0], scene or "harvest"
+    plan = reseeded(load_scene(scene), seed)
+    load_robot(robot)  # say now, and once, what is wrong with it
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "summary.json").unlink(missing_ok=True)
+    no_ros = environment.available()
+    quiet_ros = {} if "ROS_AUTOMATIC_DISCOVERY_RANGE" in os.environ else {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with company() as processes:
+        server = Process.start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0", **quiet_ros)
+        processes.append(server)
+        endpoint = server.line(20.0).removeprefix("listening on ")
+        console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
+        worker = Process.start(
+            PUSHER, "-m", "vinesim.cli", "client", "--role", "robot", "--name", PUSHER, "--connect", endpoint,
+            "--scene", scene, "--seed", str(plan.seed), "--robot", robot, "--job", job, "--status", "json",
+            "--seconds", str(seconds or 120.0), "--out", str(out / PUSHER), "--sensor-hz", "1", **quiet_ros,
+        )  # fmt: skip
+        processes.append(worker)
+        newest = {PUSHER: json.loads(worker.line(START))}
+        watch(worker, None, server, newest, console, headless)
+    report = json.loads((out / PUSHER / "report.json").read_text())
+    done = bool(report["job"]["succeeded"])
+    reason = report["job"]["reason"] or ("" if done else f"stopped at {report['job']['phase']!r} before the end")
+    summary = {
+        "scene": scene, "seed": plan.seed, "robot": robot, "job": job, JOBS[job][1]: done, "reason": reason,
+        "seconds": report["time"], "ros": no_ros or "used", "detail": report["job"],
+        **{key: report[key] for key in ("tick_hz", "tick_p50_ms", "tick_p99_ms", "overruns", "real_time_factor")},
+    }  # fmt: skip
+    for picture in (out / PUSHER).glob("*.png"):
+        shutil.copyfile(picture, out / picture.name)
+    partial = out / "summary.json.part"
+    partial.write_text(json.dumps(summary, indent=2) + "\n")
+    partial.replace(out / "summary.json")
+    console.print(f"{JOBS[job][1]} after {report['time']:.1f} s" if done else f"not {JOBS[job][1]}: {reason}")
+    console.print(f"pictures and summary.json are in {out}/")
+    return 0 if done else 5
+
+
 def set_the_stage(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:
     """The bunch to push, and where both robots start, as options: the scene's places if a bunch is in reach there."""
     from vinesim.client import places
@@ -224,14 +279,14 @@ def heard_topics(cameras: Sequence[Mount]) -> list[str]:
 
 
 def watch(
-    pusher: Process, visitor: Process, server: Process, newest: dict[str, Any], console: Console, headless: bool
+    pusher: Process, visitor: Process | None, server: Process, newest: dict[str, Any], console: Console, headless: bool
 ) -> None:
     """Show what both clients report until the pusher is done."""
     live = contextlib.nullcontext() if headless or not console.is_terminal else Live(console=console, transient=True)
     with live as view:
         while True:
             with contextlib.suppress(queue.Empty):
-                while line := visitor.lines.get_nowait():
+                while visitor is not None and (line := visitor.lines.get_nowait()):
                     newest[VISITOR] = json.loads(line)
             try:
                 line = pusher.lines.get(timeout=0.5)
@@ -242,7 +297,7 @@ def watch(
                     raise pusher.failed()
                 return
             for process in (visitor, server):
-                if process.child.poll() is not None:
+                if process is not None and process.child.poll() is not None:
                     raise process.failed()
             if line is not None:
                 newest[PUSHER] = json.loads(line)

@@ -28,8 +28,8 @@ class WrongUse(ValueError):
 
 def run(
     *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: list[str] | None,
-    spawn: int, place: tuple[float, float, float] | None, back: float,
-    namespace: str, ros: bool, push: int | None, watch: int | None, near: float, device: str,
+    spawn: int, place: tuple[float, float, float] | None, back: float, namespace: str, ros: bool, push: int | None,
+    job: str | None, watch: int | None, near: float, device: str,
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
@@ -50,7 +50,7 @@ def run(
     stop = threading.Event()
 
     from vinesim.client.client import Client
-    from vinesim.client.jobs import DriveTo, LookAt
+    from vinesim.client.jobs import DriveTo, LookAt, plan_job
     from vinesim.client.pace import Pace
     from vinesim.client.places import checked_bunch, placed, start_pose
     from vinesim.client.senses import Senses
@@ -69,6 +69,10 @@ def run(
         plan = placed(plan, *place)
         spawn = 0
     model = generate(plan)
+    start = start_pose(plan, spawn, back)
+    if job is not None:
+        begin, start = plan_job(job, model, start_pose(plan, spawn))
+        back = 0.0
     name = name or f"robot-{os.getpid()}"
     names = [name] if len(descriptions) == 1 else [f"{name}_{i + 1}" for i in range(len(descriptions))]
     for bunch in (push, watch):
@@ -99,8 +103,8 @@ def run(
         ]  # fmt: skip
         senses = perceptions[0]
         client = Client(
-            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start_pose(plan, spawn, back),
-            near=near, device=device, threads=threads,
+            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, near=near, device=device,
+            threads=threads,
         )  # fmt: skip
         for i in range(1, len(names)):
             client.add_robot(descriptions[i], names[i], start_pose(plan, spawn, back, i), bus(names[i]))
@@ -118,7 +122,12 @@ def run(
         if push is not None and client.trace is not None:
             reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
             client.jobs.append(reach.control)
-        if client.trace is not None:
+        script = None
+        if job is not None:
+            script = begin(client.physics, client.robot)
+            client.jobs.append(script.control)
+            client.jobs.append(LookAt(client.robot, script.focus))
+        elif client.trace is not None:
             client.jobs.append(LookAt(client.robot, client.trace.centre))
         reporter = Status(client, pace, senses.sent)
         speaker = threading.Thread(target=_speak, args=(reporter, senses, status, stop), name="status")
@@ -131,12 +140,14 @@ def run(
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         limit = None if seconds is None else round(seconds / client.physics.dt)
-        while not stop.is_set() and (limit is None or pace.ticks < limit):
+        while not (stop.is_set() or pace.ticks == limit or (script is not None and script.done)):
             pace.begin()
             client.tick()
             pace.end()
         if out is not None:
             report = reporter.report() | senses.report()
+            if script is not None:
+                report["job"] = script.report()
             senses.save(out)
             if client.trace is not None:
                 client.trace.rows().save(out / "trace.npz")

@@ -3,16 +3,47 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from vinesim import frames
+from vinesim.client import logistics, picking
+from vinesim.physics.step import Physics
 from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.exchange import Exchange, Swap
+from vinesim.robot.pick import Pick
+from vinesim.robot.script import Script
 from vinesim.ros.types import BaseVelocity, Command, JointPositions, JointTrajectory
+from vinesim.world.model import Model
 
 log = logging.getLogger(__name__)
+
+
+class UnknownJob(ValueError):
+    """A job that no robot here knows; the text says which it knows."""
+
+
+def plan_job(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Script], np.ndarray]:
+    """How to begin a job once physics and robot are there, and the pose [7] where the robot starts.
+
+    ``near`` [7]: where it would be otherwise. Planning takes a second or two: not for the tick.
+    """
+    if job == "pick":
+        task = next(picking.tasks(model, near[:2]))
+        return functools.partial(Pick, task=task), task.stand
+    if job == "exchange":
+        boxes = logistics.swap(model, near)
+        return functools.partial(_exchange, swap=boxes), near
+    raise UnknownJob(f"no job {job!r}; give pick or exchange")
+
+
+def _exchange(physics: Physics, robot: Robot, swap: Swap) -> Exchange:
+    """Fill the box that is to be full, and exchange it."""
+    logistics.fill(physics, swap.full)
+    return Exchange(physics, robot, swap)
 
 
 class DriveTo:

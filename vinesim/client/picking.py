@@ -19,7 +19,7 @@ from vinesim.world.model import Model
 
 AHEAD, ASIDE = 0.88, 0.28
 """Where a bunch hangs that an arm picks, in the base's axes [m]: ahead, and on the arm's side."""
-HAND_FROM, HAND_TO = np.array([-0.45, -0.11, -0.04]), np.array([0.06, 0.11, 0.09])
+HAND_FROM, HAND_TO = np.array([-0.45, -0.11, -0.05]), np.array([0.06, 0.11, 0.09])
 """What an open hand sweeps about the place where it holds a bunch [m]; x along the hand, z up."""
 HEIGHT = (1.3, 1.75)
 """[m] Where a bunch is held that arm and lift reach with the hand level."""
@@ -149,17 +149,17 @@ def parks(model: Model) -> Iterator[Park]:
                         break
 
 
-def way(model: Model, start: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
-    """Points [n, 2] m of a short way with :data:`ROOM` on either side, ends included; None if there is none.
+def way(model: Model, start: np.ndarray, goal: np.ndarray, room: float = ROOM) -> np.ndarray | None:
+    """Points [n, 2] m of a short way with ``room`` [m] on either side, ends included; None if there is none.
 
     A* on a grid (Hart, Nilsson and Raphael 1968), then every point is left out that a straight line makes needless.
     """
     low = np.minimum(start, goal) - 3.0
     shape = tuple((np.ceil((np.maximum(start, goal) + 3.0 - low) / GRID)).astype(int))
     at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
-    free = (free_room(model, low + GRID * at) > ROOM).reshape(shape)
+    free = (free_room(model, low + GRID * at) > room).reshape(shape)
     first, last = (tuple(np.round((p - low) / GRID).astype(int)) for p in (start, goal))
-    if not free[last] or float(free_room(model, np.array([start]))[0]) < ROOM:
+    if not free[last] or float(free_room(model, np.array([start]))[0]) < room:
         return None
     steps = [(i, j, float(np.hypot(i, j))) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     came: dict[tuple[int, int], tuple[int, int]] = {first: first}
@@ -186,13 +186,13 @@ def way(model: Model, start: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
     points = [start, *(low + GRID * np.array(cell) for cell in cells[-2:0:-1]), goal]
     kept, i = [points[0]], 0
     while i < len(points) - 1:
-        i = next(j for j in range(len(points) - 1, i, -1) if j == i + 1 or _open(model, points[i], points[j]))
+        i = next(j for j in range(len(points) - 1, i, -1) if j == i + 1 or _open(model, points[i], points[j], room))
         kept.append(points[i])
     return np.array(kept)
 
 
-def _open(model: Model, start: np.ndarray, end: np.ndarray) -> bool:
+def _open(model: Model, start: np.ndarray, end: np.ndarray, room: float) -> bool:
     """Whether the straight line has room on either side."""
     count = max(int(np.linalg.norm(end - start) / (0.5 * GRID)), 2)
     line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-    return bool((free_room(model, line) > ROOM - 0.5 * GRID).all())
+    return bool((free_room(model, line) > room - 0.5 * GRID).all())

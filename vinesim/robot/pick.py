@@ -114,6 +114,10 @@ class Pick(Script):
         where = {"bunch": self.task.bunch, "side": self.task.side, "box": self.task.box}
         return {"picked": self.picked, **where, "bunch_kg": round(self.mass, 4), **super().report()}
 
+    def focus(self) -> np.ndarray:
+        """See :class:`Script`."""
+        return self._grip()
+
     @property
     def mass(self) -> float:
         """Of the bunch [kg]."""

@@ -15,6 +15,8 @@ import logging
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from vinesim.robot.drives import Robot
 
 log = logging.getLogger(__name__)
@@ -51,6 +53,10 @@ class Script:
         """How it went, as plain values for JSON."""
         phases = {phase: round(seconds, 2) for phase, seconds in self.durations.items()}
         return {"succeeded": self.succeeded, "reason": self.reason, "phase": self.phase, "phases_s": phases}
+
+    def focus(self) -> np.ndarray:
+        """What to look at [3] m in the world."""
+        raise NotImplementedError
 
     def steps(self) -> Iterator[str]:
         """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`Failed`."""
