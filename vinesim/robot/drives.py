@@ -337,10 +337,11 @@ class Robot(Embodied):
 
     def control(self, time: float) -> None:
         """Hand set-points for the tick that starts at ``time`` [s] to the servos; call it before physics steps."""
-        position, velocity, _, _ = self.rigid.read(self.name)
-        by_effort = self.interface == Interface.EFFORT
+        if self._retuned:
+            self._arrange()
+        position, velocity = self.rigid.state(self.name)
         rate = self._advance(position, velocity)
-        if self._retuned or by_effort.any() or (self.interface == Interface.ELASTIC).any():
+        if self._retuned or self._changing:
             braked, brake = self._brakes(velocity)
             self._tune(braked, brake)
             rate = np.where(braked, np.copysign(self.speed, velocity), rate)
@@ -349,32 +350,39 @@ class Robot(Embodied):
         self._drive(time)
         self._odometry(self.rigid.base(self.name)[0])
 
+    def _arrange(self) -> None:
+        """Prepare what changes only with the interfaces, gains and limits."""
+        self._by_effort, self._by_motor = self.interface == Interface.EFFORT, self.interface == Interface.ELASTIC
+        self._by_velocity = np.flatnonzero(self.interface == Interface.VELOCITY)
+        self._changing = bool(self._by_effort.any() or self._by_motor.any())
+        """Whether gains follow the state, so that they must be set in every tick."""
+        self._spring_in_use = np.where(self._by_motor, self.spring, self._stiffness)
+        self._lead = self._limit / np.maximum(self._spring_in_use, 1e-9) + self.speed * self.rigid.dt
+        self._gain = SPARE * self.rigid.dt * self._limit
+
     def _advance(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Move the set-points on by a tick; their rates [joint]."""
         dt = self.rigid.dt
-        by_effort = self.interface == Interface.EFFORT
         # A servo that already gives all it has gives no more when asked for more, but would overshoot when let go.
-        lead = self._limit / np.maximum(self._spring_in_use(), 1e-9) + self.speed * dt
         middle = position
         if self._grippers:
             middle = position.copy()
             for fingers in self._grippers.values():
                 middle[fingers] = position[fingers].mean()
-        start = np.where(by_effort, position, np.clip(self.setpoint, middle - lead, middle + lead))
-        step = np.where(self.interface == Interface.VELOCITY, self._goal * dt, self._goal - start)
+        start = np.clip(self.setpoint, middle - self._lead, middle + self._lead)
+        wanted = (self._goal - start) / dt
+        wanted[self._by_velocity] = self._goal[self._by_velocity]
         # Nor may it run ahead faster than the drive can follow: at its limit the servo would shoot past the speed.
-        gain = SPARE * dt * self._limit / np.maximum(self.rigid.inertia(self.name), 1e-9)
+        gain = self._gain / np.maximum(self.rigid.inertia(self.name), 1e-9)
         slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.speed)
         fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.speed)
-        step = np.where(by_effort, 0.0, np.clip(step, slowest * dt, fastest * dt))
-        self.setpoint = np.clip(start + step, self.lower, self.upper)
+        rate = np.clip(wanted, slowest, fastest)
+        if self._changing:
+            start, rate = np.where(self._by_effort, position, start), np.where(self._by_effort, 0.0, rate)
+        self.setpoint = np.clip(start + dt * rate, self.lower, self.upper)
         rate = (self.setpoint - start) / dt
-        self._rate = np.where(by_effort, velocity, rate)
+        self._rate = np.where(self._by_effort, velocity, rate)
         return rate
-
-    def _spring_in_use(self) -> np.ndarray:
-        """[joint] stiffness between set-point and joint."""
-        return np.where(self.interface == Interface.ELASTIC, self.spring, self._stiffness)
 
     def _brakes(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joints whose effort would drive them too fast, bool, and the damping about their largest speed [joint].
@@ -386,19 +394,19 @@ class Robot(Embodied):
         brake, along = 10.0 * self.effort / self.speed, towards * self._goal
         ahead = towards * (2.0 * velocity - self._velocity)
         near = (along > brake * (self.speed - ahead)) | (self._braked & (np.abs(velocity) > 0.5 * self.speed))
-        self._braked = near & (along >= 0.0) & (self.interface == Interface.EFFORT)
+        self._braked = near & (along >= 0.0) & self._by_effort
         spare = self.speed - np.abs(velocity)
         most = 0.8 * np.where(spare > 0.0, along, self.effort)
         return self._braked, np.minimum(brake, most / np.maximum(np.abs(spare), 1e-9))
 
     def _tune(self, braked: np.ndarray, brake: np.ndarray) -> None:
         """Give the servos the gains and efforts that the interfaces ask for."""
-        by_effort, by_motor = self.interface == Interface.EFFORT, self.interface == Interface.ELASTIC
+        by_effort, by_motor = self._by_effort, self._by_motor
         damping = np.where(by_motor, self._spring_damping, self._damping)
         effort = np.where(by_motor, -self.rigid.weight(self.name), 0.0)
         self.rigid.tune(
             self.name,
-            np.where(by_effort, 0.0, self._spring_in_use()),
+            np.where(by_effort, 0.0, self._spring_in_use),
             np.where(braked, brake, np.where(by_effort, 0.0, damping)),
             np.where(by_effort & ~braked, self._goal, effort),
             limit=self._limit,
@@ -431,18 +439,21 @@ class Robot(Embodied):
         )
 
     def _wrench(self, mount: Mount, time: float, contacts: Sequence[Contact]) -> Wrench:
-        wrench, pose = self.rigid.wrench(self.name, mount.frame).copy(), self.frame_pose(mount.frame)
-        back = frames.conjugate(pose[3:])
-        for contact in contacts:  # with plants, which the rigid world does not know
-            if contact.link in self._beyond[mount.frame]:
-                wrench[:3] += frames.rotate(back, contact.force)
-                wrench[3:] += frames.rotate(back, frames.cross(contact.position - pose[:3], contact.force))
+        wrench = self.rigid.wrench(self.name, mount.frame)
+        mine = [contact for contact in contacts if contact.link in self._beyond[mount.frame]]
+        if mine:  # with plants, which the rigid world does not know
+            pose = self.frame_pose(mount.frame)
+            back = frames.conjugate(pose[3:])
+            force = np.array([contact.force for contact in mine])
+            arm = np.array([contact.position for contact in mine]) - pose[:3]
+            wrench[:3] += frames.rotate(back, force.sum(0))
+            wrench[3:] += frames.rotate(back, frames.cross(arm, force).sum(0))
         return Wrench(time, mount.name, mount.frame, wrench[:3], wrench[3:])
 
     def _imu(self, mount: Mount, time: float) -> Imu:
         turn = self.frame_pose(mount.frame)[3:]
         spin = self.rigid.angular_velocity(self.name, mount.frame)
-        acceleration = self.rigid.acceleration(self.name, mount.frame)[3:].copy()
+        acceleration = self.rigid.acceleration(self.name, mount.frame)[3:]
         return Imu(time, mount.name, mount.frame, turn, spin, acceleration)
 
     def update(self, time: float) -> RobotUpdate:
