@@ -597,3 +597,30 @@ def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
     mass, _ = hand_of(description)
     felt = frames.rotate(turn, wrench.force) + np.array([0.0, 0.0, 9.81 * mass])
     np.testing.assert_allclose(felt, force, atol=0.05)
+
+
+def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
+    """All joints soft, a set-point behind the bunch: at rest K times what is missing is what the plants press."""
+    description = load("vinebot")
+    model, _, middle = bunch_scene()
+    physics = Physics(model)
+    tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
+    place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.yaw(np.pi), tip)
+    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
+    joints = description.indices("arm_left")
+    stiffness = np.array([60.0, 60.0, 40.0, 40.0, 15.0, 15.0, 15.0])
+    robot.command_impedance(stiffness, 0.2 * stiffness, joints)
+    robot.control(physics.time)
+    physics.step()
+    here = robot.frame_pose("gripper_left_grasping_link")[:3]
+    J = physics.rigid.jacobian("anna", "gripper_left_grasping_link", here)[:3, joints]
+    wanted = robot.setpoint[joints] + np.linalg.pinv(J) @ np.array([-0.25, 0.0, 0.0])
+    robot.command_position(wanted, joints)
+    for _ in range(1500):
+        robot.control(physics.time)
+        physics.step()
+    position, velocity, _, contact = physics.rigid.read("anna")
+    assert any(c.link.startswith("gripper_left") for c in physics.contacts)
+    assert np.abs(contact[joints]).max() > 0.3
+    assert np.abs(velocity[joints]).max() < 2e-3
+    np.testing.assert_allclose(stiffness * (wanted - position[joints]), -contact[joints], atol=0.03)

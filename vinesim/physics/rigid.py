@@ -69,6 +69,18 @@ _PLANAR = ("x", "y", "yaw")
 
 
 @dataclasses.dataclass
+class _Felt:
+    """What a link felt in a tick, as MuJoCo tells it, with its places at the start of that tick."""
+
+    inner: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
+    """Moment about the robot's centre of mass and force of the parent on the link, world axes."""
+    arm: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    """From the link's origin to that centre."""
+    turn: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+    acceleration: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
+
+
+@dataclasses.dataclass
 class _Robot:
     """One robot: what it was asked for, and where its numbers lie in MuJoCo's arrays."""
 
@@ -106,12 +118,14 @@ class _Robot:
     q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     v: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     actuator: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    diagonal: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    """Where the drives' own inertias lie in MuJoCo's sparse mass matrix."""
     base_q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     base_v: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     base_actuator: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
     bodies: dict[str, int] = dataclasses.field(default_factory=dict)
-    felt: dict[str, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
-    """Of each link that carries a sensor: wrench [6] and acceleration [6] of the last tick."""
+    felt: dict[str, _Felt] = dataclasses.field(default_factory=dict)
+    """What links with sensors felt in the last tick."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -460,14 +474,18 @@ class Rigid:
         effort = np.clip(servo + d.qfrc_gravcomp[robot.v], -robot.most, robot.most)
         return position, velocity, effort, self._contact[robot.v]
 
+    def state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity of the drives alone, as :meth:`read` gives them."""
+        robot = self._robot(name)
+        return self.data.qpos[robot.q], self.data.qvel[robot.v]
+
     def weight(self, name: str) -> np.ndarray:
         """[joint] what the drives give to carry the robot's own weight [N m or N], part of their effort."""
         return self.data.qfrc_gravcomp[self._robot(name).v]
 
     def inertia(self, name: str) -> np.ndarray:
         """[joint] what each drive has to speed up if the others stand, rotor included [kg m2 or kg], in this pose."""
-        m = self.world
-        return self.data.M[m.M_rowadr + m.M_rownnz - 1][self._robot(name).v]
+        return self.data.M[self._robot(name).diagonal]
 
     def base(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (world axes) of the base link."""
@@ -495,7 +513,7 @@ class Rigid:
     def instrument(self, name: str, link: str) -> None:
         """From the next tick on, measure at a link what :meth:`wrench` and :meth:`acceleration` tell."""
         self._body(name, link)
-        self._robot(name).felt[link] = np.zeros(6), np.zeros(6)
+        self._robot(name).felt[link] = _Felt()
 
     def wrench(self, name: str, link: str) -> np.ndarray:
         """Force [N] and moment about the link's origin [N m] of the link, and all beyond it, on its parent [6].
@@ -503,11 +521,14 @@ class Rigid:
         In the link's axes, mean of the last tick. Weight, inertia, pushes and contacts with rigid things count; those
         with plants do not: who solves them has them.
         """
-        return self._felt(name, link)[0]
+        felt = self._felt(name, link)
+        (x, y, z), (u, v, w) = felt.arm.tolist(), felt.inner[3:].tolist()
+        moment = felt.inner[:3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+        return -np.concatenate([felt.inner[3:] @ felt.turn, moment @ felt.turn])
 
     def acceleration(self, name: str, link: str) -> np.ndarray:
         """Angular [rad/s2] and proper acceleration of a link's origin [m/s2] in its axes [6]; at rest 9.81 upwards."""
-        return self._felt(name, link)[1]
+        return self._felt(name, link).acceleration.copy()
 
     def angular_velocity(self, name: str, link: str) -> np.ndarray:
         """[3] rad/s of a link, in its axes."""
@@ -665,28 +686,25 @@ class Rigid:
             mujoco.mj_comPos(self.world, self.data)
             self._fresh = True
 
-    def _felt(self, name: str, link: str) -> tuple[np.ndarray, np.ndarray]:
+    def _felt(self, name: str, link: str) -> _Felt:
         try:
             return self._robot(name).felt[link]
         except KeyError:
             raise ValueError(f"nothing is measured at {link!r} of robot {name!r}; instrument() it first") from None
 
     def _feel(self) -> None:
-        """Measure forces and accelerations of the tick that ends, with MuJoCo's places still those of its start."""
+        """Keep what links felt in the tick that ends, while MuJoCo's places are still those of its start."""
         m, d = self.world, self.data
         if not any(robot.felt for robot in self._robots.values()):
             return
         mujoco.mj_rnePostConstraint(m, d)
         for robot in self._robots.values():
-            for link, (wrench, acceleration) in robot.felt.items():
+            for link, felt in robot.felt.items():
                 body = robot.bodies[link]
-                turn, inner = d.xmat[body].reshape(3, 3), d.cfrc_int[body]
-                # MuJoCo gives it about the centre of mass of the whole robot, and as what the parent does
-                x, y, z = (d.subtree_com[m.body_rootid[body]] - d.xpos[body]).tolist()
-                u, v, w = inner[3:].tolist()
-                moment = inner[:3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
-                wrench[:3], wrench[3:] = -inner[3:] @ turn, -moment @ turn
-                mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, acceleration, 1)
+                felt.inner[:] = d.cfrc_int[body]
+                np.subtract(d.subtree_com[m.body_rootid[body]], d.xpos[body], out=felt.arm)
+                felt.turn[:] = d.xmat[body].reshape(3, 3)
+                mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, felt.acceleration, 1)
 
     def _roll_back(self) -> None:
         """Stop the kinematic trees with a number that is not finite where the tick began; the others go on."""
@@ -860,6 +878,7 @@ class Rigid:
         planar = [m.joint(f"{name}:{axis}") for axis in _PLANAR]
         robot.q = np.array([j.qposadr[0] for j in joints], int)
         robot.v = np.array([j.dofadr[0] for j in joints], int)
+        robot.diagonal = (m.M_rowadr + m.M_rownnz - 1)[robot.v]
         robot.actuator = np.array([m.actuator(f"{name}/{drive.joint}").id for drive in robot.spec.drives], int)
         robot.base_q = np.array([j.qposadr[0] for j in planar], int)
         robot.base_v = np.array([j.dofadr[0] for j in planar], int)

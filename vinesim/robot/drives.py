@@ -153,7 +153,7 @@ class Robot(Embodied):
         self._compliant = np.zeros(len(drives), bool)
         """[joint] whose gains were asked for, so that they must be right to the letter"""
         self._limit = self.effort.copy()
-        self.spring = np.array([drive.elastic or drive.stiffness for drive in drives])
+        self.spring = np.array([drive.elastic or drive.stiffness or drive.effort / 0.05 for drive in drives])
         """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
         self._spring_damping = np.array([drive.elastic_damping if drive.elastic else drive.damping for drive in drives])
         self._order = {drive.joint: i for i, drive in enumerate(drives)}
@@ -337,62 +337,90 @@ class Robot(Embodied):
 
     def control(self, time: float) -> None:
         """Hand set-points for the tick that starts at ``time`` [s] to the servos; call it before physics steps."""
-        dt = self.rigid.dt
-        position, velocity = self.rigid.read(self.name)[:2]
-        by_velocity = self.interface == Interface.VELOCITY
-        by_effort = self.interface == Interface.EFFORT
-        by_motor = self.interface == Interface.ELASTIC
+        if self._retuned:
+            self._arrange()
+        position, velocity = self.rigid.state(self.name)
+        rate = self._advance(position, velocity)
+        if self._retuned or self._changing:
+            braked, brake = self._brakes(velocity)
+            self._tune(braked, brake)
+            rate = np.where(braked, np.copysign(self.speed, velocity), rate)
+        self._velocity = velocity
+        self.rigid.command(self.name, self.setpoint, rate)
+        self._drive(time)
+        self._odometry(self.rigid.base(self.name)[0])
 
+    def _arrange(self) -> None:
+        """Prepare what changes only with the interfaces, gains and limits."""
+        self._by_effort, self._by_motor = self.interface == Interface.EFFORT, self.interface == Interface.ELASTIC
+        self._by_velocity = np.flatnonzero(self.interface == Interface.VELOCITY)
+        self._changing = bool(self._by_effort.any() or self._by_motor.any())
+        """Whether gains follow the state, so that they must be set in every tick."""
+        self._spring_in_use = np.where(self._by_motor, self.spring, self._stiffness)
+        self._lead = self._limit / np.maximum(self._spring_in_use, 1e-9) + self.speed * self.rigid.dt
+        self._gain = SPARE * self.rigid.dt * self._limit
+
+    def _advance(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Move the set-points on by a tick; their rates [joint]."""
+        dt = self.rigid.dt
         # A servo that already gives all it has gives no more when asked for more, but would overshoot when let go.
-        stiffness = np.where(by_motor, self.spring, self._stiffness)
-        lead = self._limit / np.maximum(stiffness, 1e-9) + self.speed * dt
         middle = position
         if self._grippers:
             middle = position.copy()
             for fingers in self._grippers.values():
                 middle[fingers] = position[fingers].mean()
-        start = np.where(by_effort, position, np.clip(self.setpoint, middle - lead, middle + lead))
-        step = np.where(by_velocity, self._goal * dt, np.where(by_effort, 0.0, self._goal - start))
-        # nor may it run ahead faster than the drive can follow: at its limit the servo would shoot past the speed
-        gain = SPARE * dt * self._limit / np.maximum(self.rigid.inertia(self.name), 1e-9)
+        start = np.clip(self.setpoint, middle - self._lead, middle + self._lead)
+        wanted = (self._goal - start) / dt
+        wanted[self._by_velocity] = self._goal[self._by_velocity]
+        # Nor may it run ahead faster than the drive can follow: at its limit the servo would shoot past the speed.
+        gain = self._gain / np.maximum(self.rigid.inertia(self.name), 1e-9)
         slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.speed)
         fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.speed)
-        target = np.clip(start + np.clip(step, slowest * dt, fastest * dt), self.lower, self.upper)
-        self.setpoint = target
-        self._rate = rate = np.where(by_effort, velocity, (target - start) / dt)
-        rate = np.where(by_effort, 0.0, rate)
-        changing = by_effort.any() or by_motor.any()
-        if changing or self._retuned:
-            # An effort that would drive the joint too fast gives way to a brake: 90 % of the largest speed are free.
-            # Looking a tick ahead, and no stronger than it may be: at its limit a servo acts all through the tick.
-            brake = 10.0 * self.effort / self.speed
-            soon = 2.0 * velocity - self._velocity
-            still = self._braked & (np.abs(velocity) > 0.5 * self.speed)
-            fast = by_effort & (self._goal > brake * (self.speed - soon)) | still & (velocity > 0.0)
-            back = by_effort & (self._goal < -brake * (self.speed + soon)) | still & (velocity < 0.0)
-            braked = self._braked = (fast | back) & by_effort & (self._goal * velocity >= 0.0)
-            rate = np.where(braked, np.where(fast, self.speed, -self.speed), rate)
-            most = 0.8 * np.where(np.abs(velocity) < self.speed, np.abs(self._goal), self.effort)
-            brake = np.minimum(brake, most / np.maximum(np.abs(rate - velocity), 1e-9))
-            damping = np.where(by_motor, self._spring_damping, self._damping)
-            self.rigid.tune(
-                self.name,
-                np.where(by_effort, 0.0, stiffness),
-                np.where(braked, brake, np.where(by_effort, 0.0, damping)),
-                np.where(by_effort & ~braked, self._goal, np.where(by_motor, -self.rigid.weight(self.name), 0.0)),
-                limit=self._limit,
-                exact=by_motor | (self._compliant & ~by_effort),
-            )
-            self._retuned = False
-        self._velocity = velocity
-        self.rigid.command(self.name, target, rate)
+        rate = np.clip(wanted, slowest, fastest)
+        if self._changing:
+            start, rate = np.where(self._by_effort, position, start), np.where(self._by_effort, 0.0, rate)
+        self.setpoint = np.clip(start + dt * rate, self.lower, self.upper)
+        rate = (self.setpoint - start) / dt
+        self._rate = np.where(self._by_effort, velocity, rate)
+        return rate
 
+    def _brakes(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joints whose effort would drive them too fast, bool, and the damping about their largest speed [joint].
+
+        90 % of the speed are free. It looks a tick ahead, and brakes no harder than the effort that was asked for:
+        at its limit a servo does not feel how the speed falls within the tick.
+        """
+        towards = np.copysign(1.0, velocity)
+        brake, along = 10.0 * self.effort / self.speed, towards * self._goal
+        ahead = towards * (2.0 * velocity - self._velocity)
+        near = (along > brake * (self.speed - ahead)) | (self._braked & (np.abs(velocity) > 0.5 * self.speed))
+        self._braked = near & (along >= 0.0) & self._by_effort
+        spare = self.speed - np.abs(velocity)
+        most = 0.8 * np.where(spare > 0.0, along, self.effort)
+        return self._braked, np.minimum(brake, most / np.maximum(np.abs(spare), 1e-9))
+
+    def _tune(self, braked: np.ndarray, brake: np.ndarray) -> None:
+        """Give the servos the gains and efforts that the interfaces ask for."""
+        by_effort, by_motor = self._by_effort, self._by_motor
+        damping = np.where(by_motor, self._spring_damping, self._damping)
+        effort = np.where(by_motor, -self.rigid.weight(self.name), 0.0)
+        self.rigid.tune(
+            self.name,
+            np.where(by_effort, 0.0, self._spring_in_use),
+            np.where(braked, brake, np.where(by_effort, 0.0, damping)),
+            np.where(by_effort & ~braked, self._goal, effort),
+            limit=self._limit,
+            exact=by_motor | (self._compliant & ~by_effort),
+        )
+        self._retuned = False
+
+    def _drive(self, time: float) -> None:
+        """Let the base gain and lose speed as it may."""
         limits = self.description.base_limits
         goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
-        change = dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
+        change = self.rigid.dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
         self._base_velocity += np.clip(goal - self._base_velocity, -change, change)
         self.rigid.drive_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
-        self._odometry(self.rigid.base(self.name)[0])
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """What the robot knows of itself at ``time`` [s], sensors and elastic elements included."""
@@ -411,18 +439,21 @@ class Robot(Embodied):
         )
 
     def _wrench(self, mount: Mount, time: float, contacts: Sequence[Contact]) -> Wrench:
-        wrench, pose = self.rigid.wrench(self.name, mount.frame).copy(), self.frame_pose(mount.frame)
-        back = frames.conjugate(pose[3:])
-        for contact in contacts:  # with plants, which the rigid world does not know
-            if contact.link in self._beyond[mount.frame]:
-                wrench[:3] += frames.rotate(back, contact.force)
-                wrench[3:] += frames.rotate(back, frames.cross(contact.position - pose[:3], contact.force))
+        wrench = self.rigid.wrench(self.name, mount.frame)
+        mine = [contact for contact in contacts if contact.link in self._beyond[mount.frame]]
+        if mine:  # with plants, which the rigid world does not know
+            pose = self.frame_pose(mount.frame)
+            back = frames.conjugate(pose[3:])
+            force = np.array([contact.force for contact in mine])
+            arm = np.array([contact.position for contact in mine]) - pose[:3]
+            wrench[:3] += frames.rotate(back, force.sum(0))
+            wrench[3:] += frames.rotate(back, frames.cross(arm, force).sum(0))
         return Wrench(time, mount.name, mount.frame, wrench[:3], wrench[3:])
 
     def _imu(self, mount: Mount, time: float) -> Imu:
         turn = self.frame_pose(mount.frame)[3:]
         spin = self.rigid.angular_velocity(self.name, mount.frame)
-        acceleration = self.rigid.acceleration(self.name, mount.frame)[3:].copy()
+        acceleration = self.rigid.acceleration(self.name, mount.frame)[3:]
         return Imu(time, mount.name, mount.frame, turn, spin, acceleration)
 
     def update(self, time: float) -> RobotUpdate:
