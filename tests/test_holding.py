@@ -10,7 +10,7 @@ from test_people import eva, put
 from touch_scenes import bunch_scene, cane
 
 from vinesim import frames
-from vinesim.physics.people import THICK
+from vinesim.physics.people import THICK, TRACKED
 from vinesim.physics.plants import HANDS, HELD, Plants
 from vinesim.physics.step import Physics
 from vinesim.world.grow import assemble
@@ -76,10 +76,7 @@ def test_a_body_that_walks_takes_canes_along():
     furthest = 0.0
     for tick in range(60):
         walk = np.array([0.0, 0.014 * tick, 0, 0, 0, 0, 0])
-        moved = {
-            name: getattr(spec.pose, name) + walk
-            for name in ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
-        }
+        moved = {name: getattr(spec.pose, name) + walk for name in TRACKED}
         physics.move_human("eva", dataclasses.replace(spec.pose, **moved))
         physics.step()
         furthest = max(furthest, *(-contact.distance for contact in physics.contacts), 0.0)
