@@ -43,6 +43,10 @@ not in MuJoCo (a leg would run centimetres into what it kicks), and are so heavy
 """
 THICK = 0.012
 """[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
+HAND = 0.13
+"""[m] From the middle of the palm to the tips of the fingers."""
+FINGERS = np.array([[0.0, 0.0, 0.0], [0.085, 0.0, 0.0]])
+"""[m] Middle of the palm and of the fingers, in the palm's frame."""
 JUMP = 0.5
 """[m] A head that comes further in a tick has not moved but been put elsewhere: no speed, and nothing in between."""
 FASTEST = 5.0
@@ -67,9 +71,6 @@ _KINDS = {
 _NECK = np.array([-_BACK, 0.0, -0.2])
 TURN_DAMPING = 2.0 * math.sqrt(TURN * INERTIA)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
-
-
-_STILL = np.zeros((len(PARTS) + len(SIDES), 3))
 
 
 class HumanError(ValueError):
@@ -122,7 +123,7 @@ def hand_shapes(side: str) -> tuple[Shape, ...]:
     # flat faces: MuJoCo lets a capsule that lies along another touch it in one point only, and it rocks
     return (
         Shape("box", (0.05, 0.04, THICK), frames.pose(np.zeros(3)), SKIN),
-        Shape("box", (0.04, 0.036, THICK - 0.003), frames.pose(np.array([0.085, 0.0, 0.0])), SKIN),
+        Shape("box", (0.04, 0.036, THICK - 0.003), frames.pose(FINGERS[1]), SKIN),
         Shape("capsule", (0.01, 0.025), frames.pose(thumb, _Z_TO_X), SKIN),
     )  # fmt: skip
 
@@ -290,26 +291,20 @@ class Person:
 
     def drive(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
         """Before a tick: the body where it is told to be, each hand free at its controller or on its spring."""
-        way, turn = _STILL, _STILL
-        if self._before is not self._now:
-            way, turn = _apart(self._before, self._now)
-            if way[0] @ way[0] > JUMP * JUMP:
-                self._appear(d)
-                way, turn = _STILL, _STILL
-        start = self._before[: len(PARTS)]
-        self._place(d, start)
-        d.qvel[self.part_dofs] = 0.0
-        if way is not _STILL:
-            speed = way[: len(PARTS)] / dt
-            size = np.sqrt((speed * speed).sum(1, keepdims=True))
-            d.qvel[self.part_dofs[:, :3]] = speed * np.minimum(1.0, FASTEST / np.maximum(size, FASTEST))
-            d.qvel[self.part_dofs[:, 3:]] = frames.rotate(frames.conjugate(start[:, 3:]), turn[: len(PARTS)] / dt)
+        if self._before is not self._now and _far(self._before[0, :3], self._now[0, :3]):
+            self._appear(d)
         at = d.qpos[self._hand_q]
         at[:, 3:] = frames.from_wxyz(at[:, 3:])
-        held = np.array([hand.free < LINGER for hand in self.hands])
-        goal = np.where(held[:, None], self._now[len(PARTS) :], self._before[len(PARTS) :])
-        offsets, angles = _apart(at, goal)
-        steps, turns = way[len(PARTS) :], turn[len(PARTS) :]
+        parts, start = len(PARTS), self._before[: len(PARTS)]
+        held = np.array([[hand.free < LINGER] for hand in self.hands])
+        goal = np.where(held, self._now[parts:], self._before[parts:])
+        way, turn = _apart(np.concatenate([self._before, at]), np.concatenate([self._now, goal]))
+        speed = way[:parts] / dt
+        size = np.sqrt((speed * speed).sum(1, keepdims=True))
+        self._place(d, start)
+        d.qvel[self.part_dofs[:, :3]] = speed * np.minimum(1.0, FASTEST / np.maximum(size, FASTEST))
+        d.qvel[self.part_dofs[:, 3:]] = frames.rotate(frames.conjugate(start[:, 3:]), turn[:parts] / dt)
+        steps, turns, offsets, angles = way[parts:-2], turn[parts:-2], way[-2:], turn[-2:]
         for hand, here, offset, angle, step, spin in zip(self.hands, at, offsets, angles, steps, turns, strict=True):
             velocity = d.qvel[hand.v]
             if hand.rides:
@@ -426,6 +421,10 @@ def _rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
 def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Way [..., 3] m and turn [..., 3] rad from pose ``a`` to pose ``b``, world axes."""
     return b[..., :3] - a[..., :3], frames.log(frames.multiply(b[..., 3:], frames.conjugate(a[..., 3:])))
+
+
+def _far(a: np.ndarray, b: np.ndarray) -> bool:
+    return float((b - a) @ (b - a)) > JUMP * JUMP
 
 
 def _at_most(limit: float, vector: np.ndarray) -> np.ndarray:
