@@ -5,7 +5,8 @@ its controller by a spring, so that the force it gives follows from how far it i
 told otherwise (CANOPIES D6.4, section 3.1.1). What it closes on it holds by a weld, and what is lifted hangs from the
 same spring: the heavier, the further the real hand must go. A hand's own weight is never felt.
 
-Head, trunk and legs are kinematic: exactly where the tracked points put them, whoever pushes.
+Head, trunk and legs are kinematic: exactly where the tracked points put them, whoever pushes
+(``docs/decisions/hands.md``).
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ not in MuJoCo (a leg would run centimetres into what it kicks), and are so heavy
 """
 THICK = 0.012
 """[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
+ROUSED = -1 - mujoco.mjMINAWAKE
+"""What MuJoCo counts up in ``tree_asleep`` of who has just been woken: so many ticks must pass before he may sleep."""
 HAND = 0.13
 """[m] From the middle of the palm to the tips of the fingers."""
 FINGERS = np.array([[0.0, 0.0, 0.0], [0.085, 0.0, 0.0]])
@@ -415,7 +418,7 @@ def _rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
     if tree >= 0:
         d.tree_awake[tree] = 1
         if d.tree_asleep[tree] < 0:
-            d.tree_asleep[tree] = -1 - mujoco.mjMINAWAKE
+            d.tree_asleep[tree] = ROUSED
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
