@@ -7,18 +7,20 @@ import dataclasses
 import numpy as np
 import pytest
 from test_people import eva, put
-from touch_scenes import bunch_scene, cane
+from touch_scenes import bunch_scene, cane, gripper, probe
 
 from vinesim import frames
-from vinesim.physics.people import THICK
+from vinesim.physics.people import THICK, TRACKED
 from vinesim.physics.plants import HANDS, HELD, Plants
 from vinesim.physics.step import Physics
 from vinesim.world.grow import assemble
 from vinesim.world.state import State
-from vinesim.world.values import HumanPose, HumanSpec
+from vinesim.world.values import Drive, HumanPose, HumanSpec
 
 FORWARD = frames.multiply(frames.yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
 """Fingers up, palm along +y."""
+SIGNS = {"left": 1.0, "right": -1.0}
+SOFT = (Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), Drive("press", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0))
 
 
 def before_a_bunch(mass: float = 0.5, pull: float = 1e3) -> tuple[Physics, HumanSpec, int, np.ndarray]:
@@ -76,10 +78,7 @@ def test_a_body_that_walks_takes_canes_along():
     furthest = 0.0
     for tick in range(60):
         walk = np.array([0.0, 0.014 * tick, 0, 0, 0, 0, 0])
-        moved = {
-            name: getattr(spec.pose, name) + walk
-            for name in ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
-        }
+        moved = {name: getattr(spec.pose, name) + walk for name in TRACKED}
         physics.move_human("eva", dataclasses.replace(spec.pose, **moved))
         physics.step()
         furthest = max(furthest, *(-contact.distance for contact in physics.contacts), 0.0)
@@ -207,9 +206,103 @@ def test_what_lies_on_the_ground_is_picked_up():
     assert physics.rigid.bunch_pose(0)[2] > lies[2] + 0.2
 
 
+def test_shears_leave_a_bunch_in_the_hand_that_holds_it():
+    physics, spec, body, _ = before_a_bunch(0.8)
+    near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
+    move(physics, near, 0.0, 0.0, 0.0, ticks=50, closed=True)
+    assert physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    physics.pick(0)
+    move(physics, near, 0.0, 0.0, 0.0, ticks=400, closed=True)
+    hand = physics.hand("eva", "right")
+    assert hand.holds == ("bunch/0", "bunch")
+    assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=1e-3)
+    assert not physics.plants.tie_stiffness.any()
+
+
+def test_a_robot_joins_while_a_hand_holds_a_plant():
+    physics, spec, body, middle = before_a_bunch()
+    near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
+    move(physics, near, 0.0, -0.2, 0.0, ticks=100, wait=50, closed=True)
+    before = physics.hand("eva", "right")
+    physics.add_robot(gripper(middle + np.array([5.0, 0.0, 0.0])))
+    np.testing.assert_array_equal(physics.hand("eva", "right").pose, before.pose)
+    for _ in range(20):
+        physics.step()
+    hand = physics.hand("eva", "right")
+    assert hand.holds == ("plants", f"body/{body}")
+    assert np.linalg.norm(hand.force - before.force) < 0.3
+
+
+def test_a_cane_is_held_too():
+    model = assemble([cane((-0.5, 0.0, 1.1))])
+    physics, spec = Physics(model), eva(0.2, -0.6, 0.5 * np.pi)
+    spec = dataclasses.replace(spec, pose=put(spec.pose, frames.pose(np.array([0.2, -0.1, 1.1]), FORWARD)))
+    physics.add_human(spec)
+    near = move(physics, spec, 0.0, 0.09, 0.0, ticks=60, wait=30)
+    move(physics, near, 0.0, -0.2, 0.1, ticks=100, wait=500, closed=True)
+    hand = physics.hand("eva", "right")
+    assert hand.holds[0] == "plants"
+    np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], atol=0.02)
+    assert np.linalg.norm(hand.force) > 1.0
+    assert physics.view().body_q[12, 1] < -0.05
+
+
+def test_two_hands_share_a_box():
+    """F34: 10 kg on two hands, 49 cm each."""
+    model = assemble([cane((0.0, -5.0, 3.0))], box_pose=[[0, 0, 0.002, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.24]],
+                     box_mass=[10.0])  # fmt: skip
+    physics, spec = Physics(model), eva(-0.7, 0.0)
+    physics.add_human(spec)
+
+    def hold(inside: float, height: float, *, closed: bool) -> None:
+        at = {side: np.array([0.0, sign * (0.2 + 0.1 - inside), height, 0, 0, 0, 1]) for side, sign in SIGNS.items()}
+        for side, sign in SIGNS.items():  # palms to the box
+            at[side][3:] = frames.exp(np.array([-sign * 0.5 * np.pi, 0.0, 0.0]))
+        physics.move_human("eva", put(spec.pose, **at, left_closed=closed, right_closed=closed))
+        physics.step()
+
+    for _ in range(150):
+        hold(0.0, 0.15, closed=False)
+    for inside in np.linspace(0.0, 0.1, 100):
+        hold(inside, 0.15, closed=False)
+    for rise in np.append(np.linspace(0.0, 0.8, 200), np.full(1200, 0.8)):
+        hold(0.1, 0.15 + rise, closed=True)
+    left, right = physics.hand("eva", "left"), physics.hand("eva", "right")
+    assert left.holds == right.holds == ("box/0", "box")
+    for hand in (left, right):
+        assert hand.controller[2] - hand.pose[2] == pytest.approx(0.4905, rel=0.02)
+    assert physics.rigid.data.body("box/0").xpos[2] == pytest.approx(0.8 - 0.4905, abs=0.02)
+
+
+def test_a_robot_is_led_by_the_hand():
+    """F14: a closed hand takes the link it is at; the robot's drive is led away from where it would be."""
+    model = assemble([cane((0.0, -5.0, 3.0))])
+    physics, spec = Physics(model), eva(-1.0)
+    physics.add_robot(probe((0.0, 0.0, 1.1), drives=SOFT))
+    physics.add_human(spec)
+
+    def lead(x: float, *, closed: bool) -> None:
+        physics.move_human("eva", put(spec.pose, (x, 0.0, 1.1), right_closed=closed))
+        physics.step()
+
+    for x in np.append(np.linspace(-0.6, -0.05, 200), np.full(50, -0.05)):
+        lead(x, closed=False)
+    for x in np.append(np.linspace(-0.05, -0.6, 200), np.full(400, -0.6)):
+        lead(x, closed=True)
+    assert physics.hand("eva", "right").holds == ("probe", "rod")
+    position, _, effort, _ = physics.rigid.read("probe")
+    assert position[0] < -0.05
+    assert effort[0] == pytest.approx(-physics.hand("eva", "right").force[0], rel=1e-2)
+    for _ in range(300):
+        lead(-0.6, closed=False)
+    assert physics.hand("eva", "right").holds is None
+    assert abs(physics.rigid.read("probe")[0][0]) < 1e-4
+
+
 def test_a_fist_takes_nothing():
     physics, spec, _, _ = before_a_bunch()
-    away = move(physics, spec, 0.0, -0.2, 0.0, ticks=50, closed=True)
+    away = move(physics, spec, 0.0, -0.2, 0.0, ticks=50)
+    move(physics, away, 0.0, 0.0, 0.0, ticks=30, closed=True)
     move(physics, away, 0.0, 0.3, 0.0, ticks=100, wait=100, closed=True)
     assert physics.hand("eva", "right").holds is None
     assert physics.hand("eva", "right").touching

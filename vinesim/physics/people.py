@@ -5,7 +5,8 @@ its controller by a spring, so that the force it gives follows from how far it i
 told otherwise (CANOPIES D6.4, section 3.1.1). What it closes on it holds by a weld, and what is lifted hangs from the
 same spring: the heavier, the further the real hand must go. A hand's own weight is never felt.
 
-Head, trunk and legs are kinematic: exactly where the tracked points put them, whoever pushes.
+Head, trunk and legs are kinematic: exactly where the tracked points put them, whoever pushes
+(``docs/decisions/hands.md``).
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from vinesim import frames
 from vinesim.world.values import HandSample, HumanPose, HumanSpec, Shape
 
 SIDES = ("left", "right")
+TRACKED = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
+"""Poses of a :class:`HumanPose`."""
 MASS = 0.4
 """[kg] A hand (0.6 % of a person's mass: Winter, Biomechanics and Motor Control, 2009)."""
 INERTIA = 0.02
@@ -43,6 +46,14 @@ THICK = 0.012
 """[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
 ROUSED = -1 - mujoco.mjMINAWAKE
 """What MuJoCo counts up in ``tree_asleep`` of who has just been woken: so many ticks must pass before he may sleep."""
+HAND = 0.13
+"""[m] From the middle of the palm to the tips of the fingers."""
+FINGERS = np.array([[0.0, 0.0, 0.0], [0.085, 0.0, 0.0]])
+"""[m] Middle of the palm and of the fingers, in the palm's frame."""
+JUMP = 0.5
+"""[m] A head that comes further in a tick has not moved but been put elsewhere: no speed, and nothing in between."""
+FASTEST = 5.0
+"""[m/s] No part of a body pushes faster, whatever its trackers say."""
 SKIN = (0.85, 0.62, 0.5, 1.0)
 CLOTH = (0.98, 0.47, 0.16, 1.0)
 
@@ -63,9 +74,6 @@ _KINDS = {
 _NECK = np.array([-_BACK, 0.0, -0.2])
 TURN_DAMPING = 2.0 * math.sqrt(TURN * INERTIA)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
-
-
-_STILL = np.zeros((len(PARTS) + len(SIDES), 3))
 
 
 class HumanError(ValueError):
@@ -118,7 +126,7 @@ def hand_shapes(side: str) -> tuple[Shape, ...]:
     # flat faces: MuJoCo lets a capsule that lies along another touch it in one point only, and it rocks
     return (
         Shape("box", (0.05, 0.04, THICK), frames.pose(np.zeros(3)), SKIN),
-        Shape("box", (0.04, 0.036, THICK - 0.003), frames.pose(np.array([0.085, 0.0, 0.0])), SKIN),
+        Shape("box", (0.04, 0.036, THICK - 0.003), frames.pose(FINGERS[1]), SKIN),
         Shape("capsule", (0.01, 0.025), frames.pose(thumb, _Z_TO_X), SKIN),
     )  # fmt: skip
 
@@ -205,7 +213,6 @@ class Person:
         self._meets = 0
         self.move(spec.pose)
         self._before = self._now
-        self._way = self._turn = _STILL
 
     @property
     def parts(self) -> np.ndarray:
@@ -218,15 +225,14 @@ class Person:
 
     def move(self, pose: HumanPose) -> None:
         """Take over where the tracked points are: the body is there at once, the hands try to be."""
-        for field in dataclasses.fields(pose):
-            value = getattr(pose, field.name)
-            if isinstance(value, bool | np.bool_):
-                continue
-            if np.shape(value) != (7,) or not np.isfinite(value).all() or abs(np.linalg.norm(value[3:]) - 1.0) > 1e-3:
-                raise HumanError(
-                    f"human {self.spec.name!r}: {field.name} is {value}; give seven finite numbers, position and unit "
-                    "quaternion (x, y, z, w)"
-                )
+        points = [getattr(pose, name) for name in TRACKED]
+        square = np.array([np.nan if np.shape(at) != (7,) else 0.0 * at[:3].sum() + at[3:] @ at[3:] for at in points])
+        if not (abs(square - 1.0) < 1e-3).all():
+            worst = int(np.argmin(abs(square - 1.0) < 1e-3))
+            raise HumanError(
+                f"human {self.spec.name!r}: {TRACKED[worst]} is {points[worst]}; give seven finite numbers, position "
+                "and unit quaternion (x, y, z, w)"
+            )
         self._now = np.concatenate([posture(self.spec.height, pose), [pose.left, pose.right]])
         """Poses of :data:`PARTS`, then of both controllers."""
         for hand in self.hands:
@@ -288,35 +294,45 @@ class Person:
 
     def drive(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
         """Before a tick: the body where it is told to be, each hand free at its controller or on its spring."""
-        moved = self._before is not self._now
-        self._way, self._turn = _apart(self._before, self._now) if moved else (_STILL, _STILL)
-        start = self._before[: len(PARTS)]
-        self._place(d, start)
-        d.qvel[self.part_dofs[:, :3]] = self._way[: len(PARTS)] / dt
-        d.qvel[self.part_dofs[:, 3:]] = (
-            frames.rotate(frames.conjugate(start[:, 3:]), self._turn[: len(PARTS)] / dt) if moved else 0.0
-        )
+        if self._before is not self._now and _far(self._before[0, :3], self._now[0, :3]):
+            self._appear(d)
         at = d.qpos[self._hand_q]
         at[:, 3:] = frames.from_wxyz(at[:, 3:])
-        held = np.array([hand.free < LINGER for hand in self.hands])
-        goal = np.where(held[:, None], self._now[len(PARTS) :], self._before[len(PARTS) :])
-        offsets, angles = _apart(at, goal)
-        steps, turns = self._way[len(PARTS) :], self._turn[len(PARTS) :]
-        for hand, here, offset, angle, step, turn in zip(self.hands, at, offsets, angles, steps, turns, strict=True):
+        parts, start = len(PARTS), self._before[: len(PARTS)]
+        held = np.array([[hand.free < LINGER] for hand in self.hands])
+        goal = np.where(held, self._now[parts:], self._before[parts:])
+        way, turn = _apart(np.concatenate([self._before, at]), np.concatenate([self._now, goal]))
+        speed = way[:parts] / dt
+        size = np.sqrt((speed * speed).sum(1, keepdims=True))
+        self._place(d, start)
+        d.qvel[self.part_dofs[:, :3]] = speed * np.minimum(1.0, FASTEST / np.maximum(size, FASTEST))
+        d.qvel[self.part_dofs[:, 3:]] = frames.rotate(frames.conjugate(start[:, 3:]), turn[:parts] / dt)
+        steps, turns, offsets, angles = way[parts:-2], turn[parts:-2], way[-2:], turn[-2:]
+        for hand, here, offset, angle, step, spin in zip(self.hands, at, offsets, angles, steps, turns, strict=True):
             velocity = d.qvel[hand.v]
             if hand.rides:
                 velocity[:] = d.xfrc_applied[hand.body] = 0.0
             elif hand.free < LINGER:
                 turning = frames.rotate(here[3:], velocity[3:])
                 force = self.spec.stiffness * offset + self.damping * (step / dt - velocity[:3])
-                moment = TURN * angle + TURN_DAMPING * (turn / dt - turning)
+                moment = TURN * angle + TURN_DAMPING * (spin / dt - turning)
                 d.xfrc_applied[hand.body, :3] = _at_most(self.spec.force, force)
                 d.xfrc_applied[hand.body, 3:] = _at_most(MOMENT, moment)
             else:
                 step = step + offset * dt / max(RETURN, math.sqrt(offset @ offset) / HURRY)
                 velocity[:3] = self._look(m, d, hand, here[:3], step) / dt
-                velocity[3:] = frames.rotate(frames.conjugate(here[3:]), turn / dt + angle / RETURN)
+                velocity[3:] = frames.rotate(frames.conjugate(here[3:]), spin / dt + angle / RETURN)
                 d.xfrc_applied[hand.body] = 0.0
+
+    def _appear(self, d: mujoco.MjData) -> None:
+        """Be elsewhere all at once, hands too, but for those that hold something."""
+        self._before = self._now
+        for hand in self.hands:
+            if hand.holds is None:
+                at = self.controller(hand)
+                d.qpos[hand.q] = np.concatenate([at[:3], frames.to_wxyz(at[3:])])
+                d.qvel[hand.v] = 0.0
+                hand.free = LINGER
 
     def _look(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand, at: np.ndarray, step: np.ndarray) -> np.ndarray:
         """A step [3] m of a fast free hand, shortened if something is in its way."""
@@ -402,12 +418,16 @@ def _rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
     if tree >= 0:
         d.tree_awake[tree] = 1
         if d.tree_asleep[tree] < 0:
-            d.tree_asleep[tree] = -1 - mujoco.mjMINAWAKE
+            d.tree_asleep[tree] = ROUSED
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Way [..., 3] m and turn [..., 3] rad from pose ``a`` to pose ``b``, world axes."""
     return b[..., :3] - a[..., :3], frames.log(frames.multiply(b[..., 3:], frames.conjugate(a[..., 3:])))
+
+
+def _far(a: np.ndarray, b: np.ndarray) -> bool:
+    return float((b - a) @ (b - a)) > JUMP * JUMP
 
 
 def _at_most(limit: float, vector: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.people import PARTS, ROUSED, Hand, HumanError, Person, figure, hand_shapes
+from vinesim.physics.people import HAND, PARTS, ROUSED, Hand, HumanError, Person, figure, hand_shapes
 from vinesim.physics.urdf import RobotError, check, shapes_of, touchable
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
@@ -339,17 +339,18 @@ class Rigid:
         self._list()
 
     def near_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
-        """What a palm could close on: gap [m] below ``reach``, actor and link of the nearest thing; not the ground."""
+        """What a hand could close on: gap [m] below ``reach``, actor and link of the nearest thing; not the ground."""
         person = self.person(name)
         self._refresh()
-        m, d, g = self.world, self.data, self.geoms
-        palm = int(m.body_geomadr[person.hand(side).body])
+        m, d = self.world, self.data
+        body = person.hand(side).body
+        mine = range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body])
         best: tuple[float, str, str] | None = None
-        for of in (g, self.standing):
-            apart = np.linalg.norm(d.geom_xpos[of.id] - d.geom_xpos[palm], axis=1)
-            for i in np.flatnonzero(apart - of.radius - m.geom_rbound[palm] < reach):
+        for of in (self.geoms, self.standing):
+            apart = np.linalg.norm(d.geom_xpos[of.id] - d.xpos[body], axis=1)
+            for i in np.flatnonzero(apart - of.radius < reach + HAND):
                 if of.kind[i] != mujoco.mjtGeom.mjGEOM_PLANE and of.actor[i] != name:
-                    gap = mujoco.mj_geomDistance(m, d, palm, int(of.id[i]), reach, None)
+                    gap = min(mujoco.mj_geomDistance(m, d, geom, int(of.id[i]), reach, None) for geom in mine)
                     if gap < reach and (best is None or gap < best[0]):
                         best = (gap, of.actor[i], of.link[i])
         return best

@@ -238,33 +238,37 @@ class Touching:
         """(tree, actor) for every tree that somebody presses on in the last tick, sorted."""
         return tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
 
-    def nearest(self, point: np.ndarray, reach: float) -> tuple[float, int] | None:
-        """What of the plants is nearest to a ``point`` [3]: distance [m] to its surface, below ``reach``, and its body.
+    def nearest(self, points: np.ndarray, reach: float) -> tuple[float, int] | None:
+        """What of the plants is nearest to one of some ``points`` [k, 3]: distance [m] to its surface, and its body.
 
-        Of a bunch the bunch's own body, whether or not its clusters move.
+        Of a bunch the bunch's own body, whether or not its clusters move. None if nothing is below ``reach``.
         """
-        low, high = self._tree_low - reach, self._tree_high + reach
-        trees = np.flatnonzero(((low <= point) & (point <= high)).all(1))
+        low, high = points.min(0) - reach, points.max(0) + reach
+        trees = np.flatnonzero(((self._tree_low <= high) & (low <= self._tree_high)).all(1))
         if len(trees) == 0:
             return None
         self.plants.kinematics(trees)
-        s, state = self.shapes, self.plants.state
+        s, state, model = self.shapes, self.plants.state, self.model
         at = np.concatenate([np.arange(s.tree[tree], s.tree[tree + 1]) for tree in trees])
-        fine = state.tree_fine[self.model.body_tree[s.body[at]]]
+        fine = state.tree_fine[model.body_tree[s.body[at]]]
         at = at[(s.when[at] == 0) | (s.when[at] == 1 + fine)]
-        at = at[(s.bunch[at] < 0) | state.bunch_attached[s.bunch[at]]]
+        there = s.bunch[at] < 0
+        there[~there] = state.bunch_attached[s.bunch[at[~there]]]
+        at = at[there]
         pose = state.body_q[s.body[at]].astype(float)
         start = pose[:, :3] + frames.rotate(pose[:, 3:], s.start[at].astype(float))
         along = frames.rotate(pose[:, 3:], (s.end[at] - s.start[at]).astype(float))
-        length = np.maximum((along * along).sum(1), 1e-12)
-        share = np.clip(((point - start) * along).sum(1) / length, 0.0, 1.0)
-        gap = np.linalg.norm(start + share[:, None] * along - point, axis=1) - s.radius[at]
+        square = np.maximum((along * along).sum(1), 1e-12)
+        apart = points[:, None] - start
+        share = np.clip((apart * along).sum(-1) / square, 0.0, 1.0)
+        gap = (np.linalg.norm(apart - share[..., None] * along, axis=-1) - s.radius[at]).min(0)
         best = int(np.argmin(gap)) if len(gap) else -1
         if best < 0 or gap[best] >= reach:
             return None
         body, bunch = int(s.body[at[best]]), int(s.bunch[at[best]])
-        cluster = body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]
-        return float(gap[best]), int(self.model.bunch_body[bunch]) if cluster else body
+        tree = model.body_tree[body]
+        clustered = body - model.tree_first[tree] >= model.tree_core[tree]
+        return float(gap[best]), int(model.bunch_body[bunch]) if clustered else body
 
     def _name(self, other: int) -> tuple[str, str]:
         """Actor and link of what a plant touches."""
