@@ -1,0 +1,231 @@
+"""Boxes stack, rub, are carried with what lies in them; and whatever meets in the air keeps its momentum."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from touch_scenes import cane
+
+from vinesim import frames
+from vinesim.physics.rigid import FRICTION
+from vinesim.physics.step import Physics
+from vinesim.world.grow import GRAVITY, assemble
+from vinesim.world.values import Drive, RobotSpec
+
+WEIGHT = -GRAVITY[2]
+SIZE = (0.6, 0.4, 0.3)
+MASSES = (2.0, 3.0, 1.5, 2.5)
+INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+
+
+def robot(
+    name: str, at: list[float], axis: str, size: str, mass: float, drive: tuple[float, float, float]
+) -> RobotSpec:
+    """A box of ``size`` on one slider; ``drive``: stiffness, damping, effort."""
+    urdf = f"""<robot name="tool"><link name="base_footprint"><inertial><mass value="500"/>{INERTIA}</inertial></link>
+<link name="tool"><inertial><mass value="{mass}"/>{INERTIA}</inertial>
+<collision><geometry><box size="{size}"/></geometry></collision></link>
+<joint name="slide" type="prismatic"><parent link="base_footprint"/><child link="tool"/><axis xyz="{axis}"/>
+<limit lower="-9" upper="9" effort="1000" velocity="5"/></joint></robot>"""
+    drives = (Drive("slide", *drive, 5.0, -9.0, 9.0),)
+    return RobotSpec(name, 0, urdf, "base_footprint", frames.pose(at), drives, np.zeros(1), (1e5, 1e5))
+
+
+def pile(count: int) -> Physics:
+    """Boxes on one another, each turned a little."""
+    at = [frames.pose([0.0, 0.0, 0.3 * i], frames.yaw(0.01 * (-1) ** i)) for i in range(count)]
+    return Physics(assemble([cane((0.0, 50.0, 2.0))], box_pose=at, box_size=[SIZE] * count, box_mass=MASSES[:count]))
+
+
+def poses(physics: Physics) -> np.ndarray:
+    return np.array([physics.rigid.data.joint(f"box/{i}").qpos for i in range(len(physics.model.box_mass))])
+
+
+def test_four_boxes_stand_on_one_another_and_fall_asleep():
+    physics = pile(4)
+    for _ in range(100):
+        physics.step()
+    settled = poses(physics)
+    for _ in range(400):
+        physics.step()
+    moved = poses(physics)
+    assert np.abs(moved[:, :3] - settled[:, :3]).max() < 1e-4
+    np.testing.assert_allclose(moved[:, 2], 0.3 * np.arange(4), atol=2e-3)
+    tilt = 2.0 * np.linalg.norm(moved[:, 4:6], axis=1)
+    assert tilt.max() < 2e-3
+    trees = physics.rigid.world.body_treeid[[physics.rigid.world.body(f"box/{i}").id for i in range(4)]]
+    assert (physics.rigid.data.tree_asleep[trees] >= 0).all()
+
+
+@pytest.mark.parametrize("share", [0.95, 1.05])
+@pytest.mark.parametrize("which", [0, 1])
+def test_what_starts_a_box_is_mu_times_what_rests_on_its_sole(which, share):
+    """F34: the upper of two boxes slides at mu m g of its own, the lower one at mu g times both."""
+    physics = pile(2)
+    for _ in range(150):
+        physics.step()
+    start = poses(physics)
+    data, body = physics.rigid.data, physics.rigid.world.body(f"box/{which}").id
+    force = share * FRICTION * WEIGHT * sum(MASSES[which:2])
+    data.xfrc_applied[body, 0] = force
+    data.xfrc_applied[body, 4] = -force * (data.xipos[body, 2] - start[which, 2])  # acts at its sole: does not tip it
+    for _ in range(60):
+        physics.step()
+    went = poses(physics)[:, 0] - start[:, 0]
+    if share < 1.0:
+        assert np.abs(went).max() < 3e-3
+    else:
+        assert went[which] > 0.03
+    if which == 1:
+        assert abs(went[0]) < 3e-3, "the lower one stays"
+
+
+def test_a_box_of_bunches_is_lifted_driven_and_set_down_with_all_that_is_in_it():
+    """A fork carries the box up by 40 cm and forth by 1 m; its drive feels the weight of box and bunches."""
+    masses = [0.4, 0.5, 0.6]
+    trees = [cane((0.0, 9.0 + i, 2.0), bunch=mass) for i, mass in enumerate(masses)]
+    physics = Physics(
+        assemble(trees, box_pose=[[0.0, 0.0, 0.06, 0, 0, 0, 1]], box_size=[SIZE], box_mass=[2.0]), picking=False
+    )
+    fork = robot("fork", [0.0, 0.0, 0.03], "0 0 1", "0.5 0.3 0.06", 10.0, (2e4, 2e3, 1000.0))
+    physics.add_robot(fork)
+    rigid, rng = physics.rigid, np.random.default_rng(1)
+    for bunch in range(3):
+        physics.pick(bunch)
+        at = np.array([-0.15 + 0.1 * bunch, 0.02 * bunch - 0.02, 0.25 + 0.15 * bunch])
+        rigid.place_bunch(bunch, frames.pose(at, frames.normalize(rng.normal(size=4))), np.zeros(6))
+    for _ in range(200):
+        physics.step()
+    for tick in range(800):
+        lift = 0.4 * np.clip(tick / 200.0, 0.0, 1.0) * (1.0 if tick < 600 else max(0.0, 1.0 - (tick - 600) / 150.0))
+        rigid.command("fork", np.array([lift]))
+        rigid.drive_base("fork", (0.5 * float(np.interp(tick, [200, 250, 400, 450], [0, 1, 1, 0])), 0.0, 0.0))
+        physics.step()
+        if tick == 590:
+            contact = rigid.read("fork")[3][0]
+            assert contact == pytest.approx(-WEIGHT * (2.0 + sum(masses)), rel=0.01)
+            assert rigid.data.joint("box/0").qpos[2] == pytest.approx(0.46, abs=5e-3)
+    box = rigid.data.joint("box/0").qpos
+    assert box[0] == pytest.approx(1.0, abs=0.03)
+    for bunch, mass in enumerate(masses):
+        middle = rigid.bunch_pose(bunch)
+        middle = middle[:3] + frames.rotate(middle[3:], np.array([0.085, 0.0, 0.0]))
+        inside = frames.rotate(frames.conjugate(frames.from_wxyz(box[3:])), middle - box[:3])
+        assert (np.abs(inside[:2]) < [0.3, 0.2]).all()
+        assert 0.0 < inside[2] < 0.35
+        body = rigid.world.body(f"loose/{rigid._slot[bunch]}").id
+        assert rigid.world.body_mass[body] == pytest.approx(mass, rel=1e-6)
+
+
+# ---------------------------------------------------------------------- momentum of pairs
+
+HIGH = 60.0
+"""All meets in free fall, far above ground: nothing else pushes sideways [m]."""
+
+
+def airborne() -> Physics:
+    """Two boxes, two bunches and two cut canes, apart from one another, and two coasting rams."""
+    trees = [cane((20.0 * i, 30.0, HIGH), bunch=0.5) for i in range(2)]
+    trees += [cane((20.0 * i, 60.0, HIGH), radius=0.006) for i in range(2)]
+    at = [frames.pose([5.0 * i, -30.0, HIGH]) for i in range(2)]
+    physics = Physics(assemble(trees, box_pose=at, box_size=[SIZE] * 2, box_mass=[2.0, 1.0]), picking=False)
+    for i in range(2):
+        physics.add_robot(robot(f"ram{i}", [10.0 * i, -60.0, HIGH], "1 0 0", "0.2 0.3 0.2", 3.0, (0.0, 0.0, 1000.0)))
+    for bunch in range(2):
+        physics.pick(bunch)
+    return physics
+
+
+def momentum(physics: Physics) -> np.ndarray:
+    """Of all that moves freely [3] kg m/s; of a ram, along its way."""
+    rigid, model = physics.rigid, physics.model
+    rigid._refresh()
+    total, J = np.zeros(3), np.zeros((3, rigid.world.nv))
+    names = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._slot.values())]
+    for name in (*names, "ram0/tool", "ram1/tool"):
+        body = rigid.world.body(name).id
+        mujoco.mj_jacBodyCom(rigid.world, rigid.data, J, None, body)
+        total += rigid.world.body_mass[body] * (J @ rigid.data.qvel)
+    physics.refresh()
+    q, v = physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
+    free = model.body_tree >= 2
+    velocity = v[:, :3] + np.cross(v[:, 3:], frames.rotate(q[:, 3:], model.body_com.astype(float)))
+    return total + model.body_mass[free].astype(float) @ velocity[free]
+
+
+def hurl(physics: Physics, kind: str, index: int, x: float, speed: float) -> None:
+    """Put a thing where it meets its fellow at (0, 0, 60), a little off centre, flying along x."""
+    rigid = physics.rigid
+    at = np.array([x, 0.02 * index, HIGH - 0.01 * index])
+    if kind == "box":
+        joint = rigid.data.joint(f"box/{index}")
+        joint.qpos[:] = [*(at - [0.0, 0.0, 0.15]), 1, 0, 0, 0]
+        joint.qvel[0] = speed
+    elif kind == "bunch":
+        rigid.place_bunch(index, frames.pose(at - [0.085, 0, 0]), np.array([speed, 0, 0, 0, 0, 0]))
+    else:
+        rigid.place(f"ram{index}", frames.pose([*at[:2], HIGH]), np.zeros(1))
+        rigid.data.qvel[rigid._robots[f"ram{index}"].v] = speed
+
+
+PAIRS = [
+    ("box", "box"), ("box", "bunch"), ("bunch", "box"), ("bunch", "bunch"), ("ram", "box"), ("ram", "bunch"),
+    ("ram", "ram"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS)
+def test_what_one_loses_the_other_gains(one, other):
+    """Contacts give what they take, tick by tick; how much a spin about another point than the centre of mass then
+    adds up to in free flight is of the order of the step."""
+    physics = airborne()
+    rigid = physics.rigid
+    rigid.world.opt.gravity[:] = 0.0
+    hurl(physics, one, 0, -0.5, 1.5)
+    hurl(physics, other, 1, 0.5, -1.0)
+    start, exchanged = momentum(physics), np.zeros(2)
+    for _ in range(60):
+        physics.step()
+        given = rigid.data.qacc - rigid.data.qacc_smooth  # by contacts, at the poses of the tick's start
+        pair = np.array([along(physics, *thing, given) for thing in ((one, 0), (other, 1))]) * physics.dt
+        assert abs(pair.sum()) <= 1e-4 * np.abs(pair).max() + 1e-5
+        exchanged += pair
+    assert exchanged[0] < -0.3, "it was hit"
+    assert exchanged.sum() == pytest.approx(0.0, abs=1e-4 * exchanged[1])
+    assert abs(momentum(physics) - start)[0] < 5e-3 * exchanged[1]
+
+
+def along(physics: Physics, kind: str, index: int, rates: np.ndarray) -> float:
+    """Mass times the rate of a thing's centre of mass along x, at the poses that MuJoCo has now."""
+    rigid = physics.rigid
+    name = {"box": f"box/{index}", "bunch": f"loose/{rigid._slot[index]}", "ram": f"ram{index}/tool"}[kind]
+    body, J = rigid.world.body(name).id, np.zeros((3, rigid.world.nv))
+    mujoco.mj_jacBodyCom(rigid.world, rigid.data, J, None, body)
+    return float(rigid.world.body_mass[body] * (J @ rates)[0])
+
+
+@pytest.mark.parametrize("other", ["box", "bunch", "ram"])
+def test_a_cut_cane_takes_what_the_other_loses(other):
+    """A cane that falls freely, met in the middle by a box, a bunch, a ram."""
+    physics = airborne()
+    tree = 2
+    physics.plants.cut(int(physics.model.tree_first[tree]))
+    rigid = physics.rigid
+    middle = np.array([0.5, 60.0, HIGH])
+    if other == "ram":
+        rigid.place("ram0", frames.pose([middle[0], 59.8, HIGH], frames.yaw(0.5 * np.pi)), np.zeros(1))
+        rigid.data.qvel[rigid._robots["ram0"].v] = 1.0
+    elif other == "box":
+        joint = rigid.data.joint("box/0")
+        joint.qpos[:] = [middle[0], 59.7, HIGH - 0.15, 1, 0, 0, 0]
+        joint.qvel[1] = 1.0
+    else:
+        rigid.place_bunch(0, frames.pose([middle[0] - 0.085, 59.85, HIGH]), np.array([0, 1.0, 0, 0, 0, 0]))
+    start, met = momentum(physics), 0
+    for _ in range(50):
+        physics.step()
+        met += len(physics.contacts)
+    assert met > 0
+    off = momentum(physics) - start
+    assert abs(off[1]) < 1e-4 * abs(start[1])
