@@ -105,6 +105,8 @@ def test_two_actors_with_one_name():
         (["bench", "nothing"], ["nothing", "plants", "camera"]),
         (["demo", "--scene", "nowhere"], ["nowhere"]),
         (["demo", "--robot", "nobody"], ["nobody"]),
+        (["demo", "--job", "dance"], ["dance", "push", "pick", "exchange"]),
+        (["client", "--job", "dance", "--no-ros"], ["dance", "pick", "exchange"]),
     ],
 )
 def test_wrong_use(arguments, words, tmp_path):

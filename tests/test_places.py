@@ -18,7 +18,7 @@ def test_a_path_wins_over_a_name(tmp_path, monkeypatch):
 
 
 def test_an_unknown_name_lists_the_known():
-    with pytest.raises(NotFoundInData, match=r"no file 'moon'.*data/scenes.*demo, tendone, vsp"):
+    with pytest.raises(NotFoundInData, match=r"no file 'moon'.*data/scenes.*demo, harvest, tendone, vsp"):
         find("scenes", "moon", ".toml")
 
 

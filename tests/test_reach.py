@@ -11,7 +11,6 @@ from vinesim import frames
 from vinesim.physics.rigid import Rigid
 from vinesim.robot.description import Description, DescriptionError, load
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.hand import prioritized
 from vinesim.robot.reach import Phase, ReachAndPush
 from vinesim.world.grow import assemble
 
@@ -188,23 +187,3 @@ def test_a_foreign_robot_reaches_by_its_names_alone() -> None:
     run = Run(Robot(Rigid(assemble([])), tiago, "anna"), "left", np.array([0.55, 0.25, 1.1]))
     assert run.reach.cycles == 1
     assert run.errors[Phase.TOUCH] < 0.01
-
-
-def test_priorities_hold() -> None:
-    """First task exact, second as far as it is free, bounds kept: against least squares on the null space."""
-    rng = np.random.default_rng(5)
-    first, second = rng.normal(size=(3, 7)), rng.normal(size=(5, 7))
-    one, two, posture = rng.normal(size=3), rng.normal(size=5), rng.normal(size=7)
-    far = np.full(7, 1e3)
-    rates = prioritized([(first, one), (second, two)], posture, -far, far, np.ones(7))
-    np.testing.assert_allclose(first @ rates, one, atol=1e-9)
-    particular = np.linalg.pinv(first) @ one
-    null = np.eye(7) - np.linalg.pinv(first) @ first
-    best = particular + null @ (np.linalg.pinv(second @ null, rcond=1e-9) @ (two - second @ particular))
-    np.testing.assert_allclose(rates, best, atol=1e-9)
-    alone = prioritized([(first, one)], posture, -far, far, np.ones(7))
-    np.testing.assert_allclose(alone, particular + null @ posture, atol=1e-9)
-    bound = np.full(7, 0.9 * np.abs(alone).max())
-    kept = prioritized([(first, one)], posture, -bound, bound, np.ones(7))
-    assert (np.abs(kept) <= bound + 1e-9).all()
-    np.testing.assert_allclose(first @ kept, one, atol=1e-9)

@@ -96,7 +96,7 @@ def test_a_mistake_is_one_line_with_file_place_and_remedy(mistake, tmp_path):
 
 
 def test_an_unknown_scene_names_those_that_ship():
-    with pytest.raises(scene.SceneError, match=r"'vineyard'.*demo, tendone, vsp"):
+    with pytest.raises(scene.SceneError, match=r"'vineyard'.*demo, harvest, tendone, vsp"):
         scene.load("vineyard")
 
 

@@ -34,7 +34,6 @@ def logistic() -> str:
     body = (
         box((0.70, 0.36, 0.26), (0, 0, 0.06), colour="white"),
         box((0.64, 0.37, 0.03), (0, 0, 0.10), colour="red", solid=False),
-        cylinder(0.03, 0.40, (0, 0, 0.39), colour="dark"),
     )
     urdf.link("base_link", (*body, *tracks), mass=120.0)
     urdf.fix("base_link", "base_footprint", (0, 0, 0.10))
@@ -47,9 +46,9 @@ def logistic() -> str:
 
 
 def eye(urdf: Urdf) -> None:
-    """A camera on a short mast; frames named as a RealSense driver names them."""
-    urdf.link("front_camera_link", (box((0.025, 0.09, 0.025), colour="grey"),), mass=0.072)
-    urdf.fix("front_camera_link", "base_link", (0.03, 0, 0.62), (0, 0.5, 0))
+    """A camera above the front lift, for what the clamp holds; frames named as a RealSense driver names them."""
+    urdf.link("front_camera_link", (box((0.025, 0.09, 0.025), colour="grey"),), mass=0.072)  # RealSense D435 data sheet
+    urdf.fix("front_camera_link", "base_link", (0.38, 0, 0.54), (0, 0.75, 0))
     urdf.link("front_camera_rgb_optical_frame")
     urdf.fix(
         "front_camera_rgb_optical_frame", "front_camera_link", (0.014, 0, 0), (-math.pi / 2, 0, -math.pi / 2)

@@ -50,7 +50,7 @@ def run(
     stop = threading.Event()
 
     from vinesim.client.client import Client
-    from vinesim.client.jobs import DriveTo, LookAt, plan_job
+    from vinesim.client.jobs import DriveTo, LookAt, checked_job, plan_job
     from vinesim.client.pace import Pace
     from vinesim.client.places import checked_bunch, placed, start_pose
     from vinesim.client.senses import Senses
@@ -63,6 +63,7 @@ def run(
     from vinesim.world.scene import load as load_scene
     from vinesim.world.scene import reseeded
 
+    checked_job(job)
     plan = reseeded(load_scene(scene), seed)
     descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:

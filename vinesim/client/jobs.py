@@ -22,8 +22,19 @@ from vinesim.world.model import Model
 log = logging.getLogger(__name__)
 
 
+JOBS = ("pick", "exchange")
+"""What :func:`plan_job` knows."""
+
+
 class UnknownJob(ValueError):
     """A job that no robot here knows; the text says which it knows."""
+
+
+def checked_job(job: str | None) -> str | None:
+    """The job, if there is one of that name."""
+    if job is not None and job not in JOBS:
+        raise UnknownJob(f"no job {job!r}; give {' or '.join(JOBS)}")
+    return job
 
 
 def plan_job(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Script], np.ndarray]:
@@ -31,13 +42,11 @@ def plan_job(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physic
 
     ``near`` [7]: where it would be otherwise. Planning takes a second or two: not for the tick.
     """
-    if job == "pick":
+    if checked_job(job) == "pick":
         task = next(picking.tasks(model, near[:2]))
         return functools.partial(Pick, task=task), task.stand
-    if job == "exchange":
-        boxes = logistics.swap(model, near)
-        return functools.partial(_exchange, swap=boxes), near
-    raise UnknownJob(f"no job {job!r}; give pick or exchange")
+    boxes = logistics.swap(model, near)
+    return functools.partial(_exchange, swap=boxes), near
 
 
 def _exchange(physics: Physics, robot: Robot, swap: Swap) -> Exchange:

@@ -71,7 +71,7 @@ class Script:
         self.time = time
         try:
             if time - self._started > self.seconds:
-                raise Failed(f"not done after {self.seconds:.0f} s")
+                raise Failed(f"not done after {self.seconds:g} s")
             self.phase = next(self._steps)
             self.durations[self.phase] = self.durations.get(self.phase, 0.0) + self.robot.rigid.dt
         except StopIteration:
