@@ -17,8 +17,11 @@ import math
 
 import mujoco
 import numpy as np
+import warp as wp
 
 from vinesim import frames
+from vinesim.kernels import people as kernels
+from vinesim.kernels.launch import bind
 from vinesim.world.values import HandSample, HumanPose, HumanSpec, Shape
 
 SIDES = ("left", "right")
@@ -71,7 +74,8 @@ _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "box": mujoco.mjtGeom.mjGEOM_BOX,
 }  # fmt: skip
-_NECK = np.array([-_BACK, 0.0, -0.2])
+_NECK = -0.2
+"""[m] Height of the neck above the eyes."""
 TURN_DAMPING = 2.0 * math.sqrt(TURN * INERTIA)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
@@ -133,34 +137,45 @@ def hand_shapes(side: str) -> tuple[Shape, ...]:
 
 def posture(height: float, pose: HumanPose) -> np.ndarray:
     """Poses [part, 7] of :data:`PARTS`: knees bend forward by as much as hips and ankles ask."""
-    tracked = np.stack([pose.head, pose.hips, pose.left_foot, pose.right_foot]).astype(float)
-    head, hips, feet = tracked[0], tracked[1], tracked[2:]
-    ahead = frames.rotate(tracked[:, 3:], np.array([1.0, 0.0, 0.0]))
-    left = frames.rotate(hips[3:], np.array([0.0, 1.0, 0.0]))
-    neck = head[:3] + frames.rotate(head[3:], _NECK)
-    joint = hips[:3] + HIP * height * left * np.array([[1.0], [-1.0]])
-    thigh, shank = THIGH * height, SHANK * height
-    apart = feet[:, :3] - joint
-    distance = np.sqrt((apart * apart).sum(1, keepdims=True))
-    down = apart / np.maximum(distance, 1e-9)
-    reach = np.clip(distance, abs(thigh - shank) + 1e-3, thigh + shank - 1e-6)
-    along = (thigh**2 - shank**2 + reach**2) / (2.0 * reach)
-    front = ahead[2:] + ahead[1]
-    front = frames.normalize(front - (front * down).sum(1, keepdims=True) * down)
-    knee = joint + along * down + np.sqrt(np.maximum(thigh**2 - along**2, 0.0)) * front
+    return _Motion(height).posture(pose)
 
-    # trunk, thighs and shanks: along each limb, and the way it looks
-    begin = np.concatenate([hips[None, :3], joint, knee])
-    limb = np.concatenate([[neck - hips[:3]], knee - joint, joint + reach * down - knee])
-    limb = frames.normalize(limb)
-    look = np.concatenate([ahead[1:2], front, front])
-    look = frames.normalize(look - (look * limb).sum(1, keepdims=True) * limb)
-    side = frames.cross(look, limb)
-    side[0] *= -1.0
-    axes = np.stack([limb, side, look], -1)
-    axes[0, :, 0], axes[0, :, 2] = look[0], limb[0]  # the chest's z is up, its x forward
-    chest, *legs = np.concatenate([begin, frames.from_matrix(axes)], -1)
-    return np.stack([head, chest, hips, legs[0], legs[2], feet[0], legs[1], legs[3], feet[1]])
+
+class _Motion:
+    """Kernels about one person, bound to their arrays."""
+
+    def __init__(self, height: float) -> None:
+        points, poses = len(TRACKED) - 3, len(PARTS) + 2 * len(SIDES)
+        self._tracked, self._parts = np.zeros((points, 7)), np.zeros((len(PARTS), 7))
+        self._start, self._goal = np.zeros((poses, 7)), np.zeros((poses, 7))
+        self._apart = np.zeros((3, poses, 3))
+
+        def shared(data: np.ndarray) -> wp.array:
+            return wp.array(data, dtype=wp.float64, device="cpu", copy=False)
+
+        self._stand = bind(
+            kernels.stand,
+            [THIGH * height, SHANK * height, HIP * height, wp.vec3d(-_BACK, 0.0, _NECK), shared(self._tracked)],
+            [shared(self._parts)],
+        )
+        self._differ = bind(
+            kernels.differ, [shared(self._start), shared(self._goal)], [shared(rows) for rows in self._apart]
+        )
+
+    def posture(self, pose: HumanPose) -> np.ndarray:
+        """Poses [part, 7] of :data:`PARTS`."""
+        self._tracked[:] = pose.head, pose.hips, pose.left_foot, pose.right_foot
+        self._stand(3)
+        return self._parts.copy()
+
+    def apart(self, start: tuple[np.ndarray, ...], goal: tuple[np.ndarray, ...]) -> np.ndarray:
+        """From poses to poses [k, 7]: way [m], turn [rad] in world axes, turn in the first pose's axes; [3, k, 3].
+
+        The array is written anew by the next call.
+        """
+        np.concatenate(start, out=self._start)
+        np.concatenate(goal, out=self._goal)
+        self._differ(len(self._start))
+        return self._apart
 
 
 # ---------------------------------------------------------------------- one person
@@ -211,6 +226,7 @@ class Person:
         """MuJoCo's degrees of freedom of the same."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
         self._meets = 0
+        self._motion = _Motion(spec.height)
         self.move(spec.pose)
         self._before = self._now
 
@@ -233,7 +249,7 @@ class Person:
                 f"human {self.spec.name!r}: {TRACKED[worst]} is {points[worst]}; give seven finite numbers, position "
                 "and unit quaternion (x, y, z, w)"
             )
-        self._now = np.concatenate([posture(self.spec.height, pose), [pose.left, pose.right]])
+        self._now = np.concatenate([self._motion.posture(pose), [pose.left, pose.right]])
         """Poses of :data:`PARTS`, then of both controllers."""
         for hand in self.hands:
             hand.closed = bool(getattr(pose, f"{hand.side}_closed"))
@@ -301,12 +317,12 @@ class Person:
         parts, start = len(PARTS), self._before[: len(PARTS)]
         held = np.array([[hand.free < LINGER] for hand in self.hands])
         goal = np.where(held, self._now[parts:], self._before[parts:])
-        way, turn = _apart(np.concatenate([self._before, at]), np.concatenate([self._now, goal]))
+        way, turn, within = self._motion.apart((self._before, at), (self._now, goal))
         speed = way[:parts] / dt
         size = np.sqrt((speed * speed).sum(1, keepdims=True))
         self._place(d, start)
         d.qvel[self.part_dofs[:, :3]] = speed * np.minimum(1.0, FASTEST / np.maximum(size, FASTEST))
-        d.qvel[self.part_dofs[:, 3:]] = frames.rotate(frames.conjugate(start[:, 3:]), turn[:parts] / dt)
+        d.qvel[self.part_dofs[:, 3:]] = within[:parts] / dt
         steps, turns, offsets, angles = way[parts:-2], turn[parts:-2], way[-2:], turn[-2:]
         for hand, here, offset, angle, step, spin in zip(self.hands, at, offsets, angles, steps, turns, strict=True):
             velocity = d.qvel[hand.v]
@@ -419,11 +435,6 @@ def _rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
         d.tree_awake[tree] = 1
         if d.tree_asleep[tree] < 0:
             d.tree_asleep[tree] = ROUSED
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Way [..., 3] m and turn [..., 3] rad from pose ``a`` to pose ``b``, world axes."""
-    return b[..., :3] - a[..., :3], frames.log(frames.multiply(b[..., 3:], frames.conjugate(a[..., 3:])))
 
 
 def _far(a: np.ndarray, b: np.ndarray) -> bool:

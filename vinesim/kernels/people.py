@@ -1,0 +1,116 @@
+"""Where the parts of people's bodies are, and how poses differ: what NumPy does slowly on ten rows."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+HEAD, HIPS, LEFT_FOOT, RIGHT_FOOT = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+
+
+@wp.func
+def spot(poses: wp.array2d(dtype=wp.float64), i: int):
+    """Position of a pose."""
+    return wp.vec3d(poses[i, 0], poses[i, 1], poses[i, 2])
+
+
+@wp.func
+def heading(poses: wp.array2d(dtype=wp.float64), i: int):
+    """Rotation of a pose."""
+    return wp.quatd(poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6])
+
+
+@wp.func
+def across(v: wp.vec3d, axis: wp.vec3d):
+    """Unit vector along what of ``v`` is perpendicular to the unit vector ``axis``."""
+    return wp.normalize(v - wp.dot(v, axis) * axis)
+
+
+@wp.func
+def framed(x: wp.vec3d, z: wp.vec3d):
+    """Rotation of axes x and z to these perpendicular unit vectors."""
+    y = wp.cross(z, x)
+    return wp.normalize(wp.quat_from_matrix(wp.matrix_from_cols(x, y, z)))
+
+
+@wp.func
+def write(at: wp.vec3d, q: wp.quatd, i: int, poses_out: wp.array2d(dtype=wp.float64)):
+    """Put a pose into its row."""
+    for k in range(3):
+        poses_out[i, k] = at[k]
+    for k in range(4):
+        poses_out[i, 3 + k] = q[k]
+
+
+@wp.kernel
+def stand(
+    # model
+    thigh: wp.float64,
+    shank: wp.float64,
+    hip: wp.float64,
+    neck: wp.vec3d,
+    # in
+    tracked: wp.array2d(dtype=wp.float64),
+    # out
+    parts_out: wp.array2d(dtype=wp.float64),
+):
+    """Pose one leg (thread 0: left, 1: right) or the rest (2) of a person: head, chest, hips, then thigh, shank, foot."""
+    side = wp.tid()
+    zero = wp.float64(0.0)
+    x = wp.vec3d(wp.float64(1.0), zero, zero)
+    hips = spot(tracked, HIPS)
+    ahead = wp.quat_rotate(heading(tracked, HIPS), x)
+    if side == 2:
+        for k in range(7):  # bit by bit
+            parts_out[0, k] = tracked[HEAD, k]
+            parts_out[2, k] = tracked[HIPS, k]
+        up = wp.normalize(spot(tracked, HEAD) + wp.quat_rotate(heading(tracked, HEAD), neck) - hips)
+        write(hips, framed(across(ahead, up), up), 1, parts_out)
+    else:
+        foot = LEFT_FOOT + side
+        leg = 3 + 3 * side
+        sign = wp.float64(1 - 2 * side)
+        joint = hips + wp.quat_rotate(heading(tracked, HIPS), wp.vec3d(zero, sign * hip, zero))
+        apart = spot(tracked, foot) - joint
+        down = wp.normalize(apart)
+        reach = wp.clamp(
+            wp.length(apart), wp.abs(thigh - shank) + wp.float64(1.0e-3), thigh + shank - wp.float64(1.0e-6)
+        )
+        along = (thigh * thigh - shank * shank + reach * reach) / (wp.float64(2.0) * reach)
+        front = across(wp.quat_rotate(heading(tracked, foot), x) + ahead, down)
+        knee = joint + along * down + wp.sqrt(wp.max(thigh * thigh - along * along, zero)) * front
+        upper = wp.normalize(knee - joint)
+        lower = wp.normalize(joint + reach * down - knee)
+        write(joint, framed(upper, across(front, upper)), leg, parts_out)
+        write(knee, framed(lower, across(front, lower)), leg + 1, parts_out)
+        for k in range(7):
+            parts_out[leg + 2, k] = tracked[foot, k]
+
+
+@wp.kernel
+def differ(
+    # in
+    start: wp.array2d(dtype=wp.float64),
+    goal: wp.array2d(dtype=wp.float64),
+    # out
+    way_out: wp.array2d(dtype=wp.float64),
+    turn_out: wp.array2d(dtype=wp.float64),
+    turn_within_out: wp.array2d(dtype=wp.float64),
+):
+    """Way and turn from one pose to another, the turn in the axes of the world and of the first pose."""
+    i = wp.tid()
+    way = spot(goal, i) - spot(start, i)
+    q = heading(start, i)
+    turn = wp.quat_inverse(q) * heading(goal, i)
+    vector = wp.vec3d(turn[0], turn[1], turn[2])
+    if turn[3] < wp.float64(0.0):
+        vector = -vector
+    sine = wp.length(vector)
+    scale = wp.float64(2.0)
+    if sine > wp.float64(1.0e-9):
+        scale = wp.float64(2.0) * wp.atan2(sine, wp.abs(turn[3])) / sine
+    within = scale * vector
+    outside = wp.quat_rotate(q, within)
+    for k in range(3):
+        way_out[i, k] = way[k]
+        turn_out[i, k] = outside[k]
+        turn_within_out[i, k] = within[k]
