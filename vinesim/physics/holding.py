@@ -29,6 +29,8 @@ FELT = 0.2
 FAINT = 0.01
 """Amplitude not worth a message."""
 
+_NOBODY = np.zeros(0, int)
+
 
 @dataclasses.dataclass(slots=True)
 class _Grip:
@@ -56,7 +58,9 @@ class Holding:
     @property
     def trees(self) -> np.ndarray:
         """Trees that somebody holds, sorted [k]."""
-        return np.unique([int(self.plants.model.body_tree[grip.body]) for grip in self._grips.values()]).astype(int)
+        if not self._grips:
+            return _NOBODY
+        return np.unique([int(self.plants.model.body_tree[grip.body]) for grip in self._grips.values()])
 
     # ------------------------------------------------------------------ the tick
 
