@@ -68,28 +68,25 @@ def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarr
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     hold = body_q[:, :3] + HOLD * axis
     fits = (hold[:, 2] > HEIGHT[0]) & (hold[:, 2] < HEIGHT[1]) & (model.bunch_radius <= WIDEST) & (axis[:, 2] < -0.95)
-    headings = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    bunches = np.flatnonzero(fits)
+    heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    turn = frames.yaw(heading)
+    sides = np.stack([frames.rotate(turn, np.array([AHEAD, y, 0.0]))[:, :2] for y in (ASIDE, -ASIDE)], 1)
+    base = hold[bunches, None, None, :2] - sides  # [bunch, heading, side, 2]
+    roomy = (free_room(model, base.reshape(-1, 2)) > ROOM).reshape(base.shape[:3])
     found = []
-    for bunch in np.flatnonzero(fits).tolist():
+    for i, bunch in enumerate(bunches.tolist()):
         here = (np.linalg.norm(points - hold[bunch], axis=1) < 0.8) & (owner != bunch)
-        for heading in headings:
-            back = frames.conjugate(frames.yaw(heading))
-            local = frames.rotate(back, points[here] - hold[bunch])
-            low = HAND_FROM - [0.0, 0.0, max(float(model.bunch_length[bunch]) - HOLD - 0.05, 0.0)]
-            beyond = np.maximum(low - local, local - HAND_TO)
-            gap = np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(1), 0.0) - radius[here]
-            clear = float(gap.min(initial=0.15))
-            if clear < CLEAR:
-                continue
-            ahead = np.array([np.cos(heading), np.sin(heading)])
-            left = np.array([-ahead[1], ahead[0]])
-            for side, sign in (("left", 1.0), ("right", -1.0)):
-                base = hold[bunch, :2] - AHEAD * ahead - sign * ASIDE * left
-                room = float(free_room(model, base[None])[0])
-                if room > ROOM:
-                    score = min(clear, FREE) - 0.01 * float(np.linalg.norm(base - near))
-                    pose = frames.pose(np.append(base, 0.0), frames.yaw(heading))
-                    found.append((-score, bunch, side, pose))
+        low = HAND_FROM - [0.0, 0.0, max(float(model.bunch_length[bunch]) - HOLD - 0.05, 0.0)]
+        looking = np.flatnonzero(roomy[i].any(1))
+        local = frames.rotate(frames.conjugate(turn[looking])[:, None], points[here] - hold[bunch])
+        beyond = np.maximum(low - local, local - HAND_TO)
+        apart = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(-1), 0.0)
+        for j, clear in zip(looking.tolist(), (apart - radius[here]).min(-1, initial=FREE).tolist(), strict=True):
+            for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= CLEAR else ():
+                score = clear - 0.01 * float(np.linalg.norm(base[i, j, k] - near))
+                pose = frames.pose(np.append(base[i, j, k], 0.0), turn[j])
+                found.append((-score, bunch, ("left", "right")[k], pose))
     for _, bunch, side, pose in sorted(found, key=lambda entry: entry[:3]):
         yield bunch, side, pose
 
@@ -104,7 +101,7 @@ def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     points = body_q[wood, None, :3] + along[..., None] * axis[wood, None]
     radius = np.full(points.shape[:2], 0.006)
-    middles = bunch_centres(model)[:, None] + 0.0
+    middles = bunch_centres(model)[:, None]
     depth = np.linspace(-0.8, 0.8, 5)
     bunch_axis = axis[model.bunch_body]
     fruit = middles + (0.5 * model.bunch_length[:, None] * depth)[..., None] * bunch_axis[:, None]

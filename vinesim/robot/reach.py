@@ -150,7 +150,7 @@ class ReachAndPush:
         elapsed = time - self._started
         if self.phase is Phase.HOLD:
             return elapsed >= self.hold
-        return self.error < NEAR or elapsed > self._patience
+        return bool(self.error < NEAR or elapsed > self._patience)
 
     def _advance(self, time: float) -> None:
         order = list(Phase)
