@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from touch_scenes import bar
 
 from vinesim import frames
 from vinesim.physics.plants import AIR, Plants
+from vinesim.physics.step import Physics
 from vinesim.physics.wind import ROUND, Wind
 from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.model import Model
@@ -201,3 +203,19 @@ def test_a_tree_asleep_in_steady_wind_stays_asleep() -> None:
     for tick in range(ROUND):
         wind.update(plants, 0.01 * tick)
     assert len(plants.awake) == 0
+
+
+def test_a_tick_blows_on_what_is_near_a_robot() -> None:
+    """In a breeze the cane beside the robot leans and stays awake; one nine metres on sleeps as it grew."""
+    physics = Physics(leafy(10))
+    physics.add_robot(bar((1.0, -0.5, 0.2)))
+    physics.wind = Wind(np.array([0.0, 6.0, 0.0]), gusts=1.0)
+    for _ in range(200):
+        physics.step()
+    model = physics.model
+    grown = model.forward(model.joint_settled)
+    first, last = model.bodies_of(0), model.bodies_of(9)
+    assert 0 in physics.plants.awake
+    assert 9 not in physics.plants.awake
+    assert physics.view().body_q[first.stop - 1, 1] > grown[first.stop - 1, 1] + 0.01
+    np.testing.assert_array_equal(physics.state.joint_q[last], model.joint_settled[last])

@@ -1,18 +1,13 @@
-"""Canes, a bunch, a gripper and a bar: built for our physics, and the same wholly in MuJoCo as the oracle."""
+"""Canes, a bunch, a gripper and a bar: built for our physics, and for the peer that has all in MuJoCo."""
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics import rigid as rigid_module
-from vinesim.physics.rigid import Rigid
-from vinesim.physics.touching import shapes_of
 from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
-from vinesim.world.state import State
 from vinesim.world.values import Drive, RobotSpec
 
 DOWN = frames.aligned(np.array([0.0, 0.0, -1.0]))
@@ -119,93 +114,6 @@ def probe(at, name: str = "probe", mass: float = 3.0, drives: tuple[Drive, ...] 
             Drive("press", 0.0, 2.0, 1000.0, 5.0, -5.0, 5.0),
         )
     return RobotSpec(name, 2, urdf, "base_footprint", frames.pose(np.array(at, float)), drives, np.zeros(2))
-
-
-class Whole:
-    """The oracle: plants and robots in one MuJoCo world, ball joints and sphere and capsule geoms."""
-
-    def __init__(self, model: Model, spec: RobotSpec, *, dt: float = 0.01, give: float | None = None) -> None:
-        """The scheme of ``discrete`` adds dt K of damping; it is taken off, down to nothing.
-
-        ``give`` [s] is the time constant of every contact; the default of MuJoCo, 0.02, is soft: at 3 m/s it lets
-        things overlap by centimetres.
-        """
-        self.rigid = Rigid(model, dt=dt)
-        self.rigid.add_robot(spec)
-        scene = rigid_module._scene(model, dt)
-        scene.memory = 1 << 26
-        for robot in self.rigid._robots.values():
-            rigid_module._attach(scene, robot)
-        made = []
-        for b in range(len(model.body_mass)):
-            parent = int(model.body_parent[b])
-            pose = frames.pose(model.body_offset[b], model.body_rest[b])
-            if parent < 0:
-                pose = frames.compose(model.tree_pose[model.body_tree[b]].astype(float), pose)
-            body = (scene.worldbody if parent < 0 else made[parent]).add_body(
-                name=f"plant/{b}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[b]),
-                ipos=model.body_com[b], inertia=model.body_inertia[b], explicitinertial=True,
-            )  # fmt: skip
-            k, c = float(model.joint_stiffness[b, 1]), float(model.joint_damping[b, 1])
-            body.add_joint(
-                name=f"plant/{b}", type=mujoco.mjtJoint.mjJNT_BALL, stiffness=k, damping=max(0.0, c - dt * k)
-            )
-            made.append(body)
-        shapes = shapes_of(model)
-        for b, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
-            size, place = [float(radius), 0, 0], {"pos": start}
-            kind = mujoco.mjtGeom.mjGEOM_SPHERE
-            if (start != end).any():
-                kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
-            made[b].add_geom(
-                type=kind, size=size, contype=rigid_module._FIXED, conaffinity=0, mass=0.0,
-                friction=[rigid_module.FRICTION, 0.005, 0.0001], solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2],
-                **place,
-            )  # fmt: skip
-        self.world = world = scene.compile()
-        if give is not None:
-            world.geom_solref[:] = give, 1.0
-            world.geom_solimp[:] = 0.99, 0.999, 0.001, 0.5, 2.0
-        self.data = data = mujoco.MjData(world)
-        mine = self.rigid.world
-        for j in range(mine.njnt):
-            if mine.joint(j).name.startswith("loose/"):  # waits for a picked bunch, which the oracle has not
-                continue
-            to, at = world.joint(mine.joint(j).name), mine.joint(j)
-            data.qpos[to.qposadr[0] : to.qposadr[0] + len(at.qpos0)] = self.rigid.data.joint(j).qpos
-        state = State.at_rest(model)
-        for b in range(len(model.body_mass)):
-            data.joint(f"plant/{b}").qpos[:] = frames.to_wxyz(state.joint_q[b])
-        # from here on the robot's side speaks to the whole world
-        self.rigid.world, self.rigid.data = world, data
-        for robot in self.rigid._robots.values():
-            self.rigid._locate(robot)
-        self.rigid._contact = np.zeros(world.nv)
-
-    def step(self) -> None:
-        self.rigid._servo()
-        mujoco.mj_step(self.world, self.data)
-        self.rigid._fresh = False
-
-    def body_q(self, b: int) -> np.ndarray:
-        """Pose [7] after the last step."""
-        self.rigid._refresh()
-        body = self.data.body(f"plant/{b}")
-        return np.concatenate([body.xpos, frames.from_wxyz(body.xquat)])
-
-    def force_on(self, link: str) -> np.ndarray:
-        """[3] N of all contacts on one robot link in the last step."""
-        total, wrench = np.zeros(3), np.zeros(6)
-        for c in range(self.data.ncon):
-            contact = self.data.contact[c]
-            mujoco.mj_contactForce(self.world, self.data, c, wrench)
-            force = contact.frame.reshape(3, 3).T @ wrench[:3]
-            bodies = [self.world.body(self.world.geom_bodyid[g]).name for g in contact.geom]
-            if bodies[1].endswith("/" + link):
-                total += force
-            if bodies[0].endswith("/" + link):
-                total -= force
-        return total
 
 
 def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:

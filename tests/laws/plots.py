@@ -17,8 +17,9 @@ import numpy as np
 import test_contact
 import test_rod_in_space
 import warp as wp
-from touch_scenes import Whole, bunch_scene, grasp, gripper
+from touch_scenes import bunch_scene, grasp, gripper
 
+from vinesim.physics.oracle import Whole
 from vinesim.physics.step import Physics
 
 matplotlib.use("Agg")
@@ -88,9 +89,12 @@ def convergence() -> Table:
     """Errors over pieces and over time steps, with the slope of two."""
     figure, (pieces, steps) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     rows = []
-    for (case, errors), colour in zip(beams.errors_over_pieces().items(), COLOURS, strict=True):
+    joined = beams.errors_over_pieces_of_joined()
+    cases = [*beams.errors_over_pieces().items(), *joined.items()]
+    for (case, errors), colour in zip(cases, COLOURS * 2, strict=True):
         slope = beams.order([1 / n for n in beams.PIECES], errors)
-        pieces.loglog(beams.PIECES, 1e3 * errors, "o-", color=colour, label=f"{case}: {slope:.2f}")
+        style = "s:" if case in joined else "o-"
+        pieces.loglog(beams.PIECES, 1e3 * errors, style, color=colour, ms=4, label=f"{case}: {slope:.2f}")
         rows.append((case, *(f"{1e3 * e:.3g}" for e in errors), f"{slope:.2f}"))
     n = np.array(beams.PIECES, float)
     pieces.loglog(n, 60 * (n / n[0]) ** -2, color=GREY, ls="--", lw=1)
@@ -98,7 +102,7 @@ def convergence() -> Table:
     pieces.set(xlabel="bodies of a cane", ylabel="tip off [mm]", xticks=n, xticklabels=beams.PIECES)
     pieces.minorticks_off()
     pieces.set_title("resting tip against the elastica: order")
-    pieces.legend(fontsize=9)
+    pieces.legend(fontsize=7, loc="lower left")
 
     over_dt, dt = beams.errors_over_dt(), 1e3 * np.array(beams.STEPS)
     slope = beams.order(beams.STEPS, over_dt["frequency"])
@@ -145,7 +149,7 @@ def damping() -> Table:
 def grasped() -> Table:
     """A bunch grasped, lifted, moved, pulled, let go: ours and the same scene wholly in MuJoCo."""
     model, body, middle = bunch_scene()
-    ours, oracle = Physics(model), Whole(model, gripper(middle))
+    ours, oracle = Physics(model), Whole(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     place, force = np.zeros((2, 800, 3)), np.zeros((2, 800))
     for tick in range(800):
@@ -182,14 +186,16 @@ def energy() -> Table:
     figure, axes = plt.subplots(figsize=(7.5, 3.6), layout="constrained")
     rows = []
     kicks = {"up and down": (0.0, 0.05, 0.0), "slantwise": (0.0, 0.04, 0.03), "aside": (0.0, 0.0, 0.05)}
-    for (name, kick), colour in zip(kicks.items(), COLOURS, strict=False):
-        seen, fastest = test_rod_in_space.drift(test_rod_in_space.drawn_cane(), np.array(kick))
+    canes = [(name, test_rod_in_space.drawn_cane(), np.array(kick)) for name, kick in kicks.items()]
+    canes.append(("aside, 100 g on the tip", test_rod_in_space.loaded_cane(0.1), np.array([0.0, 0.0, 0.02])))
+    for (name, cane, kick), colour in zip(canes, COLOURS, strict=True):
+        seen, fastest = test_rod_in_space.drift(cane, kick)
         share = 100 * (seen[-100:].mean() / seen[:100].mean() - 1)
         axes.plot(0.05 * np.arange(len(seen)), 100 * (seen / seen[0] - 1), color=colour, lw=1.2, label=name)
         rows.append((name, f"{fastest:.2f} rad/s", f"{share:+.2f} %"))
     axes.axhspan(-1, 1, color=GREY, alpha=0.18, lw=0, label="gate: 1 %")
-    axes.set(xlabel="time [s]", ylabel="energy, % off", ylim=(-4, 2))
-    axes.set_title("undamped cane, phi 1/2, 100 Hz")
+    axes.set(xlabel="time [s]", ylabel="energy, % off", ylim=(-2, 2))
+    axes.set_title("undamped canes, phi 1/2, 100 Hz")
     axes.legend(ncols=4, loc="upper right", fontsize=9)
     save(figure, "energy")
     return table(("energy over 60 s, phi 1/2", "fastest body", "drift"), rows)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from touch_scenes import Whole, bar, bunch_scene, cane, grasp, gripper, probe
+from touch_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 
 from vinesim import frames
+from vinesim.physics.oracle import Whole
 from vinesim.physics.step import Physics
 from vinesim.physics.touching import STIFFNESS, Touching
 from vinesim.world.grow import assemble
@@ -64,7 +65,7 @@ def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
 def held():
     """Close, lift, move, pull, let go: ours and the oracle's bunch, finger forces and efforts, tick by tick."""
     model, body, middle = bunch_scene()
-    ours, oracle = Physics(model), Whole(model, gripper(middle))
+    ours, oracle = Physics(model), Whole(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     rows = {key: [] for key in ("ours", "oracle", "force", "oracle_force", "effort", "oracle_effort")}
     for tick in range(800):
@@ -182,7 +183,7 @@ def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, g
     """
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005) for i in range(5)])
     spec = bar((0.7, -0.08, 0.95), damping=damping)
-    ours, oracle = Physics(model), Whole(model, spec, dt=0.01 / substeps, give=give)
+    ours, oracle = Physics(model), Whole(model, [spec], dt=0.01 / substeps, give=give)
     ours.touching.branches = False  # in the oracle canes pass through each other
     ours.add_robot(spec)
     for rigid in (ours.rigid, oracle.rigid):
@@ -246,7 +247,7 @@ def test_a_fast_sweep_agrees_with_hard_contacts_in_quarters_of_a_millisecond():
 def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
     model, body, middle = bunch_scene()
     spec = gripper(middle, effort=effort)
-    ours, oracle = Physics(model, picking=False), Whole(model, spec)
+    ours, oracle = Physics(model, picking=False), Whole(model, [spec])
     ours.add_robot(spec)
     held, force, off = [], [], 0.0
     for tick in range(450):
@@ -274,7 +275,7 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
 def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
     model, body, middle = bunch_scene()
     spec = gripper(middle, mimic=True)
-    ours, oracle = Physics(model), Whole(model, spec)
+    ours, oracle = Physics(model), Whole(model, [spec])
     ours.add_robot(spec)
     force, off = [], 0.0
     for tick in range(450):
@@ -409,7 +410,7 @@ def test_what_rests_on_a_cane_weighs_what_it_weighs(places):
 def test_what_is_dragged_along_a_cane_rubs_as_the_oracle_says():
     """Mean force over three pieces within 1 %; from tick to tick it is smooth but for the corners between pieces."""
     model, spec = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)]), probe((0.5, 0.0, 1.03))
-    ours, oracle = Physics(model), Whole(model, spec, dt=0.0005, give=0.004)
+    ours, oracle = Physics(model), Whole(model, [spec], dt=0.0005, give=0.004)
     ours.add_robot(spec)
     force = []
     for tick in range(1000):

@@ -27,6 +27,7 @@ from vinesim.net.bus import Bus
 from vinesim.net.exchange import Exchange, Inbox
 from vinesim.net.messages import Hello
 from vinesim.physics.step import Physics
+from vinesim.physics.wind import Wind
 from vinesim.robot import description as descriptions
 from vinesim.robot.description import Description, DescriptionError
 from vinesim.robot.drives import RemoteRobot, Robot
@@ -66,6 +67,9 @@ class Client:
         self.physics = Physics(
             model, device=device, threads=threads, picking=False
         )  # the network does not carry it yet
+        if any(scene.wind.mean) or scene.wind.gusts > 0.0:
+            wind = scene.wind
+            self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robots: dict[str, Robot] = {}
         """All that this client moves, by name; the first is :attr:`robot`."""
         self.exchanges: dict[str, Exchange] = {}

@@ -47,6 +47,16 @@ wp.set_module_options({"enable_backward": False})
 AIR = wp.constant(1.2)
 """[kg/m^3] density of air at 20 degrees"""
 
+WILD = wp.constant(0.1)
+"""Share of ``limit``: a tree with phi = 1 of which a joint turns faster keeps it, until all are ``CALM``. Thrown, a limp
+thread under a heavy load gains energy at any other phi: going back and forth it would thrash for ever."""
+
+CALM = wp.constant(0.06)
+"""Share of ``limit`` below which all joints of a wild tree must turn for a second."""
+
+TOUCHED = wp.constant(4)
+"""[tick] A count above this is a wild tree's; a touch begins with less."""
+
 
 @wp.func
 def exponential(v: wp.vec3):
@@ -736,9 +746,12 @@ def integrate(
     turning = fastest(joint_qd_free, first, size, pitch)
     most = wp.length(wp.vec2(turning, fleeing(joint_x, joint_xd_free, body_parent, body_root, first, size, pitch)))
     tree_rate_out[tree] = most
-    tree_onset_out[tree] = wp.max(tree_onset_out[tree] - 1, 0)
-    sound = most <= bound
+    onset = wp.max(tree_onset_out[tree] - 1, 0)
     phi = tree_phi[tree]
+    if (phi == 1.0 and turning > WILD * limit) or (onset > TOUCHED and turning > CALM * limit):
+        onset = wp.max(onset, int(1.0 / dt))
+    tree_onset_out[tree] = onset
+    sound = most <= bound
     # a tree beyond limit is slowed as a whole and well below it: holding back single joints would feed energy into the
     # others, and a loaded cane would thrash at the limit for ever
     slower = float(1.0)

@@ -60,8 +60,9 @@ FEW_MOVES = 100
 class Plants:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
-    ``free()`` chooses each tree's phi: 1 while a joint turns faster than ``brisk`` or for ``ONSET`` ticks after a touch
-    began, ``phi`` otherwise. ``response()`` and ``commit()`` belong to the ``free()`` before them.
+    ``free()`` chooses each tree's phi: 1 while a joint turns faster than ``brisk``, and if that was faster than a tenth
+    of ``limit`` until all have been slower than 0.06 ``limit`` for a second; 1 for ``ONSET`` ticks after a touch began;
+    ``phi`` otherwise. ``response()`` and ``commit()`` belong to the ``free()`` before them.
 
     Args:
         model: constants; :class:`ValueError` in words if a tree cannot be simulated.
@@ -428,7 +429,7 @@ class Plants:
             self._carry_wrench(len(self._stepped))
             self._push(len(touched))
             begun = touched[self._touched[touched] < self.tick - 1]
-            self._onset[begun] = ONSET + 1  # integrating counts this tick
+            self._onset[begun] = np.maximum(self._onset[begun], ONSET + 1)  # integrating counts this tick
             self._touched[touched] = self.tick
         elif changed:
             self._carry_wrench(len(self._stepped))
@@ -482,7 +483,7 @@ class Plants:
 
     def brace(self, trees: np.ndarray) -> None:
         """Use phi = 1 in the next ``ONSET`` ticks of trees about to be touched (``commit()`` sees to new touches)."""
-        self._onset[trees] = ONSET
+        self._onset[trees] = np.maximum(self._onset[trees], ONSET)
 
     def kinematics(self, trees: np.ndarray | None = None) -> None:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""

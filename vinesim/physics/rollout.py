@@ -31,8 +31,10 @@ _FREE, _INTEGRATE, _PLACE = (
     wp.kernel(kernel.func, module="vinesim.physics.rollout", enable_backward=True)
     for kernel in (plant.free, plant.integrate, plant.place)
 )
-_STILL = ("body_load", "body_wrench", "tree_onset")
+_STILL = ("body_load", "body_wrench")
 """Inputs that are zero unless given."""
+_COUNTER = "tree_onset"
+"""The state that is no number to differentiate by, and counts on where it stands."""
 _PARAMETERS = ("joint_stiffness", "joint_damping", "body_mass", "body_inertia", "body_product", "body_load")
 
 
@@ -45,7 +47,7 @@ class Track:
     body_qd: np.ndarray
     """[tick + 1, watched, 6] velocity of the origin [m/s] and angular velocity [rad/s], world axes."""
     phi: np.ndarray
-    """[tick, tree] the phi that each tick was stepped with: 1 while a joint turns faster than ``brisk``."""
+    """[tick, tree] the phi that each tick was stepped with: 1 once a joint has turned faster than ``brisk``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -170,6 +172,7 @@ class Rollout:
         ):
             self._set(name, default if value is None else self._sound(name, value, default.shape, least))
         start = {name: getattr(self.state, name) for name in self._states}
+        start[_COUNTER] = np.zeros(len(model.tree_first), np.int32)
         if joint_q is not None:
             start["joint_q"] = frames.normalize(self._sound("joint_q", joint_q, start["joint_q"].shape))
         if joint_qd is not None:
@@ -184,7 +187,7 @@ class Rollout:
             poses[rows] = self._stacks["body_q"].numpy()[:count, self.watch]
             motions[rows] = self._stacks["body_qd"].numpy()[:count, self.watch]
             phi[rows] = self._stacks["tree_phi"].numpy()[:count]
-            self._checkpoints.append({name: self._stacks[name].numpy()[count].copy() for name in self._states})
+            self._checkpoints.append({name: self._stacks[name].numpy()[count].copy() for name in start})
             self._refuse(first, self._stacks["tree_rate"].numpy()[:count])
         poses[-1] = self._last[0].numpy()[self.watch]
         motions[-1] = self._last[1].numpy()[self.watch]
@@ -248,6 +251,7 @@ class Rollout:
         for arg in _INTEGRATE.adj.args:
             if (name := arg.label.removesuffix("_out")) in self._states:
                 self._stacks[name] = self._zeros(name, arg.type.dtype, self._slots + 1)
+        self._stacks[_COUNTER] = self._zeros(_COUNTER, wp.int32, self._slots + 1)
         self._ticks = [(self._launch(_FREE, slot), self._launch(_INTEGRATE, slot)) for slot in range(self._slots)]
         self._ends = [self._launch(_PLACE, slot + 1, end=True) for slot in range(self._slots)]
         self._last = (self._arrays["end body_q"], self._arrays["end body_qd"])
@@ -265,7 +269,7 @@ class Rollout:
         if name in self._given:
             return self._given[name]
         dtype = arg.type.dtype
-        if name in self._states:
+        if name in self._states or name == _COUNTER:
             return self._stacks[name][slot + written]
         counter = dtype in (wp.int32, wp.bool)
         if written and end:
@@ -298,10 +302,12 @@ class Rollout:
 
     def _replay(self, segment: int, count: int) -> None:
         """Run one segment from its checkpoint."""
-        for name in self._states:
-            _fill(self._stacks[name][0], self._checkpoints[segment][name])
-        for prediction, move in self._ticks[:count]:
+        for name, value in self._checkpoints[segment].items():
+            _fill(self._stacks[name][0], value)
+        counter = self._stacks[_COUNTER]
+        for slot, (prediction, move) in enumerate(self._ticks[:count]):
             prediction[0].launch()
+            wp.copy(counter[slot + 1], counter[slot])
             move[0].launch()
         self._ends[count - 1][0].launch()
         self._at = segment

@@ -13,9 +13,13 @@ from vinesim.physics.plants import Plants
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.sleep import Sleep
 from vinesim.physics.touching import Touching
+from vinesim.physics.wind import Wind
 from vinesim.world.model import Model
 from vinesim.world.state import State
 from vinesim.world.values import Contact, Parting, RobotSpec, View
+
+STIRRED = 4.0
+"""[m] With robots about, wind moves only the trees whose foot is so near to one of them."""
 
 
 class Physics:
@@ -38,12 +42,15 @@ class Physics:
         self.detail = Detail(self.plants)
         self.sleep = Sleep(self.plants)
         self.guard = Guard(self.plants)
+        self.wind: Wind | None = None
+        """What blows, if anything does; set it as you like."""
         self.partings: tuple[Parting, ...] = ()
         """What left its plant in the last tick, or by command before it; sorted by body."""
         self.tick = 0
         self._body_q: np.ndarray | None = None
         self._fresh = True
         self.stages: tuple[tuple[str, Callable[[], None]], ...] = (
+            ("wind: blow on what somebody may see", self._blow),
             ("rigid: predict without plants", self.rigid.prep),
             ("touching: wake what is near", self.touching.find),
             ("detail: berries move where somebody is near", self._refine),
@@ -136,6 +143,11 @@ class Physics:
         return blade
 
     # ------------------------------------------------------------------ stages that only hand over
+
+    def _blow(self) -> None:
+        if self.wind is not None:
+            robots = [self.rigid.base(name)[0][:3] for name in self.rigid.robots]
+            self.wind.update(self.plants, self.time, (np.array(robots), STIRRED) if robots else None)
 
     def _refine(self) -> None:
         self.detail.update(self.touching.near)

@@ -435,6 +435,8 @@ class _Bodies:
     com: np.ndarray
     inertia: np.ndarray
     stiffness: np.ndarray
+    half: np.ndarray
+    """Spring of what of a piece of wood lies behind its middle."""
     damping: np.ndarray
     drag: np.ndarray
     """Drag area Cd A [m^2]."""
@@ -449,7 +451,8 @@ def _bodies(scene: Scene, parts: vine.Vine, s: _Shoots) -> _Bodies:
         present=np.ones(shape, bool), parent=np.zeros(shape, int), organ=np.full(shape, int(Organ.CANE)),
         origin=np.zeros((*shape, 3)), turn=np.zeros((*shape, 4)), length=np.zeros(shape), radius=np.zeros((*shape, 2)),
         mass=np.zeros(shape), com=np.zeros((*shape, 3)), inertia=np.zeros((*shape, 3)),
-        stiffness=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)), drag=np.zeros(shape),
+        stiffness=np.zeros((*shape, 3)), half=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)),
+        drag=np.zeros(shape),
         head={"mass": np.zeros((count, BUNCHES)), "com": np.zeros((count, BUNCHES, 3)),
               "inertia": np.zeros((count, BUNCHES, 3))},
     )  # fmt: skip
@@ -532,16 +535,22 @@ def _rod(
 ) -> None:  # fmt: skip
     """Fill the slots of one axis: points [shoot, piece + 1, 3], radius [shoot, piece + 1], modulus [piece].
 
-    What it grows on is tens of times as stiff, and taken for a clamp.
+    It is a root, or grows on its parent's tip.
     """
     along = np.diff(points, axis=1)
     length = np.linalg.norm(along, axis=-1)
     start, end = radius[:, :-1], radius[:, 1:]
-    mass, inertia, stiffness, far = grow.section(length, start, end, modulus, density)
-    stiffness[:, 1:] = 1.0 / (1.0 / stiffness[:, 1:] + 1.0 / far[:, :-1])
+    mass, inertia, near, b.half[:, slots] = grow.section(length, start, end, modulus, density)
     b.parent[:, slots] = parent
     b.origin[:, slots] = points[:, :-1]
-    b.turn[:, slots] = frames.aligned(along, up[:, None])
+    b.turn[:, slots] = turn = frames.aligned(along, up[:, None])
+    slack = 1.0 / near
+    slack[:, 1:] += 1.0 / b.half[:, slots][:, :-1]
+    if (parent[:, 0] >= 0).all():
+        grown_on = np.arange(len(parent)), parent[:, 0]
+        axes = frames.matrix(frames.multiply(frames.conjugate(b.turn[grown_on]), turn[:, 0]))
+        slack[:, 0] += np.einsum("si,sij->sj", 1.0 / b.half[grown_on], axes**2)
+    stiffness = 1.0 / slack
     b.length[:, slots] = length
     b.radius[:, slots] = np.stack([start, end], -1)
     b.mass[:, slots] = mass

@@ -158,7 +158,7 @@ class Tree:
         h = length / pieces
         edges = radius[0] + (radius[1] - radius[0]) * np.arange(pieces + 1) / pieces
         masses, inertias, near, far = section(h, edges[:-1], edges[1:], wood.modulus, wood.density, wood.shear)
-        above = self.bodies[parent] if parent >= 0 else {}
+        above = self.bodies[parent] if 0 <= parent < len(self.bodies) else {}
         if offset is None:
             offset = (above.get("length", 0.0), 0.0, 0.0)
         slack, damped = 1.0 / near, wood.damping / near  # [rad/N m] of the lower halves, and with the wood's damping

@@ -91,6 +91,17 @@ class Sun(_Part, frozen=True, kw_only=True):
         return level * math.cos(self.azimuth), level * math.sin(self.azimuth), math.sin(self.elevation)
 
 
+class Wind(_Part, frozen=True, kw_only=True):
+    """How the air moves; see :class:`vinesim.physics.wind.Wind`. Calm unless said."""
+
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[m/s] world axes"""
+    gusts: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
+    """Standard deviation of each component about the mean [m/s]."""
+    scale: Length = 4.0
+    """Of the gusts [m]."""
+
+
 class Spawn(_Part, frozen=True, kw_only=True):
     """A named place where a robot or a person starts, on the ground."""
 
@@ -114,6 +125,7 @@ class Scene(_Part, frozen=True, kw_only=True):
     fruit: Fruit
     boxes: tuple[Box, ...] = ()
     sun: Sun = Sun()
+    wind: Wind = Wind()
     spawns: tuple[Spawn, ...] = ()
 
 
