@@ -817,9 +817,6 @@ class Rigid:
             self._locate(robot)
         for person in self._people.values():
             person.locate(world)
-        if self._people:  # MuJoCo's solver is as exact as what it takes for the usual inertia lets it be
-            heavy = np.concatenate([person.part_dofs.ravel() for person in self._people.values()])
-            world.stat.meaninertia = np.delete(world.dof_M0, heavy).mean()
         for person in self._people.values():
             for hand in person.hands:
                 self._regrasp(person, hand)
