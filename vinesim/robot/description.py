@@ -691,7 +691,7 @@ def _check_sidecar(description: Description, driven: set[str], file: pathlib.Pat
                 )
         if (group.elastic is None) != (group.elastic_damping is None):
             raise _error(file, f"group {name!r} gives only half of its springs", "give elastic and elastic_damping")
-        if min(*(group.elastic or ()), *(group.elastic_damping or ()), 0.0) < 0.0:
+        if min((*(group.elastic or ()), *(group.elastic_damping or ()), 0.0)) < 0.0:
             raise _error(file, f"group {name!r} has a spring below zero", "give 0 or more")
         if group.tool and group.tool not in description.anchors:
             raise _error(file, f"group {name!r} has the tool {group.tool!r}", "name a link of the URDF")
