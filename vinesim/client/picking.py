@@ -39,6 +39,10 @@ RUNS = (1.1, 0.8)
 """The base comes straight along a box from so far [m]; the first that has room."""
 LANE = 0.36
 """What a base that goes straight needs on either side of its middle [m]."""
+NEIGHBOURS = 0.8
+"""What hangs nearer than this to a bunch may be in the hand's way [m]."""
+CANDIDATES = 200
+"""So many of the nearest bunches are tried."""
 GRID = 0.1
 """[m] between the points of which a way is made."""
 
@@ -69,6 +73,12 @@ def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarr
     hold = body_q[:, :3] + HOLD * axis
     fits = (hold[:, 2] > HEIGHT[0]) & (hold[:, 2] < HEIGHT[1]) & (model.bunch_radius <= WIDEST) & (axis[:, 2] < -0.95)
     bunches = np.flatnonzero(fits)
+    away = np.linalg.norm(hold[bunches, :2] - near, axis=1)
+    bunches = np.sort(bunches[np.argsort(away, kind="stable")][:CANDIDATES])
+    middle = hold[bunches].mean(0) if len(bunches) else np.zeros(3)
+    reached = np.linalg.norm(hold[bunches] - middle, axis=1).max(initial=0.0) + NEIGHBOURS
+    region = np.linalg.norm(points - middle, axis=1) < reached
+    points, radius, owner = points[region], radius[region], owner[region]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     turn = frames.yaw(heading)
     sides = np.stack([frames.rotate(turn, np.array([AHEAD, y, 0.0]))[:, :2] for y in (ASIDE, -ASIDE)], 1)
@@ -76,7 +86,7 @@ def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarr
     roomy = (free_room(model, base.reshape(-1, 2)) > ROOM).reshape(base.shape[:3])
     found = []
     for i, bunch in enumerate(bunches.tolist()):
-        here = (np.linalg.norm(points - hold[bunch], axis=1) < 0.8) & (owner != bunch)
+        here = (np.linalg.norm(points - hold[bunch], axis=1) < NEIGHBOURS) & (owner != bunch)
         low = HAND_FROM - [0.0, 0.0, max(float(model.bunch_length[bunch]) - HOLD - 0.05, 0.0)]
         looking = np.flatnonzero(roomy[i].any(1))
         local = frames.rotate(frames.conjugate(turn[looking])[:, None], points[here] - hold[bunch])
