@@ -130,9 +130,10 @@ class _Perception:
 
     def _open_eyes(self, stack: contextlib.ExitStack) -> Any:
         from vinesim.sensors.camera import Camera, CameraSpec
-        from vinesim.sensors.eyes import Eyes, Mount
+        from vinesim.sensors.eyes import Eyes, Mount, load_kernels
         from vinesim.sensors.lidar import Lidar, LidarSpec
 
+        load_kernels()
         setup, mounts = self.setup, []
         for i, place in enumerate(setup.description.cameras):
             spec = CameraSpec.load(place.type)

@@ -15,7 +15,9 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
+import warp as wp
 
+from vinesim.kernels import rays, shade, shapes, visibility
 from vinesim.sensors.camera import Camera
 from vinesim.sensors.lidar import Lidar
 from vinesim.sensors.primitives import Primitives
@@ -23,6 +25,12 @@ from vinesim.world.model import Model
 from vinesim.world.values import CameraFrame, LidarScan, View
 
 log = logging.getLogger(__name__)
+
+
+def load_kernels() -> None:
+    """Compile what pictures and scans need, or read it from the cache, before anybody waits for one."""
+    for module in (rays, shade, shapes, visibility):
+        wp.load_module(module, device="cpu")
 
 
 class Wanted(Protocol):
