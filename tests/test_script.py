@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from vinesim.physics.rigid import Rigid
@@ -15,6 +16,9 @@ from vinesim.world.grow import assemble
 
 class Story(Script):
     fails = False
+
+    def focus(self) -> np.ndarray:
+        return np.zeros(3)
 
     def steps(self) -> Iterator[str]:
         yield from self.wait(0.5, "one")

@@ -6,11 +6,15 @@
                 self.robot.command_position([angle], ["arm_left_3_joint"])
                 yield from self.wait(1.0, "wave")
 
+        def focus(self):
+            return self.robot.frame_pose(self.robot.description.groups["arm_left"].tool)[:3]
+
 What goes wrong ends the job with a reason in words.
 """
 
 from __future__ import annotations
 
+import abc
 import logging
 from collections.abc import Iterator
 from typing import Any
@@ -26,7 +30,7 @@ class Failed(Exception):
     """The job cannot go on; the text says why."""
 
 
-class Script:
+class Script(abc.ABC):
     """Runs :meth:`steps` one tick at a time. ``reason`` is empty as long as all goes well."""
 
     def __init__(self, robot: Robot, *, seconds: float) -> None:
@@ -54,13 +58,13 @@ class Script:
         phases = {phase: round(seconds, 2) for phase, seconds in self.durations.items()}
         return {"succeeded": self.succeeded, "reason": self.reason, "phase": self.phase, "phases_s": phases}
 
+    @abc.abstractmethod
     def focus(self) -> np.ndarray:
         """What to look at [3] m in the world."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def steps(self) -> Iterator[str]:
         """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`Failed`."""
-        raise NotImplementedError
 
     def control(self, time: float) -> None:
         """Command the robot for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
