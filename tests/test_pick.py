@@ -53,6 +53,12 @@ def awake(physics: Physics) -> None:
     physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
+def picker(physics: Physics, description: Description, pose: np.ndarray) -> Robot:
+    robot = Robot(physics.rigid, description, "anna", pose=pose)
+    robot.fit_cutters(physics)
+    return robot
+
+
 def run(pick: Pick) -> Pick:
     while not pick.done:
         pick.control(pick.physics.time)
@@ -64,7 +70,7 @@ def run(pick: Pick) -> Pick:
 def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(vinebot: Description):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = Robot(physics.rigid, vinebot, "anna", pose=task.stand)
+    robot = picker(physics, vinebot, task.stand)
     awake(physics)
     body = model.bunch_body[task.bunch]
     physics.plants.wake(int(model.body_tree[body]))
@@ -100,17 +106,19 @@ def test_a_bunch_out_of_reach_is_told_in_words(vinebot: Description):
     model, task = vineyard(7)
     far = frames.compose(task.stand, frames.pose([-0.8, 0.0, 0.0]))
     physics = Physics(model)
-    pick = run(Pick(physics, Robot(physics.rigid, vinebot, "anna", pose=far), task))
+    pick = run(Pick(physics, picker(physics, vinebot, far), task))
     assert not pick.picked
     assert pick.reason.startswith("reach: the hand is 0.")
     assert "out of reach" in pick.reason
     assert physics.state.bunch_attached.all()
 
 
-def test_a_blade_that_does_not_cut_is_told_in_words(vinebot: Description):
+def test_a_blade_that_does_not_cut_is_told_in_words(vinebot: Description, monkeypatch: pytest.MonkeyPatch):
     model, task = vineyard(7)
     physics = Physics(model)
-    pick = run(Pick(physics, Robot(physics.rigid, vinebot, "anna", pose=task.stand), task, cut=lambda: None))
+    robot = picker(physics, vinebot, task.stand)
+    monkeypatch.setattr(robot, "command_cutter", lambda group: None)
+    pick = run(Pick(physics, robot, task))
     assert not pick.picked
     assert pick.reason.startswith("cut: the blade closed beside the stalk")
     assert physics.state.bunch_attached.all()
@@ -120,7 +128,7 @@ def test_a_bunch_that_is_gone_is_told_in_words(vinebot: Description):
     """The fingers close where nothing is: what hung there fell before."""
     model, task = vineyard(7)
     physics = Physics(model)
-    pick = Pick(physics, Robot(physics.rigid, vinebot, "anna", pose=task.stand), task)
+    pick = Pick(physics, picker(physics, vinebot, task.stand), task)
     while pick.phase != "advance":
         pick.control(physics.time)
         pick.robot.control(physics.time)
@@ -132,8 +140,7 @@ def test_a_bunch_that_is_gone_is_told_in_words(vinebot: Description):
 def test_a_robot_without_a_cutter_is_refused(vinebot: Description):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = Robot(physics.rigid, vinebot, "anna", pose=task.stand)
-    robot.description = dataclasses.replace(vinebot, anchors={"base_link": vinebot.anchors["base_link"]})
+    robot = picker(physics, dataclasses.replace(vinebot, cutters=()), task.stand)
     with pytest.raises(CommandError, match="no gripper with a cutter on its"):
         Pick(physics, robot, task)
 
@@ -143,7 +150,7 @@ def test_the_same_pick_twice_is_the_same_to_the_bit(vinebot: Description):
     for _ in range(2):
         model, task = vineyard(7)
         physics = Physics(model)
-        pick = Pick(physics, Robot(physics.rigid, vinebot, "anna", pose=task.stand), task)
+        pick = Pick(physics, picker(physics, vinebot, task.stand), task)
         while pick.phase != "tuck":
             pick.control(physics.time)
             pick.robot.control(physics.time)

@@ -27,8 +27,6 @@ from vinesim.robot.hand import Hand, axes_of
 from vinesim.robot.script import Failed, Script
 from vinesim.robot.way import Way
 
-MOUTH = np.array([0.025, 0.020, 0.004])
-"""Half edges of the mouth of vinebot's cutter [m]."""
 STUMP = 0.012
 """So much of the stalk stays on the bunch [m]."""
 SLACK = 0.015
@@ -78,28 +76,20 @@ class Task:
 class Pick(Script):
     """One bunch from its vine into a box; ``done``, ``picked`` and ``reason`` say how it went."""
 
-    def __init__(
-        self,
-        physics: Physics,
-        robot: Robot,
-        task: Task,
-        *,
-        cut: Callable[[], None] | None = None,
-        seconds: float = 90.0,
-    ) -> None:
-        """``cut`` closes the blade of that hand; a blade of :data:`MOUTH` on its cutter link unless given."""
+    def __init__(self, physics: Physics, robot: Robot, task: Task, *, seconds: float = 90.0) -> None:
+        """``robot`` has been fitted with its cutters (:meth:`Robot.fit_cutters`)."""
         super().__init__(robot, seconds=seconds)
         self.physics, self.task = physics, task
         self.hand = Hand(robot, task.side)
-        if not self.hand.gripper or f"{self.hand.gripper}_cutter_link" not in robot.description.anchors:
+        cutter = next((c for c in robot.description.cutters if c.group == self.hand.gripper), None)
+        if cutter is None:
             raise CommandError(f"{robot.name} has no gripper with a cutter on its {task.side} arm; give one that has")
-        cutter = f"{self.hand.gripper}_cutter_link"
-        self._cut = cut or physics.blade(robot.name, cutter, frames.pose(np.zeros(3)), MOUTH).close
+        self._cutter = cutter.frame
         model, bunch = physics.model, task.bunch
         self._body = int(model.bunch_body[bunch])
         self._length, self._radius = float(model.bunch_length[bunch]), float(model.bunch_radius[bunch])
         self._fingers = robot.description.indices(self.hand.gripper)
-        above = np.linalg.norm(robot.frame_pose(cutter)[:3] - robot.frame_pose(self.hand.tool)[:3])
+        above = np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.hand.tool)[:3])
         self._depth = min(float(above) - STUMP, 0.6 * self._length)
         """How far below its upper end the bunch is held [m]."""
         self._up = np.array([0.0, 0.0, 1.0])
@@ -183,7 +173,7 @@ class Pick(Script):
     def _part(self) -> Iterator[str]:
         """Close the blade, again if it caught nothing."""
         for _ in range(5):
-            self._cut()
+            self.robot.command_cutter(self.hand.gripper)
             yield "cut"
             if not self.physics.state.bunch_attached[self.task.bunch]:
                 return
@@ -267,7 +257,7 @@ class Pick(Script):
 
     def _mouth(self) -> str:
         """Where the stalk is in the cutter's axes, in words."""
-        cutter = self.robot.frame_pose(f"{self.hand.gripper}_cutter_link")
+        cutter = self.robot.frame_pose(self._cutter)
         stalk = frames.compose(frames.inverse(cutter), self.bunch_pose)[:3]
         return "its lower end is at ({:.3f}, {:.3f}, {:.3f}) m in the mouth".format(*stalk)
 
