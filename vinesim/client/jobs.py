@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import logging
 from collections.abc import Callable, Iterable
@@ -16,7 +15,8 @@ from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.exchange import Exchange, Swap
 from vinesim.robot.pick import Pick
 from vinesim.robot.script import Script
-from vinesim.ros.types import BaseVelocity, Command, JointPositions, JointTrajectory
+from vinesim.robot.trajectory import Trajectory, TrajectoryController
+from vinesim.ros.types import BaseVelocity, Command, JointPositions
 from vinesim.world.model import Model
 
 log = logging.getLogger(__name__)
@@ -111,16 +111,8 @@ class LookAt:
         robot.command_position(robot.setpoint[self._joints] + self.EVERY * robot.rigid.dt * rate, self._joints)
 
 
-@dataclasses.dataclass
-class _Running:
-    trajectory: JointTrajectory
-    start: float
-    joints: np.ndarray
-    origin: np.ndarray
-
-
 class Obey:
-    """Do what ROS asks: drive the base, hold joint positions, follow trajectories (linear between their points)."""
+    """Do what ROS asks: drive the base, hold joint positions, follow trajectories (straight between their points)."""
 
     def __init__(self, robot: Robot, commands: Callable[[], Iterable[Command]]) -> None:
         """``commands`` returns what was asked since the last call."""
@@ -128,7 +120,7 @@ class Obey:
         self.refused = 0
         """Commands that no joint of this robot can take."""
         self._commands = commands
-        self._running: dict[str, _Running] = {}
+        self._controllers: dict[str, TrajectoryController] = {}
 
     def __call__(self, time: float) -> None:
         for command in self._commands():
@@ -138,24 +130,23 @@ class Obey:
                 self.refused += 1
                 if self.refused == 1:
                     log.warning("refused a command, further ones are only counted: %s", error)
-        for controller, running in list(self._running.items()):
-            t, points = time - running.start, running.trajectory
-            knots = np.concatenate([[0.0], points.times])
-            way = np.concatenate([running.origin[None], points.positions])
-            self.robot.command_position([np.interp(t, knots, column) for column in way.T], running.joints)
-            if t >= knots[-1]:
-                del self._running[controller]
+        for controller in self._controllers.values():
+            controller(time)
 
     def _take(self, command: Command, time: float) -> None:
         robot = self.robot
         if isinstance(command, BaseVelocity):
             robot.command_base(float(command.linear[0]), float(command.angular[2]), time)
         elif isinstance(command, JointPositions):
-            self._running.clear()
+            for controller in self._controllers.values():
+                controller.cancel()
             robot.command_position(command.positions)
-        elif not len(command.times):
-            self._running.pop(command.controller, None)
         else:
-            joints = robot.joint_indices(command.joints)
-            start = max(command.time, time) if command.time > 0.0 else time
-            self._running[command.controller] = _Running(command, start, joints, robot.setpoint[joints].copy())
+            if command.controller not in self._controllers:
+                self._controllers[command.controller] = TrajectoryController(robot, robot.description.joints)
+            controller = self._controllers[command.controller]
+            if len(command.times):
+                way = Trajectory(command.joints, command.times, command.positions, start=command.time)
+                controller.start(way, time)
+            else:
+                controller.cancel()
