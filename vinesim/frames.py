@@ -112,6 +112,12 @@ def yaw(angle: float | np.ndarray) -> np.ndarray:
     return np.stack([zero, zero, np.sin(half), np.cos(half)], -1)
 
 
+def heading(q: np.ndarray) -> float:
+    """Where the x axis of a rotation [4] points, seen from above [rad]: of :func:`yaw` the inverse."""
+    x, y, z, w = q
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
 def aligned(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np.ndarray:
     """Quaternion whose x axis points along ``x`` and whose z axis leans to ``up`` (to y if they are parallel)."""
     ex = normalize(np.asarray(x, float))

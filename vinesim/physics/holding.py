@@ -40,6 +40,8 @@ class _Grip:
     tie: int
     point: np.ndarray
     """[3] in the body's frame."""
+    bunch: int
+    """Which bunch the body is, -1 if it is none."""
 
 
 class Holding:
@@ -131,8 +133,9 @@ class Holding:
             self.plants.wake(self.plants.model.body_tree[body])
             pose = self.plants.state.body_q[body].astype(float)
             hand.grip = frames.compose(frames.inverse(pose), palm)
+            bunch = np.flatnonzero(self.plants.model.bunch_body == body)
             tie = self.plants.hold(body, hand.grip[:3], person.spec.stiffness, person.damping)
-            self._grips[key] = _Grip(body, tie, hand.grip[:3].copy())
+            self._grips[key] = _Grip(body, tie, hand.grip[:3].copy(), next(iter(bunch.tolist()), -1))
             self.rigid.ride(*key, body)
         elif rigid is not None:
             self.rigid.hold(*key, *rigid[1:])
@@ -161,9 +164,7 @@ class Holding:
 
     def _torn(self, grip: _Grip) -> bool:
         """Whether a held bunch is no longer there: picked by other means."""
-        model, state = self.plants.model, self.plants.state
-        bunch = np.flatnonzero(model.bunch_body == grip.body)
-        return len(bunch) > 0 and not state.bunch_attached[bunch[0]]
+        return grip.bunch >= 0 and not self.plants.state.bunch_attached[grip.bunch]
 
     def _drop(self, key: tuple[str, str]) -> None:
         grip = self._grips.pop(key, None)

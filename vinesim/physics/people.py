@@ -398,14 +398,14 @@ class Person:
             m.eq_data[hand.weld, :3], m.eq_data[hand.weld, 3:6] = hand.grip[:3], 0.0
             m.eq_data[hand.weld, 6:10] = frames.to_wxyz(frames.conjugate(hand.grip[3:]))
             m.eq_data[hand.weld, 10] = 1.0
-            _rouse(m, d, body)
+            rouse(m, d, body)
         self._touchable(m, hand, yes=False)
 
     def release(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand) -> None:
         """Open a hand; it hangs on its spring a little longer and then returns to its controller."""
         hand.holds, hand.rides, hand.free = None, False, 0
         if d.eq_active[hand.weld]:
-            _rouse(m, d, m.eq_obj2id[hand.weld])
+            rouse(m, d, m.eq_obj2id[hand.weld])
         d.eq_active[hand.weld] = 0
         self._touchable(m, hand, yes=True)
 
@@ -425,7 +425,7 @@ def _add(body: mujoco.MjsBody, shape: Shape, contype: int, conaffinity: int, fri
     )  # fmt: skip
 
 
-def _rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
+def rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
     """Wake a body: MuJoCo does when the two arrays that it keeps of sleep disagree.
 
     One that is awake but still, as what is held is, would fall asleep in the very tick in which it is let go.

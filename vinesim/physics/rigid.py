@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.people import HAND, PARTS, ROUSED, Hand, HumanError, Person, figure, hand_shapes
+from vinesim.physics.people import HAND, PARTS, ROUSED, Hand, HumanError, Person, figure, hand_shapes, rouse
 from vinesim.physics.urdf import RobotError, check, shapes_of, touchable
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
@@ -243,7 +243,7 @@ class Rigid:
             target_velocity=np.zeros(len(spec.drives)),
             forward=np.zeros(len(spec.drives)),
             control=np.zeros(len(spec.drives)),
-            base_target=np.array([pose[0], pose[1], _yaw(pose)]),
+            base_target=np.array([pose[0], pose[1], frames.heading(pose[3:])]),
             base_velocity=np.zeros(3),
             tracks=_tracks(spec),
             exact=np.zeros(len(spec.drives), bool),
@@ -266,7 +266,7 @@ class Rigid:
         """Put a robot somewhere, at rest and asking for nothing else: base ``pose`` [7], ``position`` [joint]."""
         robot, pose = self._robot(name), np.asarray(pose, float)
         robot.target[:] = self.data.qpos[robot.q] = position
-        robot.base_target[:] = self.data.qpos[robot.base_q] = pose[0], pose[1], _yaw(pose)
+        robot.base_target[:] = self.data.qpos[robot.base_q] = pose[0], pose[1], frames.heading(pose[3:])
         self.data.qvel[robot.v] = self.data.qvel[robot.base_v] = 0.0
         robot.target_velocity[:] = robot.base_velocity[:] = 0.0
         robot.control[:] = robot.stiffness * robot.target + robot.forward
@@ -388,7 +388,7 @@ class Rigid:
         joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(turn)])
         joint.qvel[:3] = velocity[:3]
         joint.qvel[3:] = frames.rotate(frames.conjugate(turn), np.asarray(velocity[3:], float))
-        self._rouse(self._slot[bunch])
+        rouse(self.world, self.data, self.world.body(f"loose/{self._slot[bunch]}").id)
         self._fresh = False
 
     def remove_bunch(self, bunch: int) -> None:
@@ -453,7 +453,7 @@ class Rigid:
         robot = self._robot(name)
         base_q, base_qd = np.asarray(base_q, float), np.asarray(base_qd, float)
         self.command(name, position, velocity)
-        yaw = _yaw(base_q)
+        yaw = frames.heading(base_q[3:])
         turns = np.round((self.data.qpos[robot.base_q[2]] - yaw) / (2.0 * np.pi))
         robot.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
         c, s = np.cos(yaw), np.sin(yaw)
@@ -865,10 +865,6 @@ class Rigid:
             getattr(m, name)[volumes] = getattr(alone, name)
         m.bvh_nodeid[volumes] = np.where(alone.bvh_nodeid >= 0, alone.bvh_nodeid + geoms.start, -1)
 
-    def _rouse(self, slot: int) -> None:
-        """Wake a body: MuJoCo does when the two arrays that it keeps of sleep disagree."""
-        self.data.tree_awake[self.world.body_treeid[self.world.body(f"loose/{slot}").id]] = 1
-
     def _untouch(self, slot: int) -> None:
         """Let nothing touch a waiting body."""
         m = self.world
@@ -1002,12 +998,6 @@ class _Block:
 def _unfit(spec: RobotSpec, error: ValueError) -> RobotError:
     """What MuJoCo says against a robot, in one line."""
     return RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {' '.join(str(error).split())}")
-
-
-def _yaw(pose: np.ndarray) -> float:
-    """Heading of a pose [7] [rad]."""
-    x, y, z, w = pose[3:]
-    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
 def _scene(model: Model, dt: float) -> mujoco.MjSpec:
