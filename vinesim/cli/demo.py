@@ -308,10 +308,15 @@ def watch(
 
 
 def _line(status: dict[str, Any]) -> str:
-    return (
+    how = (
         f"{status['time']:6.1f} s  {status['tick_hz']:6.2f} Hz  p99 {status['tick_p99_ms']:5.2f} ms  "
-        f"awake {status['awake']:3d}  force {status['force']:6.2f} N  moved {status['displacement_mm']:6.1f} mm  "
-        f"out {status['bytes_out']:7d} B  env {status['environment_bytes_out']:6d} B"
+        f"awake {status['awake']:3d}  force {status['force']:6.2f} N  "
+    )
+    if status["phase"]:
+        return how + status["phase"]
+    return how + (
+        f"moved {status['displacement_mm']:6.1f} mm  out {status['bytes_out']:7d} B  "
+        f"env {status['environment_bytes_out']:6d} B"
     )
 
 
@@ -329,6 +334,8 @@ def _table(newest: dict[str, dict[str, Any]]) -> Table:
     )  # fmt: skip
     for label, key, form in rows:
         table.add_row(label, *(format(status[key], form) for status in newest.values()))
+    if any(status["phase"] for status in newest.values()):
+        table.add_row("job", *(status["phase"] for status in newest.values()))
     for topic in sorted({topic for status in newest.values() for topic in status["topics"]}):
         table.add_row(topic, *(f"{status['topics'].get(topic, 0.0):.1f} Hz" for status in newest.values()))
     return table

@@ -127,10 +127,11 @@ def run(
         if job is not None:
             script = begin(client.physics, client.robot)
             client.jobs.append(script.control)
+            client.worth = script.worth
             client.jobs.append(LookAt(client.robot, script.focus))
         elif client.trace is not None:
             client.jobs.append(LookAt(client.robot, client.trace.centre))
-        reporter = Status(client, pace, senses.sent)
+        reporter = Status(client, pace, senses.sent, script)
         speaker = threading.Thread(target=_speak, args=(reporter, senses, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)

@@ -82,6 +82,8 @@ class Client:
         """Called every tick with the simulation time, before the drives: what the robot is to do."""
         self.senses: list[Callable[[Client], None]] = []
         """Called every tick after the step: ROS, cameras, whoever wants to know."""
+        self.worth: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
+        """How much there is to see now: of the pictures, that of the greatest moment is kept."""
         self.trace: Trace | None = None
         """If set, what happens to one bunch is noted in it."""
         self.far = Faraway()

@@ -64,8 +64,8 @@ class Letter:
     links: tuple[Link, ...] | None
     link_q: np.ndarray | None
     poses: dict[str, np.ndarray] | None
-    displacement: float
-    """Of the watched bunch [m]."""
+    worth: float
+    """How much there is to see: see ``Client.worth``."""
 
 
 def perceive(setup: Setup, mailbox: Mailbox, pipe: Connection) -> None:
@@ -99,7 +99,7 @@ class _Perception:
         self._links: tuple[Link, ...] = ()
         self._kept: CameraFrame | None = None
         self._greatest = -1.0
-        self._displacement = 0.0
+        self._worth = 0.0
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(len(setup.model.bunch_body)))
         self._names: tuple[str, ...] = self._bunch_names
         self._next_figures = 0.0
@@ -168,7 +168,7 @@ class _Perception:
                     self.node.publish_diagnostics(time, value, healthy=value["real_time_factor"] > 0.99)
 
     def _read(self, letter: Letter) -> None:
-        self._displacement = letter.displacement
+        self._worth = letter.worth
         if letter.bodies is not None:
             self._state.body_q[letter.bodies] = letter.body_q
         if letter.links is not None:
@@ -218,8 +218,8 @@ class _Perception:
         assert isinstance(frame, CameraFrame)
         if self.node is not None:
             self.node.publish_camera(frame)
-        if self.setup.keep_pictures and frame.name == self.eyes.mounts[0].name and self._displacement >= self._greatest:
-            self._greatest, self._kept = self._displacement, frame
+        if self.setup.keep_pictures and frame.name == self.eyes.mounts[0].name and self._worth >= self._greatest:
+            self._greatest, self._kept = self._worth, frame
 
     def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
         assert isinstance(scan, LidarScan)

@@ -108,7 +108,7 @@ class Senses:
 
     def _every_tick(self, client: Client) -> None:
         self._listen()
-        physics, trace = client.physics, client.trace
+        physics = client.physics
         self._moved[physics.plants.awake] = True
         looks = self._figures["eyes"] and physics.tick % VIEW_TICKS == 0
         truth = self._figures.get("truth", False) and physics.tick % 10 == 0
@@ -127,7 +127,7 @@ class Senses:
             number=self._letters + 1, tick=physics.tick, time=physics.time,
             sample=self.robot.sample(physics.time, physics.contacts),
             bodies=bodies, body_q=body_q, trees=trees, attached=np.packbits(physics.state.bunch_attached),
-            links=links, link_q=link_q, poses=poses, displacement=0.0 if trace is None else trace.displacement,
+            links=links, link_q=link_q, poses=poses, worth=client.worth(),
         )  # fmt: skip
         if self._mailbox.put(pickle.dumps(letter, pickle.HIGHEST_PROTOCOL)):
             self._letters += 1

@@ -10,14 +10,15 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.pace import Pace
 from vinesim.client.trace import touch_to_motion
+from vinesim.robot.script import Script
 
 
 class Status:
     """Figures of a running client. Reads what the tick leaves behind; may be asked from another thread."""
 
-    def __init__(self, client: Client, pace: Pace, sent: Any = None) -> None:
-        """``sent`` gives the number of messages sent so far by ROS topic, if there is a node."""
-        self.client, self.pace = client, pace
+    def __init__(self, client: Client, pace: Pace, sent: Any = None, script: Script | None = None) -> None:
+        """``sent`` gives the number of messages sent so far by ROS topic, if there is a node; ``script``: the job."""
+        self.client, self.pace, self._script = client, pace, script
         self._sent = sent or (dict)
         self._before: dict[str, int] = {}
         self._before_time = 0.0
@@ -48,6 +49,7 @@ class Status:
             "bytes_out": sum(family.bytes_out for family in families),
             "environment_bytes_in": traffic.environment.bytes_in,
             "environment_bytes_out": traffic.environment.bytes_out,
+            "phase": "" if self._script is None else self._script.phase,
             "others": sorted(client.others),
             "topics": rates,
         }

@@ -76,6 +76,8 @@ class Task:
 class Pick(Script):
     """One bunch from its vine into a box; ``done``, ``picked`` and ``reason`` say how it went."""
 
+    shown = frozenset({"cut", "back"})
+
     def __init__(self, physics: Physics, robot: Robot, task: Task, *, seconds: float = 90.0) -> None:
         """``robot`` has been fitted with its cutters (:meth:`Robot.fit_cutters`)."""
         super().__init__(robot, seconds=seconds)

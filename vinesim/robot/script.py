@@ -33,6 +33,9 @@ class Failed(Exception):
 class Script(abc.ABC):
     """Runs :meth:`steps` one tick at a time. ``reason`` is empty as long as all goes well."""
 
+    shown: frozenset[str] = frozenset()
+    """Phases of which a picture tells most."""
+
     def __init__(self, robot: Robot, *, seconds: float) -> None:
         """Given up after ``seconds`` [s]."""
         self.robot, self.seconds = robot, seconds
@@ -52,6 +55,10 @@ class Script(abc.ABC):
     def succeeded(self) -> bool:
         """Whether it came to its end."""
         return self.done and not self.reason
+
+    def worth(self) -> float:
+        """How much there is to see now, from 0 to 1."""
+        return float(self.phase in self.shown)
 
     def report(self) -> dict[str, Any]:
         """How it went, as plain values for JSON."""
