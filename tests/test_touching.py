@@ -520,8 +520,6 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
     met = {}
     for fine in (False, True):
         physics = Physics(model)
-        hand = physics.rigid.link_pose if False else None
-        assert hand is None
         if fine:
             physics.plants.refine(0)
         at = physics.state.body_q[bunch, :3] + np.array([0.0, -0.075, -0.06])
@@ -622,7 +620,7 @@ def test_waking_is_never_late(seed):
     model = assemble([cane((1.2 * (i % 3), 0.25 * (i // 3), 1.0), radius=0.005) for i in range(24)])
     physics = Physics(model)
     physics.add_robot(bar((rng.uniform(0.0, 3.0), rng.uniform(-1.0, 1.0), rng.uniform(0.8, 1.2)), damping=2000.0))
-    speed, woken, touched = 0.0, set(), 0
+    speed, woken, touched = 0.0, set(), set()
     for tick in range(120):
         if tick % 20 == 0:
             speed = float(rng.uniform(-5.0, 5.0))
@@ -633,21 +631,22 @@ def test_waking_is_never_late(seed):
         still = asleep & ~physics.state.tree_awake
         gap = gaps(physics, "bar", "bar", 0.03, 0.3, np.array([0.0, 0.0, 1.0]))
         assert gap[still].min(initial=np.inf) > 0.0
-        touched += int((gap < 0.002).any())
+        touched |= set(np.flatnonzero(gap < 0.0).tolist())
         woken |= set(physics.plants.awake.tolist())
-    assert touched == 0 or woken
+    assume(touched)
+    assert touched <= woken
 
 
 def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
     """Many canes in one place about one bar: what is left out is said in words, twice the same."""
-    model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, heading=1e-4 * i) for i in range(170)])
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, heading=4e-5 * i) for i in range(460)])
 
     def run() -> tuple:
         physics = Physics(model)
         Touching.__init__(physics.touching, model, physics.plants, physics.rigid, capacity=100, branches=False)
         for i in range(15):
             physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
-        physics.plants.wake(np.arange(170))
+        physics.plants.wake(np.arange(460))
         for stage in (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve):
             stage()
         t = physics.touching
@@ -655,8 +654,9 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
 
     count, dropped, complaint, gap, result, touching = run()
     assert count == 100
-    assert count + dropped > 10_000 or dropped > 2000
+    assert count + dropped > 10_000
     assert f"{dropped} of {count + dropped} contacts" in complaint
-    everything = np.sort(touching._hit_gap[:170].ravel()[np.flatnonzero(touching._slot < touching._found[:170, None])])
+    seen = np.flatnonzero(touching._slot < touching._found[:460, None])
+    everything = np.sort(touching._hit_gap[:460].ravel()[seen])
     np.testing.assert_array_equal(np.sort(gap), everything[:100])
     assert run()[4] == result

@@ -73,7 +73,10 @@ class TestDemo:
         assert rgb.std() > 10.0
         depth = cv2.imread(str(out / "depth_mm.png"), cv2.IMREAD_UNCHANGED)
         assert depth.dtype == np.uint16
-        assert 300 < np.median(depth[depth > 0]) < 10_000
+        seen = depth[depth > 0]
+        assert seen.size > 0.5 * depth.size
+        assert seen.min() >= 175 and seen.max() <= 10_000  # what a D435 can measure
+        assert np.percentile(seen, 90) > 1000  # however near an arm stands, vineyard behind it
         for name in ("labels.png", "depth.png", "touch.png"):
             assert cv2.imread(str(out / name)) is not None
 
