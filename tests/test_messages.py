@@ -14,6 +14,7 @@ from vinesim import frames
 from vinesim.net import messages
 from vinesim.net.authority import Claim
 from vinesim.net.messages import Hello, MessageError, Trees, WrongVersion
+from vinesim.world import ids
 from vinesim.world.values import RobotUpdate
 
 
@@ -257,3 +258,41 @@ def test_damaged_messages_raise_nothing_else(data):
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     hold(bytes(payload[: data.draw(st.integers(0, len(payload)))]) if data.draw(st.booleans()) else bytes(payload))
+
+
+def fact(**change) -> messages.Fact:
+    usual = {"thing": ids.thing(ids.Kind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
+    return messages.Fact(**{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change})
+
+
+def test_facts_come_back_as_they_were_said():
+    told = [fact(), fact(thing=ids.thing(ids.Kind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
+    heard = messages.decode_facts(messages.encode_facts(told))
+    assert heard == told
+    assert heard[0].claim == Claim(3, 65535, "picker")
+    assert ids.unthing(heard[0].thing) == (ids.Kind.BUNCH, 17)
+    assert messages.kind_of(messages.encode_facts(told)) == messages.FACTS
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"thing": 3 * ids.THING_STRIDE}, "of no kind"),
+        ({"thing": -1}, "of no kind"),
+        ({"authority": 65536}, "with claim"),
+        ({"author": "a/b"}, "fact by 'a/b'"),
+        ({"pose": (np.nan, 0, 0, 0, 0, 0, 1.0)}, "not finite"),
+        ({"pose": (0, 0, 2e5, 0, 0, 0, 1.0)}, "too far away"),
+        ({"pose": (0, 0, 0, 0, 0, 0, 0.5)}, "no unit quaternion"),
+        ({"cut": (-1,)}, "cannot be"),
+        ({"parent": "x" * 201}, "cannot be"),
+    ],
+)
+def test_a_fact_that_cannot_be_is_refused_in_words(change, words):
+    with pytest.raises(MessageError, match=words):
+        messages.decode_facts(messages.encode_facts([fact(**change)]))
+
+
+def test_too_many_facts_are_refused():
+    with pytest.raises(MessageError, match="at most 4096"):
+        messages.decode_facts(messages.encode_facts([fact()] * 4097))

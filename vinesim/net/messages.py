@@ -20,13 +20,14 @@ import msgspec
 import numpy as np
 
 from vinesim.net.authority import Claim
+from vinesim.world.ids import THING_STRIDE, Kind
 from vinesim.world.values import RobotUpdate, TreeUpdate
 
 PROTOCOL = 1
 """Version of everything in this file. Others are refused."""
 
 MAGIC = b"VS"
-ROBOT, TREES, CLAIMS, HELLO, TIME = 1, 2, 3, 16, 17
+ROBOT, TREES, CLAIMS, FACTS, HELLO, TIME = 1, 2, 3, 4, 16, 17
 """Kinds of message."""
 
 SAMPLE = 1100
@@ -50,6 +51,9 @@ TOUCHED, RESTING = 1, 2
 MAX_JOINTS = 256
 MAX_TREES = 4096
 MAX_BODIES = 1 << 16
+MAX_FACTS = 4096
+FARTHEST = 1e5
+"""Nothing lies farther from the origin than this [m]."""
 
 _HEAD = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
 _BASE = struct.Struct("<3f3h6h")  # position, turn, velocity; then all joint positions f4, all joint velocities i2
@@ -92,6 +96,33 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Index of its label in label images."""
     joints: int = -1
     """How many joints its updates carry; -1 leaves it open until the first one."""
+
+
+class Fact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """What stays true when its author has gone: a bunch or a box lies somewhere, a tree was cut.
+
+    Facts travel once, reliably, and the server keeps the greatest of each thing for those who come later.
+    """
+
+    thing: int
+    """:func:`vinesim.world.ids.thing`"""
+    ownership: int
+    authority: int
+    """The author's claim when it was said, u16 sequences."""
+    author: str
+    pose: tuple[float, float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    """Where a bunch or a box lies [m, 1], in the frame of ``parent``."""
+    parent: str = ""
+    """What it rides on: ``box/3`` or a robot's ``actor/link``; empty: the ground."""
+    cut: tuple[int, ...] = ()
+    """Bodies of the tree that were cut off their parents, in increasing order."""
+    trees: bytes = b""
+    """The tree's state as a message of one tree, :func:`encode_trees`."""
+
+    @property
+    def claim(self) -> Claim:
+        """By which facts about one thing are ordered."""
+        return Claim(self.ownership, self.authority, self.author)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -198,6 +229,7 @@ def _unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decod
 _encoder = msgspec.msgpack.Encoder()
 _hello_decoder = msgspec.msgpack.Decoder(Hello)
 _claims_decoder = msgspec.msgpack.Decoder(list[tuple[int, int, int, str, bool]])
+_facts_decoder = msgspec.msgpack.Decoder(list[Fact])
 _time_decoder = msgspec.msgpack.Decoder(tuple[float, float])
 
 # ---------------------------------------------------------------- actors
@@ -396,6 +428,30 @@ def decode_claims(payload: bytes, tree_count: int | None = None) -> list[tuple[i
     return [
         (tree, Claim(ownership, authority, owner), touching) for tree, ownership, authority, owner, touching in rows
     ]
+
+
+def encode_facts(facts: list[Fact]) -> bytes:
+    """Facts as their author, or the server that kept them, tells them."""
+    return _pack(FACTS, facts)
+
+
+def decode_facts(payload: bytes) -> list[Fact]:
+    """Facts, each checked as far as that is possible without the vineyard: numbers, names, poses, sizes."""
+    facts = _unpack(payload, FACTS, "facts", _facts_decoder)
+    if len(facts) > MAX_FACTS:
+        raise MessageError(f"{len(facts)} facts in one message, at most {MAX_FACTS}")
+    for fact in facts:
+        if not 0 <= fact.thing < len(Kind) * THING_STRIDE:
+            raise MessageError(f"fact about thing {fact.thing}, which is of no kind")
+        if not (0 <= fact.ownership < 1 << 16 and 0 <= fact.authority < 1 << 16 and valid_name(fact.author)):
+            raise MessageError(f"fact by {fact.author[:60]!r} with claim ({fact.ownership}, {fact.authority})")
+        if not all(-FARTHEST < number < FARTHEST for number in fact.pose):
+            raise MessageError(f"fact about thing {fact.thing} at {fact.pose}, not finite or too far away")
+        if not 0.95 < math.hypot(*fact.pose[3:]) < 1.05:
+            raise MessageError(f"fact about thing {fact.thing} with orientation {fact.pose[3:]}, no unit quaternion")
+        if len(fact.parent) > 200 or len(fact.cut) > MAX_BODIES or any(body < 0 for body in fact.cut):
+            raise MessageError(f"fact about thing {fact.thing} with a parent or cuts that cannot be")
+    return facts
 
 
 def encode_time(asked: float, server: float = 0.0) -> bytes:

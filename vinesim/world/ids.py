@@ -27,6 +27,29 @@ class Organ(enum.IntEnum):
     HUMAN = 12
 
 
+class Kind(enum.IntEnum):
+    """What can be owned and moved by somebody, and is known to all clients by the same number."""
+
+    TREE = 0
+    BUNCH = 1
+    """Once it has left its vine; while it hangs it is part of its tree."""
+    BOX = 2
+
+
+THING_STRIDE = 1 << 24
+"""A thing is numbered ``kind * THING_STRIDE + index``: trees come first, by their own numbers."""
+
+
+def thing(kind: Kind, index: int) -> int:
+    """The number of a tree, a loose bunch or a box among all things; index counts each kind from 0."""
+    return int(kind) * THING_STRIDE + index
+
+
+def unthing(value: int) -> tuple[Kind, int]:
+    """Kind and index of a thing; :class:`ValueError` for a number of no kind."""
+    return Kind(value // THING_STRIDE), value % THING_STRIDE
+
+
 LABEL_STRIDE = 1 << 20
 """Label images hold ``organ * LABEL_STRIDE + index``: organ and instance in one int32."""
 
