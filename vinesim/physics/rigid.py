@@ -119,7 +119,7 @@ class Rigid:
         return person.sample(person.hand(side), self.data)
 
     def hold(self, name: str, side: str, actor: str, link: str) -> None:
-        """Let a hand hold a link of an actor, a box or a loose bunch, as :class:`geoms.Geoms` names it, where it is now."""
+        """Let a hand hold a link of an actor, a box or a bunch where it is now; names are those of ``geoms.Geoms``."""
         person, body = self.person(name), self._body_of(actor, link)
         hand = person.hand(side)
         self.refresh()
