@@ -21,10 +21,13 @@ from vinesim.net import authority, interest, messages, smooth
 from vinesim.net.authority import NOBODY, UNTOUCHED, Claim
 from vinesim.net.bus import EVERY, NEWEST, RECENT, Bus, Publisher, Subscription
 from vinesim.net.clock import WINDOW, Clock, Ping
+from vinesim.net.forces import Forces
 from vinesim.net.interest import Cell
 from vinesim.net.messages import Hello, MessageError, Trees
+from vinesim.net.motion import Actor
+from vinesim.net.poses import decode_pose, encode_pose
 from vinesim.world.model import Model
-from vinesim.world.values import RobotUpdate, TreeUpdate
+from vinesim.world.values import HumanUpdate, RobotUpdate, TreeUpdate
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +78,8 @@ class Counters:
     """Moving trees."""
     event: Traffic = dataclasses.field(default_factory=Traffic)
     """Claims, corrections and rest."""
+    force: Traffic = dataclasses.field(default_factory=Traffic)
+    """What hands do to robots of other clients."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
     """Greetings and clock (received only)."""
     malformed: int = 0
@@ -91,63 +96,14 @@ class Inbox:
     left: list[str] = dataclasses.field(default_factory=list)
     robots: dict[str, RobotUpdate] = dataclasses.field(default_factory=dict)
     """Every other actor whose pose is known, every tick: extrapolated at most 150 ms, corrections blended in 100 ms."""
+    people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
+    """The same of people."""
+    pushes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """With what wrench [6] others push each of my links now: see :class:`vinesim.net.poses.Push`."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
     """Trees of which their owner sent news: the last record of each, extrapolated at most 150 ms."""
     released: list[int] = dataclasses.field(default_factory=list)
     """Trees another actor owned until now and nobody does any more: they rest, or their owner is gone."""
-
-
-class _Actor:
-    """Another actor and the last that is known of its pose."""
-
-    def __init__(self, hello: Hello) -> None:
-        self.hello = hello
-        self.joints = hello.joints
-        self.update: RobotUpdate | None = None
-        self.near: Subscription | None = None
-        self.moved_at = _LONG_AGO
-        self._state = np.zeros(0)
-        self._rate = np.zeros(0)
-        self._off = np.zeros(0)
-
-    def hear(self, update: RobotUpdate, time: float) -> bool:
-        """Take a newer pose at network ``time``; False if it is not newer."""
-        if self.update is not None and update.time <= self.update.time:
-            return False
-        if self.joints < 0:
-            self.joints = len(update.position)
-        if len(update.position) != self.joints:
-            raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
-        shown = None if self.update is None else self._shown(time)
-        q = update.base_q[3:]
-        self.update = update
-        self._state = np.concatenate([update.base_q, update.position])
-        self._rate = np.concatenate([update.base_qd[:3], smooth.spin(q, update.base_qd[3:]), update.velocity])
-        if shown is not None:
-            if shown[3:7] @ q < 0.0:
-                shown[3:7] *= -1.0
-            self._off = np.zeros(0)
-            self._off = shown - self._shown(time)
-            self.moved_at = time
-        return True
-
-    def at(self, time: float, now: float) -> RobotUpdate:
-        """The pose at network ``time``, to be shown ``now``."""
-        heard = self.update
-        assert heard is not None
-        shown = self._shown(time)
-        going = 1.0 if time - heard.time <= smooth.EXTRAPOLATION else 0.0
-        shown[3:7] /= np.sqrt(shown[3:7] @ shown[3:7])
-        return RobotUpdate(
-            heard.actor, now, shown[:7], heard.base_qd * going, shown[7:], heard.velocity * going
-        )  # fmt: skip
-
-    def _shown(self, time: float) -> np.ndarray:
-        assert self.update is not None
-        shown = self._state + self._rate * smooth.horizon(time - self.update.time)
-        if len(self._off):
-            shown += self._off * smooth.remaining(time - self.moved_at)
-        return shown
 
 
 class Exchange:
@@ -171,7 +127,8 @@ class Exchange:
         self._elders = bus.alive() - {me.name}
 
         # others
-        self._actors: dict[str, _Actor] = {}
+        self._actors: dict[str, Actor] = {}
+        self._forces = Forces(bus, me.name)
         self._asked: dict[str, float] = {}
         self._refused: set[str] = set()
         self._blamed: set[str] = set()
@@ -248,7 +205,8 @@ class Exchange:
             family, _, rest = key.partition("/")
             parts = rest.split("/")
             sender = parts[0] if family == "a" else parts[-1]
-            traffic = {"a": self.counters.actor, "c": self.counters.environment}.get(family, self.counters.event)
+            counted = {"a": self.counters.actor, "c": self.counters.environment, "force": self.counters.force}
+            traffic = counted.get(family, self.counters.event)
             traffic.messages_in += 1
             traffic.bytes_in += len(payload)
             actor = self._actors.get(sender)
@@ -259,7 +217,9 @@ class Exchange:
                 continue
             try:
                 if family == "a":
-                    self.counters.dropped += not actor.hear(messages.decode_robot(payload, sender), time)
+                    self.counters.dropped += not actor.hear(decode_pose(payload, sender), time)
+                elif family == "force":
+                    self.counters.dropped += not self._forces.hear(payload, sender, now)
                 elif messages.kind_of(payload) == messages.CLAIMS:
                     for tree, claim, touching in messages.decode_claims(payload, len(self._said_at)):
                         self._hear_claim(tree, claim, touching, sender, time, lost)
@@ -274,7 +234,10 @@ class Exchange:
                 if tree not in self._mine:
                     inbox.released.append(tree)
         inbox.trees = self._extrapolated(news, now, time)
-        inbox.robots = {n: a.at(time, now) for n, a in self._actors.items() if a.update is not None}
+        shown = [actor.at(time, now) for actor in self._actors.values() if actor.update is not None]
+        inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
+        inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
+        inbox.pushes = self._forces.on_me(now)
         self._correct(lost, time)
         return inbox
 
@@ -327,7 +290,7 @@ class Exchange:
                 f"{self.me.name!r} has {self.me.scene!r} with {self.me.digest!r}",
             )
             return
-        self._actors[name] = _Actor(hello)
+        self._actors[name] = Actor(hello)
         inbox.joined.append(hello)
 
     def _refuse(self, name: str, why: str) -> None:
@@ -341,6 +304,7 @@ class Exchange:
     def _leave(self, name: str, time: float) -> None:
         """An actor is gone: what it still moved goes to the nearest of those who remain, then the lowest name."""
         actor = self._actors.pop(name)
+        self._forces.forget(name)
         self._asked.pop(name, None)
         self._blamed.discard(name)
         if actor.near is not None:
@@ -454,16 +418,18 @@ class Exchange:
     def send(
         self,
         now: float,
-        robot: RobotUpdate,
+        robot: RobotUpdate | HumanUpdate,
         *,
         touched: Iterable[int] = (),
         moving: Iterable[int] = (),
         read: Callable[[int], tuple[np.ndarray, np.ndarray]],
         grabbed: Iterable[int] = (),
+        pushed: dict[str, dict[str, np.ndarray]] | None = None,
     ) -> list[TreeUpdate]:
         """Say what must be said this tick; returns the rest records that left, exactly as all copies hold them.
 
-        ``robot`` is my pose (its ``time`` is replaced by ``now``; a spectator passes its viewpoint, without joints).
+        ``robot`` is my pose (its ``time`` is replaced by ``now``; a spectator passes its viewpoint, without joints; a
+        human passes in ``pushed`` what the hands did to others' robots in this tick: robot, link, wrench [6]).
         ``touched``: trees I am in contact with now; ``moving``: trees I own that still move by themselves (others are
         ignored); ``grabbed``: trees of which I grabbed, picked or cut something this tick. ``read(tree)`` gives
         (joint_q [n, 4], joint_qd [n, 3] rad/s) and is called only for trees that somebody near may have to hear of.
@@ -471,6 +437,9 @@ class Exchange:
         time = self._last_sent = max(now + self.clock.offset, self._last_sent + 1e-6)
         self._position = np.asarray(robot.base_q[:3], float)
         self._send_pose(robot, now, time)
+        for payload in self._forces.say(pushed or {}, now, time):
+            self.counters.force.messages_out += 1
+            self.counters.force.bytes_out += len(payload)
 
         touched = {int(tree) for tree in touched}
         for tree in sorted({int(tree) for tree in grabbed}):
@@ -532,7 +501,7 @@ class Exchange:
                 actor.near.close()
                 actor.near = None
 
-    def _send_pose(self, robot: RobotUpdate, now: float, time: float) -> None:
+    def _send_pose(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
         """60 Hz to those who are near, 5 Hz to everybody; encoded once, and only if somebody listens."""
         payload = b""
         for publisher, period in ((self._pose, ACTOR_PERIOD), (self._far_pose, FAR_PERIOD)):
@@ -541,7 +510,7 @@ class Exchange:
                 continue
             self._pose_due[publisher] = max(due, now - period) + period
             if publisher.matching:
-                payload = payload or messages.encode_robot(dataclasses.replace(robot, actor=self.me.name, time=time))
+                payload = payload or encode_pose(dataclasses.replace(robot, actor=self.me.name, time=time))
                 self._put(publisher, payload, self.counters.actor)
 
     def _near_me(self, trees: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ PROTOCOL = 1
 
 MAGIC = b"VS"
 ROBOT, TREES, CLAIMS, FACTS, HELLO, TIME = 1, 2, 3, 4, 16, 17
+HUMAN, FORCE = 6, 7
 """Kinds of message."""
 
 SAMPLE = 1100
@@ -96,6 +97,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Index of its label in label images."""
     joints: int = -1
     """How many joints its updates carry; -1 leaves it open until the first one."""
+    height: float = 1.75
+    """Of a human [m]."""
 
 
 class Fact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -211,6 +214,10 @@ def _open(payload: bytes, kind: int, name: str) -> tuple[int, float]:
     if not math.isfinite(time):
         raise MessageError(f"{name} with time {time}")
     return count, time
+
+
+HEAD, head, opened = _HEAD.size, _head, _open
+"""The same for messages that are written elsewhere: size of a header, how it is written and read."""
 
 
 def _pack(kind: int, value: Any) -> bytes:

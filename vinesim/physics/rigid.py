@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics import geoms, loose, renewal, yard
+from vinesim.physics import geoms, loose, renewal, wrenches, yard
 from vinesim.physics.loose import Loose
 from vinesim.physics.metric import Metric
 from vinesim.physics.people import HAND, PARTS, Hand, HumanError, Person, figure, hand_shapes, rouse
@@ -91,6 +91,10 @@ class Rigid:
         """Robots and people."""
         return (*self._robots, *self._people)
 
+    def stands(self, name: str) -> np.ndarray:
+        """[3] m where a robot's base or a person's hips are."""
+        return self.person(name).parts[PARTS.index("hips"), :3] if name in self._people else self.base(name)[0][:3]
+
     def person(self, name: str) -> Person:
         """The body of a person who is here."""
         try:
@@ -98,9 +102,12 @@ class Rigid:
         except KeyError:
             raise HumanError(f"no human {name!r} here; there are: {', '.join(self._people) or 'none'}") from None
 
-    def add_human(self, spec: HumanSpec) -> None:
-        """Let a person join, at ``spec.pose``; all others go on exactly where they are. Raises :class:`HumanError`."""
-        self._people[spec.name] = Person(spec, self._admit("human", spec.name, HumanError))
+    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
+        """Let a person join, at ``spec.pose``; all others go on exactly where they are. Raises :class:`HumanError`.
+
+        ``copy``: another client moves the person; here the hands neither hold anything nor touch robots.
+        """
+        self._people[spec.name] = Person(spec, self._admit("human", spec.name, HumanError), copy=copy)
         self._compile()
 
     def remove_human(self, name: str) -> None:
@@ -111,7 +118,12 @@ class Rigid:
 
     def move_human(self, name: str, pose: HumanPose) -> None:
         """Tell where a person's tracked points are at the end of the coming tick."""
-        self.person(name).move(pose)
+        person = self.person(name)
+        busy = [hand.busy for hand in person.hands]
+        person.move(pose)
+        if busy != [hand.busy for hand in person.hands]:
+            person.excuse(self.world)
+            self._list()
 
     def hand(self, name: str, side: str) -> HandSample:
         """A person's ``"left"`` or ``"right"`` hand after the last tick."""
@@ -251,6 +263,19 @@ class Rigid:
         """A force [N] and a moment [N m] on a link's centre of mass, world axes, until it is set anew."""
         wrench = self.data.xfrc_applied[self._body(name, link)]
         wrench[:3], wrench[3:] = force, moment
+
+    def bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
+        """Let a robot feel how people push it whom other clients move: wrenches [6] by link, until told anew.
+
+        Force [N] and moment about the link's centre of mass [N m], world axes. They count as contacts in :meth:`read`.
+        """
+        self._robot(name).bear(self.data, pushes)
+
+    def pushed_by(self, name: str) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
+        """What a person's hands did to robots in the last tick; see :func:`wrenches.of_hands`."""
+        robots = self._robots.items()
+        links = {body: (robot, link) for robot, found in robots for link, body in found.bodies.items()}
+        return wrenches.of_hands(self.world, self.data, self.person(name), links)
 
     # ------------------------------------------------------------------ what they feel and where they are
 
@@ -413,6 +438,9 @@ class Rigid:
             out = np.zeros(m.nv)
             mujoco.mj_mulJacTVec(m, d, out, native)
             self._contact += out
+        for robot in self._robots.values():
+            if robot.afar:
+                self._contact += robot.effort_from_afar(m, d)
         for person in self._people.values():
             person.feel(d)
         self._fresh = False
@@ -514,7 +542,7 @@ class Rigid:
         for robot in self._robots.values():
             robot.attach(spec)
         for person in self._people.values():
-            person.attach(spec, yard.ALL & ~(1 << person.bit), yard.GROUND, yard.ROUGH)
+            person.attach(spec, sum(1 << robot.bit for robot in self._robots.values()))
         self._waiting = max(self._slot.values(), default=-1) + 1 + loose.WAITING
         for slot in range(self._waiting):
             loose.wait(spec, slot)
