@@ -6,7 +6,8 @@
 
 A tick is five steps: receive, control, step, sense, send. Nothing in it waits: not for the network, not for a picture.
 
-One client moves one robot, or several (D6.4 section 4.1): then each is an actor of its own on the network.
+One client moves one robot, or several (D6.4 section 4.1): then each is an actor of its own on the network. Or it moves
+a person.
 """
 
 from __future__ import annotations
@@ -21,19 +22,22 @@ from pathlib import Path
 import numpy as np
 
 from vinesim import frames
+from vinesim.client.person import Person, RemotePerson
 from vinesim.client.trace import Trace
 from vinesim.net import interest
 from vinesim.net.bus import Bus
 from vinesim.net.exchange import Exchange, Inbox
 from vinesim.net.messages import Hello
+from vinesim.physics.people import standing
 from vinesim.physics.step import Physics
+from vinesim.physics.urdf import RobotError
 from vinesim.physics.wind import Wind
 from vinesim.robot import description as descriptions
 from vinesim.robot.description import Description, DescriptionError
 from vinesim.robot.drives import RemoteRobot, Robot
 from vinesim.world.model import Model
 from vinesim.world.scene import Scene
-from vinesim.world.values import RobotUpdate, TreeUpdate
+from vinesim.world.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
 
 log = logging.getLogger(__name__)
 
@@ -47,22 +51,25 @@ def label_index(name: str) -> int:
 
 
 class Client:
-    """The robot role. ``clock`` is any steady clock in seconds; tests pass their own."""
+    """One actor's share of a world. ``clock`` is any steady clock in seconds; tests pass their own."""
 
     def __init__(
         self,
         scene: Scene,
         model: Model,
-        description: Description,
+        description: Description | None,
         bus: Bus,
         *,
         name: str,
         pose: np.ndarray,
+        source: Callable[[float], HumanPose] | None = None,
+        height: float = 1.75,
         near: float = interest.NEAR,
         device: str = "cpu",
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """A robot of this ``description``; None: a person of ``height`` [m], still or where ``source`` says."""
         self.name, self.model, self.scene = name, model, scene
         self.physics = Physics(
             model, device=device, threads=threads, picking=False
@@ -71,13 +78,18 @@ class Client:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robots: dict[str, Robot] = {}
-        """All that this client moves, by name; the first is :attr:`robot`."""
+        """All robots that this client moves, by name; the first is :attr:`robot`."""
+        self.people: dict[str, Person] = {}
+        """All people that this client moves, by name."""
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
         self._near = near
-        self.robot = self.add_robot(description, name, pose, bus)
+        if description is None:
+            self.add_human(HumanSpec(name, label_index(name), standing(pose, height), height), source, bus)
+        else:
+            self.robot = self.add_robot(description, name, pose, bus)
         self.exchange = self.exchanges[name]
-        self.others: dict[str, RemoteRobot] = {}
+        self.others: dict[str, RemoteRobot | RemotePerson] = {}
         self.jobs: list[Callable[[float], None]] = []
         """Called every tick with the simulation time, before the drives: what the robot is to do."""
         self.senses: list[Callable[[Client], None]] = []
@@ -90,7 +102,7 @@ class Client:
         self._clock = clock
         self._copies: dict[int, TreeUpdate] = {}
         self._expected: dict[str, Hello] = {}
-        """Robots that joined and whose place is not known yet."""
+        """Robots and people that joined and whose place is not known yet."""
 
     def add_robot(self, description: Description, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Move one more robot, standing at ``pose`` [7]; ``bus`` is opened in its name."""
@@ -101,10 +113,24 @@ class Client:
         exchange = Exchange(bus, hello, self.model, near=self._near)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
+        self._share(name, exchange)
+        return robot
+
+    def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> Person:
+        """Move one more person as ``source`` says (see :class:`Person`; None: still); ``bus`` is opened in its name."""
+        hello = Hello(
+            name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
+            height=spec.height,
+        )  # fmt: skip
+        exchange = Exchange(bus, hello, self.model, near=self._near)
+        self.people[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
+        self._share(spec.name, exchange)
+        return person
+
+    def _share(self, name: str, exchange: Exchange) -> None:
         self.exchanges[name] = exchange
         for own, share in self.exchanges.items():
             share.kin = self.exchanges.keys() - {own}
-        return robot
 
     def tick(self) -> None:
         """Ten milliseconds of the vineyard."""
@@ -122,7 +148,7 @@ class Client:
         inbox = self._inbox(now)
         for hello in inbox.joined:
             log.info("%s joined as %s", hello.name, hello.kind)
-            if hello.kind == "robot":
+            if hello.kind in ("robot", "human"):
                 self._expected[hello.name] = hello
         for name in inbox.left:
             self._expected.pop(name, None)
@@ -130,7 +156,7 @@ class Client:
                 other.leave()
                 self.physics.touching.copies.discard(name)
                 log.info("%s left", name)
-        for name, update in inbox.robots.items():
+        for name, update in (*inbox.robots.items(), *inbox.people.items()):
             if name in self._expected:
                 self._embody(self._expected.pop(name), update)
             if name in self.others:
@@ -138,11 +164,13 @@ class Client:
         self._pull(inbox)
 
     def control(self) -> None:
-        """Do the jobs, then hand set-points to the drives."""
+        """Do the jobs, then hand set-points to the drives; people go where they are told."""
         for job in self.jobs:
             job(self.physics.time)
         for robot in self.robots.values():
             robot.control(self.physics.time)
+        for person in self.people.values():
+            person.control(self.physics.time)
 
     def sense(self) -> None:
         """Note the watched bunch, and tell everybody who listens."""
@@ -159,18 +187,20 @@ class Client:
             sense(self)
 
     def send(self, now: float) -> None:
-        """Say where the robot is, and what it touches to those who are near."""
+        """Say where robots and people are, and what they touch to those who are near."""
         physics = self.physics
         touching = False
-        for name, robot in self.robots.items():
-            touched = [tree for tree, actor in physics.touched if actor == name]
+        for name, actor in (*self.robots.items(), *self.people.items()):
+            update = actor.update(now)
+            pushed = actor.pushed(self.others) if isinstance(actor, Person) else {}
+            touched = [tree for tree, toucher in physics.touched if toucher == name]
             touching |= bool(touched)
             settled = self.exchanges[name].send(
-                now, robot.update(now), touched=touched, moving=physics.sleep.moving, read=self._read,
+                now, update, touched=touched, moving=physics.sleep.moving, read=self._read, pushed=pushed
             )  # fmt: skip
-            for update in settled:
+            for last in settled:
                 # the last word is what all copies hold: hold it too
-                physics.plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
+                physics.plants.pull(last.tree, last.joint_q, last.joint_qd, 1.0)
         self.far.note(self, touching)
 
     def side_of(self, point: np.ndarray) -> str:
@@ -184,19 +214,23 @@ class Client:
     def _inbox(self, now: float) -> Inbox:
         """What all exchanges brought: of another actor, what is heard where it is nearest."""
         inboxes = {name: exchange.receive(now) for name, exchange in self.exchanges.items()}
+        for name in self.robots:
+            self._bear(name, inboxes[name].pushes)
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
-        here = {name: self.physics.rigid.base(name)[0][:2] for name in inboxes}
+        here = {name: self.physics.rigid.stands(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
-        nearest: dict[str, tuple[float, RobotUpdate]] = {}
+        nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
         for name, heard in inboxes.items():
-            for other, update in heard.robots.items():
+            for other, update in (*heard.robots.items(), *heard.people.items()):
                 away = float(np.hypot(*(update.base_q[:2] - here[name])))
                 if other not in nearest or away < nearest[other][0]:
                     nearest[other] = away, update
             trees.update((update.tree, update) for update in heard.trees)
-        inbox.robots = {other: update for other, (_, update) in sorted(nearest.items())}
+        shown = [update for _, (_, update) in sorted(nearest.items())]
+        inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
+        inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
         inbox.trees = [trees[tree] for tree in sorted(trees)]
         return inbox
 
@@ -205,17 +239,27 @@ class Client:
         owners = {exchange.owner(tree) for exchange in self.exchanges.values()} - {None}
         return bool(owners) and not owners & self.robots.keys()
 
-    def _embody(self, hello: Hello, update: RobotUpdate) -> None:
-        """Let another client's robot stand where it is."""
+    def _embody(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> None:
+        """Let another client's robot or person stand where it is."""
         try:
-            description = _description_of(hello, self.robot.description)
+            if isinstance(update, HumanUpdate):
+                self.others[hello.name] = RemotePerson(self.physics, hello, update)
+                return
+            description = _description_of(hello, [robot.description for robot in self.robots.values()])
             self.others[hello.name] = RemoteRobot(
                 self.physics.rigid, description, hello.name, hello.index, update.base_q
             )
         except ValueError as error:
-            log.warning("the robot of %s cannot be shown: %s", hello.name, error)
+            log.warning("%s cannot be shown: %s", hello.name, error)
             return
         self.physics.touching.copies.add(hello.name)
+
+    def _bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
+        """Let a robot feel what other clients' people do to it."""
+        try:
+            self.physics.rigid.bear(name, pushes)
+        except RobotError as error:
+            log.debug("a push on nothing: %s", error)
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
@@ -258,8 +302,8 @@ class Faraway:
         """Judge one tick by where the others' copies stand."""
         sent = sum(exchange.counters.environment.bytes_out for exchange in client.exchanges.values())
         rigid = client.physics.rigid
-        here = [rigid.base(name)[0][:2] for name in client.robots]
-        there = [rigid.base(name)[0][:2] for name in client.others]
+        here = [rigid.stands(name)[:2] for name in client.exchanges]
+        there = [rigid.stands(name)[:2] for name in client.others]
         distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
         if distance > client.exchange.near + self.MARGIN:
             self.bytes += sent - self._seen
@@ -267,10 +311,10 @@ class Faraway:
         self._seen = sent
 
 
-def _description_of(hello: Hello, own: Description) -> Description:
+def _description_of(hello: Hello, own: list[Description]) -> Description:
     """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
-    if hello.urdf == own.urdf:
-        return own
+    if same := [description for description in own if description.urdf == hello.urdf]:
+        return same[0]
     try:
         known = descriptions.load(hello.robot)
         if known.urdf == hello.urdf:
