@@ -97,7 +97,7 @@ def test_two_actors_with_one_name():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["client", "--role", "human"], ["human", "not built yet"]),
+        (["client", "--role", "spectator"], ["spectator", "not built yet"]),
         (["client", "--role", "tractor"], ["tractor", "robot"]),
         (["client", "--push", "99999", "--no-ros"], ["99999"]),
         (["client", "--spawn", "99", "--no-ros"], ["99"]),
