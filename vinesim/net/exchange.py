@@ -167,6 +167,7 @@ class Exchange:
         self.counters = Counters()
         self.clock = Clock()
         greeting = messages.encode_hello(me)
+        bus.join(greeting)
         bus.serve(f"hello/{me.name}", lambda _: greeting)
         self._elders = bus.alive() - {me.name}
 
