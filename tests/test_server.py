@@ -250,13 +250,14 @@ def test_what_cannot_be_believed_is_dropped_counted_and_said_once(caplog):
         for payload in (b"", b"junk", good[:-2], b"VS\x09\x04" + good[4:], bytes(messages.LARGEST + 1)):
             publisher.put(payload)
         nowhere.put(good)
-        wait(lambda: server.malformed == 6, "six to be dropped")
+        publisher.put(messages.encode_facts([box(author="bob")]))
+        wait(lambda: server.malformed == 7, "seven to be dropped")
         publisher.put(good)
         assert snapshot(ada, (0, 0), 1) == [box()]
         assert len([line for line in caplog.messages if "cannot be believed" in line]) == 1
         for question in ("snap/x/0", "snap/1/1.5"):
             ada.ask(question)
-        wait(lambda: server.malformed == 8, "two questions that name no cell")
+        wait(lambda: server.malformed == 9, "two questions that name no cell")
 
 
 def test_who_says_too_much_is_cut_off_and_nobody_else(caplog):

@@ -1,7 +1,8 @@
 """Who may say what where links are secured: denied is what is not allowed by name.
 
 Every actor has a certificate whose common name is the actor's. Under it an actor hears its whole world, asks, and
-writes only under keys that end with its own name. A spectator writes nothing but that it is there and who it is.
+writes only under keys that end with its own name. A spectator only says that it is there, who it is and where its eyes
+are (or nobody would know that somebody looks); about the world it says nothing.
 The settings are Zenoh's; rules are applied by the router, so it is there that a foreign key ends.
 """
 
@@ -33,6 +34,9 @@ class Role(enum.StrEnum):
 class NoCertificate(BusError):
     """A certificate or key is missing or unusable; the text says which."""
 
+
+FAMILIES = ("c", "own", "fact", "voice")
+"""First chunks of keys ``FAMILY/<cx>/<cy>/<actor>``."""
 
 _EVERYTHING = [
     "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply",
@@ -93,8 +97,10 @@ def control(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
             ),
             rule(f"{name} asks to be let in", "ingress", ["query"], f"{root}/join/{name}/*"),
         ]  # fmt: skip
+        written = (f"{root}/a/{name}", f"{root}/a/{name}/far")
         if role != Role.SPECTATOR:
-            own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *_written_by(root, name)))
+            written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))
+        own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *written))
         policies.append({"rules": hears + own, "subjects": [name]})
     everything = [rule(f"servers {flow}", flow, _EVERYTHING, "**") for flow in ("ingress", "egress")]
     policies.append({"rules": everything, "subjects": [SERVER]})
@@ -109,10 +115,3 @@ def control(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
             "policies": policies,
         }
     }
-
-
-def _written_by(root: str, name: str) -> tuple[str, ...]:
-    return (
-        f"{root}/a/{name}", f"{root}/a/{name}/far", f"{root}/force/*/{name}",
-        *(f"{root}/{family}/*/*/{name}" for family in ("c", "own", "fact", "voice")),
-    )  # fmt: skip

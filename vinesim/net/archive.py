@@ -202,6 +202,8 @@ class Archive:
             return ""
         try:
             facts = messages.decode_facts(payload)
+            if strangers := [fact.author for fact in facts if fact.author != actor]:
+                raise MessageError(f"fact by {strangers[0]!r} said by {actor!r}")
         except MessageError as error:
             self._blame(world, actor, str(error))
             return ""

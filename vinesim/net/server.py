@@ -115,15 +115,17 @@ class Server:
             reason = "address already in use" if "in use" in str(error) else str(error).split(" at /")[0]
             raise PortTaken(", ".join(map(str, self.endpoints)), reason) from error
         session = self._session
+        # under access control a declaration that reaches beyond the one world would be told to nobody
+        where = f"{ROOT}/{'*' if certificates is None else world}"
         self._declared: list[object] = [
-            session.liveliness().declare_subscriber(f"{ROOT}/*/live/*/*", self._notice, history=True)
+            session.liveliness().declare_subscriber(f"{where}/live/*/*", self._notice, history=True)
         ]
         if self.archive is not None:
             self._declared += [
-                session.declare_subscriber(f"{ROOT}/*/fact/**", self._fact),
-                session.declare_queryable(f"{ROOT}/*/clock", self._clock),
-                session.declare_queryable(f"{ROOT}/*/snap/*/*", self._snapshot),
-                session.declare_queryable(f"{ROOT}/*/join/*/*", self._join),
+                session.declare_subscriber(f"{where}/fact/**", self._fact),
+                session.declare_queryable(f"{where}/clock", self._clock),
+                session.declare_queryable(f"{where}/snap/*/*", self._snapshot),
+                session.declare_queryable(f"{where}/join/*/*", self._join),
             ]
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
 

@@ -226,7 +226,7 @@ class ZenohBus:
             )  # fmt: skip
             return self._session
         self._declared.append(self._listen_for_loss(session, str(endpoint)))
-        if zenoh.Reliability.BEST_EFFORT not in {link.reliability for link in session.info.links()}:
+        if zenoh.Reliability.BEST_EFFORT not in [link.reliability for link in session.info.links()]:
             log.warning(
                 "%s: the router at %s offers no datagrams on that link: poses go in line there; "
                 "it is older than Zenoh 1.10, or listens without mixed_rel", self.name, endpoint,
