@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import pathlib
+import re
 import subprocess
 import sys
 import threading
@@ -14,11 +16,11 @@ import zenoh
 from vinesim.net import messages
 from vinesim.net.agreement import Plan
 from vinesim.net.archive import Quota
-from vinesim.net.bus import Refused
+from vinesim.net.bus import EVERY, NameTaken, Refused
 from vinesim.net.endpoints import chosen
 from vinesim.net.messages import Fact, Hello, Welcome
 from vinesim.net.server import PortTaken, Server
-from vinesim.net.zenoh_bus import ZenohBus, config
+from vinesim.net.zenoh_bus import ZenohBus, close_session, config, open_session
 from vinesim.world.ids import Kind, thing
 
 
@@ -146,10 +148,10 @@ def test_an_answer_of_another_protocol_is_refused_by_both_numbers():
 
 def test_a_plain_router_lets_everybody_in_and_the_log_says_so(caplog):
     (endpoint,) = chosen(["tcp/127.0.0.1:0"])
-    router = zenoh.open(config("router", listen__endpoints=[endpoint.locator]))
+    router = open_session(config("router", listen__endpoints=[endpoint.locator]))
     with caplog.at_level("INFO"), ZenohBus("ada", connect=str(endpoint)) as ada:
         ada.join(hello("ada"))
-    router.close()
+    close_session(router)
     assert len([line for line in caplog.messages if "no vinesim server keeps world" in line]) == 1
 
 
@@ -336,3 +338,93 @@ def test_the_scene_is_kept_with_the_facts(tmp_path):
         with pytest.raises(Refused, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--keep"):
             bob.join(hello("bob", "D2"))
         assert snapshot(bob, (0, 0), 1) == [box()]
+
+
+# ---------------------------------------------------------------- several servers
+
+
+def meet(one, other):
+    """Poses and events of each reach the other, over however many routers, and what may be lost stays what it is."""
+    for sender, receiver in ((one, other), (other, one)):
+        receiver.subscribe(f"a/{sender.name}")
+        receiver.subscribe(f"own/0/0/{sender.name}", EVERY)
+        pose = sender.publisher(f"a/{sender.name}")
+        event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
+        wait(lambda pose=pose, event=event: pose.matching and event.matching, "the other's subscriptions")
+        assert event.put(b"event")
+        heard: set = set()
+
+        def arrived(pose=pose, receiver=receiver, heard=heard):
+            pose.put(b"pose")
+            time.sleep(0.002)
+            heard.update(receiver.drain())
+            return len(heard) == 2
+
+        wait(arrived, "a pose and an event")
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "udp"])
+def test_of_two_linked_servers_one_decides_and_keeps_for_both(protocol):
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as hub:
+        address = hub.endpoint.partition("/")[2]
+        with (
+            Server("tcp/127.0.0.1:0", connect=[f"{protocol}/{address}"]) as relay,
+            ZenohBus("ada", connect=hub.endpoint) as ada,
+            ZenohBus("bob", connect=relay.endpoint) as bob,
+        ):
+            wait(lambda: hub.actors == relay.actors == ["vineyard/ada", "vineyard/bob"], "both rosters")
+            wait(lambda: ada.alive() == bob.alive() == {"ada", "bob"}, "both to see each other")
+            bob.join(hello("bob"))
+            with pytest.raises(Refused, match="'D2', world 'vineyard' has 'vsp' with 'D1'"):
+                ada.join(hello("ada", "D2"))
+            ada.join(hello("ada"))
+            meet(ada, bob)
+            say(bob, (0, 0), box(0, author="bob"))
+            say(ada, (0, 0), box(1))
+            assert snapshot(ada, (0, 0), 2) == snapshot(bob, (0, 0), 2) == [box(0, author="bob"), box(1)]
+            with pytest.raises(NameTaken):
+                ZenohBus("ada", connect=relay.endpoint)
+            answers: list = []
+            bob.ask("clock", messages.encode_time(1.0))
+            wait(lambda: answers.extend(bob.answers()) or answers, "the time")
+            assert (hub.pings, relay.pings) == (1, 0)
+
+
+def test_linked_servers_have_a_way_for_what_may_be_lost():
+    with Server("udp/127.0.0.1:0") as hub, Server("tcp/127.0.0.1:0", connect=[hub.endpoint]) as relay:
+        wait(lambda: len(relay._session.info.links()) == 2, "both links")
+        kinds = [link.reliability for link in relay._session.info.links()]
+        assert zenoh.Reliability.BEST_EFFORT in kinds
+        assert zenoh.Reliability.RELIABLE in kinds
+
+
+def test_a_server_that_carries_waits_for_the_one_that_keeps():
+    (endpoint,) = chosen(["tcp/127.0.0.1:0"])
+    with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as relay, ZenohBus("ada", connect=relay.endpoint) as ada:
+        ada.join(hello("ada"))  # nobody decides yet
+        with Server(str(endpoint)) as hub:
+            wait(lambda: hub._agreement.plan("vineyard") == Plan("vsp", "D1"), "ada to say who she is")
+
+
+def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):
+    with pytest.raises(ValueError, match=r"only carries: give --keep, --scene and --max-clients to the one server"):
+        Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], keep=tmp_path)
+
+
+def test_the_configuration_for_stock_routers_is_true():
+    text = (pathlib.Path(__file__).parents[1] / "docs/network-routers.md").read_text()
+    snippet = re.search(r"```json5\n(.*?)```", text, re.S).group(1)
+    stream, datagrams = chosen(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as hub:
+        snippet = snippet.replace("0.0.0.0:7447", f"127.0.0.1:{stream.port}")
+        snippet = snippet.replace("10.0.0.1:7447", hub.endpoint.partition("/")[2])
+        router = open_session(zenoh.Config.from_json5(snippet))
+        with ZenohBus("ada", connect=hub.endpoint) as ada, ZenohBus("bob", connect=str(datagrams)) as bob:
+            assert len(bob.links) == 3
+            wait(lambda: ada.alive() == bob.alive() == {"ada", "bob"}, "both to see each other")
+            ada.join(hello("ada"))
+            with pytest.raises(Refused, match="'D2'"):
+                bob.join(hello("bob", "D2"))
+            bob.join(hello("bob"))
+            meet(ada, bob)
+        close_session(router)

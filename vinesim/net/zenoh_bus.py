@@ -47,6 +47,10 @@ PATIENCE = 2.0
 """How long connecting may take [s]."""
 
 
+RETRY = 0.05
+"""Between two attempts to be let in again [s]."""
+
+
 class ServerUnreachable(BusError):
     """No server answers at the endpoint."""
 
@@ -316,18 +320,26 @@ class ZenohBus:
             log.warning("%s: %d servers keep world %r; link all but one to it with --connect", self.name, len(welcomes),
                         self.world)  # fmt: skip
 
-        # a server that was started anew does not know who is there: whoever is says so again
+        # a server that was started anew, or later, does not know who is there: whoever is says so again
+        doorkeeper = self._session.declare_querier(key)
+
         def ask_again() -> None:
-            refused = [welcome.refused for welcome in self._ask_in(key, greeting) if welcome.refused]
+            answers, end = self._ask_in(key, greeting), time.monotonic() + PATIENCE
+            # between linked routers a server is announced before questions find the way to it
+            while not answers and doorkeeper.matching_status.matching and time.monotonic() < end:
+                time.sleep(RETRY)
+                answers = self._ask_in(key, greeting)
+            refused = [welcome.refused for welcome in answers if welcome.refused]
             self._refusal = refused[0] if refused else ""
             if refused:
                 log.error("%s: the server that came back lets this actor in no more: %s", self.name, self._refusal)
 
-        doorkeeper = self._session.declare_querier(key)
         self._declared += [
             doorkeeper,
             doorkeeper.declare_matching_listener(lambda status: status.matching and self.outside(ask_again)),
         ]
+        if not welcomes and doorkeeper.matching_status.matching:
+            self.outside(ask_again)
 
     def _ask_in(self, key: str, greeting: bytes) -> list[messages.Welcome]:
         replies = self._session.get(key, payload=greeting, timeout=PATIENCE, consolidation=zenoh.ConsolidationMode.NONE)
