@@ -30,6 +30,10 @@ class BusError(RuntimeError):
     exit_code = 4
 
 
+class WrongUse(ValueError):
+    """What was asked for cannot be meant: a name, an endpoint, a combination; the text says what would be right."""
+
+
 class NameTaken(BusError):
     """Another live actor has this name."""
 

@@ -15,6 +15,7 @@ import socket
 from collections.abc import Sequence
 
 from vinesim.net.access import AUTHORITY, SERVER, NoCertificate, Role
+from vinesim.net.bus import WrongUse
 from vinesim.net.messages import valid_name
 
 try:
@@ -53,11 +54,11 @@ def new(
     if _missing is not None:
         raise NotInstalled from _missing
     if not valid_name(name) or name == AUTHORITY:
-        raise ValueError(f"actor name {name!r}: use 1 to 48 letters, digits, '_', '-' or '.', and not {AUTHORITY!r}")
+        raise WrongUse(f"actor name {name!r}: use 1 to 48 letters, digits, '_', '-' or '.', and not {AUTHORITY!r}")
     if (name == SERVER) != (role == Role.SERVER):
-        raise ValueError(f"{name!r} as {role}: only the server is called {SERVER!r}")
+        raise WrongUse(f"{name!r} as {role}: only the server is called {SERVER!r}")
     if hosts and role != Role.SERVER:
-        raise ValueError(f"hosts {', '.join(hosts)} for {name!r}: only the server's certificate names hosts")
+        raise WrongUse(f"hosts {', '.join(hosts)} for {name!r}: only the server's certificate names hosts")
     if name != SERVER and (folder / f"{name}.pem").exists():
         raise NoCertificate(f"{folder / name}.pem is there already: remove it and its key first, if that is meant")
     try:

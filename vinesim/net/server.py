@@ -19,7 +19,7 @@ from vinesim.net import endpoints, messages
 from vinesim.net.access import SERVER, control, secured
 from vinesim.net.agreement import Agreement, Plan
 from vinesim.net.archive import Archive, Quota
-from vinesim.net.bus import BusError
+from vinesim.net.bus import BusError, WrongUse
 from vinesim.net.interest import Cell
 from vinesim.net.messages import MessageError
 from vinesim.net.zenoh_bus import ROOT, WORLD, close_session, config, open_session
@@ -66,14 +66,14 @@ class Server:
         ``plan``: the only scene allowed. ``most``: actors at a time. ``certificates``: folder of a server, see
         :mod:`vinesim.net.certificates`; then only ``world`` exists, and in it only who has a certificate.
 
-        :class:`PortTaken` if an endpoint is taken, :class:`ValueError` if it is none,
+        :class:`PortTaken` if an endpoint is taken, :class:`WrongUse` if it is none,
         :class:`vinesim.net.keep.NotKept` and :class:`vinesim.net.access.NoCertificate` in words.
         """
         listen = (listen,) if isinstance(listen, str) else listen
         safe = certificates is not None
         linked = [endpoints.parse(text, secured=safe) for text in connect]
         if linked and (keep is not None or plan is not None or most is not None):
-            raise ValueError(
+            raise WrongUse(
                 f"a server linked to {linked[0]} only carries: give --keep, --scene and --max-clients "
                 "to the one server that connects to nobody"
             )

@@ -26,7 +26,7 @@ import zenoh
 
 from vinesim.net import messages
 from vinesim.net.access import secured
-from vinesim.net.bus import EVERY, NEWEST, Answer, BusError, NameTaken, Refused, Store
+from vinesim.net.bus import EVERY, NEWEST, Answer, BusError, NameTaken, Refused, Store, WrongUse
 from vinesim.net.endpoints import Endpoint, ways
 
 log = logging.getLogger(__name__)
@@ -181,11 +181,11 @@ class ZenohBus:
 
         ``certificates``: folder with ``ca.pem`` and this actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then
         ``tls/`` or ``quic/``. :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the
-        name is live, :class:`ValueError` if name or world cannot be part of a key or the endpoint is none.
+        name is live, :class:`WrongUse` if name or world cannot be part of a key or the endpoint is none.
         """
         for what, text in (("actor name", name), ("world", world)):
             if not messages.valid_name(text):
-                raise ValueError(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
+                raise WrongUse(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
         way = ways(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else secured(certificates, name)
         self.name, self.world, self.endpoint = name, world, str(way.bulk)
@@ -358,7 +358,7 @@ class ZenohBus:
 
     def publisher(self, key: str, reliable: bool = False) -> _Publisher:
         if "*" in key:
-            raise ValueError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
+            raise WrongUse(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
         declared = (self._session if reliable else self._poses).declare_publisher(
             self._prefix + key,
             congestion_control=zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP,
