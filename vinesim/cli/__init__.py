@@ -110,7 +110,7 @@ def server(
     quota: Annotated[
         tuple[float, float],
         typer.Option(help="MESSAGES/s and BYTES/s that one actor may say for good (cuts, where things lie)."),
-    ] = (50.0, 200_000.0),
+    ] = (200.0, 200_000.0),
     tls: Annotated[
         pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): nobody else gets in.")
     ] = None,

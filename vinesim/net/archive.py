@@ -39,11 +39,14 @@ SHELF = 10_000
 class Quota(NamedTuple):
     """How much one actor may say for good, sustained over time; five seconds' worth may come at once."""
 
-    messages: float = 50.0
-    """[1/s]"""
+    messages: float = 200.0
+    """[1/s]: an actor says all its facts again to a server that was gone, one message a tick and cell."""
     payload: float = 200_000.0
     """[B/s]"""
 
+
+EARLY = 1000
+"""Messages that wait for their author to be let in: it says its facts again at once when a server is back."""
 
 BURST = 5.0
 """Seconds of its quota that an actor may spend at once."""
@@ -79,7 +82,7 @@ class Counters:
     over_quota: int = 0
     """... of actors that said too much."""
     strange: int = 0
-    """... of worlds nobody was let into, of too many things, or that came faster than they could be kept."""
+    """... of worlds nobody is let into, of too many things, or that came faster than they could be kept."""
     snapshots: int = 0
     """Questions for a cell's facts."""
 
@@ -96,6 +99,7 @@ class Archive:
         self._facts: dict[str, Facts] = {world: journal.facts for world, journal in self._journals.items()}
         self._plans: dict[str, Plan] = {world: journal.plan for world, journal in self._journals.items()}
         self._shelf: collections.deque[tuple[str, bytes]] = collections.deque()
+        self._early: collections.deque[tuple[str, bytes]] = collections.deque()
         self._purses: dict[tuple[str, str], _Purse] = {}
         self._blamed: set[tuple[str, str]] = set()
         self._lock = threading.Lock()
@@ -122,6 +126,9 @@ class Archive:
             if not self._facts.get(world):
                 self._plans[world] = plan
                 self._facts.setdefault(world, Facts())
+            early, self._early = self._early, collections.deque()
+            self._shelf.extend(early)
+        self._news.set()
 
     def hear(self, key: str, payload: bytes) -> None:
         """Facts that arrived under ``<world>/fact/<cx>/<cy>/<actor>``; returns at once."""
@@ -192,6 +199,14 @@ class Archive:
         except ValueError:
             self._blame(world, actor, f"{key!r} names no cell")
             return ""
+        with self._lock:
+            kept = self._facts.get(world)
+            if kept is None:
+                self._early.append((key, payload))
+                if len(self._early) > EARLY:
+                    self._early.popleft()
+                    self.counters.strange += 1
+                return ""
         now = time.monotonic()
         if len(self._purses) >= SHELF:
             self._purses.clear()  # so many actors are a flood of names: let all begin anew
@@ -206,11 +221,6 @@ class Archive:
                 raise MessageError(f"fact by {strangers[0]!r} said by {actor!r}")
         except MessageError as error:
             self._blame(world, actor, str(error))
-            return ""
-        kept = self._facts.get(world)
-        if kept is None:
-            self.counters.strange += 1
-            self._say(world, actor, "states facts of a world that nobody was let into; dropped")
             return ""
         changed = False
         for fact in facts:
