@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import logging
 import pathlib
 import threading
@@ -31,6 +32,9 @@ MOST = 100_000
 
 SETTLE = 0.5
 """Between two moments at which facts are made safe against the end of the machine [s]."""
+
+RECOVER = 5.0
+"""Between two attempts to write again, after a disk did not take something [s]."""
 
 SHELF = 10_000
 """Facts that may wait to be believed; what comes beyond is dropped."""
@@ -106,7 +110,7 @@ class Archive:
         self._news = threading.Event()
         self._closing = False
         self.trouble = ""
-        """Empty, or in words why nothing is written any more; facts are then kept in memory."""
+        """Empty, or in words why nothing is written now; facts are then kept in memory until it is mended."""
         self._thread = threading.Thread(target=self._run, name="archive")
         self._thread.start()
 
@@ -169,25 +173,41 @@ class Archive:
         settled = time.monotonic()
         unsettled: set[str] = set()
         while True:
-            self._news.wait(SETTLE if unsettled else None)
+            self._news.wait(SETTLE if unsettled else RECOVER if self.trouble else None)
             self._news.clear()
             closing = self._closing
             while self._shelf:
-                world = self._believe(*self._shelf.popleft())
-                if world in self._journals:
+                if world := self._believe(*self._shelf.popleft()):
                     unsettled.add(world)
                 if time.monotonic() - settled >= SETTLE:
                     break
-            if closing and not self._shelf:
-                break
+            now = time.monotonic()
+            if self.trouble and now - settled >= RECOVER:
+                self._recover()
+                settled = now
+            elif now - settled >= SETTLE and not self.trouble:
+                self._written(lambda: [self._journals[world].settle() for world in sorted(unsettled)])
+                unsettled.clear()
+                settled = now
             if self._shelf:
                 self._news.set()
-            if time.monotonic() - settled >= SETTLE:
-                self._guarded(lambda: [self._journals[world].settle() for world in sorted(unsettled)])
-                unsettled.clear()
-                settled = time.monotonic()
+            elif closing:
+                break
         for journal in self._journals.values():
-            self._guarded(journal.close)
+            self._written(journal.close)
+
+    def _recover(self) -> None:
+        """The disk did not take something: try to write everything anew."""
+        trouble, self.trouble = self.trouble, ""
+        for world, facts in list(self._facts.items()):
+            if (journal := self._journals.get(world)) is not None:
+                self._written(journal.rewrite)
+            elif len(facts):
+                self._written(functools.partial(self._begin, world))
+        if self.trouble:
+            self.trouble = trouble
+        else:
+            log.warning("facts are written again")
 
     def _believe(self, key: str, payload: bytes) -> str:
         """Keep what a message says; the world that has changed, or nothing."""
@@ -232,32 +252,37 @@ class Archive:
         return world if changed else ""
 
     def _keep(self, world: str, cell: Cell, fact: Fact) -> bool:
-        if self._folder is not None and world not in self._journals and not self.trouble:
-            path = self._folder / f"{world}{SUFFIX}"
-            self._guarded(
-                lambda: self._journals.update({world: Journal(path, world, self._plans[world], self._facts[world])})
-            )
-        journal = self._journals.get(world)
+        """Take a fact in and write it down; whether it was news and there is a journal of its world."""
+        facts = self._facts[world]
         with self._lock:
-            if journal is None or self.trouble:
-                return self._facts[world].add(cell, fact)
-            changed = False
-            try:
-                changed = journal.add(cell, fact)
-            except NotKept as error:
-                self._give_up(error)
-            return changed
+            if not facts.add(cell, fact):
+                return False
+        if self._folder is None:
+            return False
+        # no lock here: who asks for a snapshot does not wait for a disk
+        journal = self._journals.get(world)
+        if self.trouble:
+            pass  # written with everything else when the disk takes it again
+        elif journal is not None:
+            self._written(lambda: journal.append(cell, fact))
+        else:
+            self._written(lambda: self._begin(world))
+        return world in self._journals
 
-    def _guarded(self, write: Callable[[], object]) -> None:
+    def _begin(self, world: str) -> None:
+        """Begin a journal with all that is known of a world."""
+        assert self._folder is not None
+        path = self._folder / f"{world}{SUFFIX}"
+        self._journals[world] = Journal(path, world, self._plans[world], self._facts[world])
+
+    def _written(self, write: Callable[[], object]) -> None:
+        """Write; if that fails, facts are kept in memory until it does not."""
         try:
             write()
         except NotKept as error:
-            self._give_up(error)
-
-    def _give_up(self, error: NotKept) -> None:
-        if not self.trouble:
+            if not self.trouble:
+                log.error("facts are kept in memory only until this is mended: %s", error)
             self.trouble = str(error)
-            log.error("facts are kept in memory only from now on: %s", error)
 
     def _blame(self, world: str, actor: str, why: str) -> None:
         self.counters.malformed += 1
