@@ -48,6 +48,8 @@ class Rigid:
         self.complaint = ""
         self.generation = 0
         """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
+        self.owners: dict[int, tuple[str, str]] = {}
+        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`geoms.Geoms` names them."""
         self._compile()
 
     # ------------------------------------------------------------------ who is here
@@ -119,7 +121,7 @@ class Rigid:
         return person.sample(person.hand(side), self.data)
 
     def hold(self, name: str, side: str, actor: str, link: str) -> None:
-        """Let a hand hold a link of an actor, a box or a loose bunch, as :class:`geoms.Geoms` names it, where it is now."""
+        """Let a hand hold a link of an actor, a box or a loose bunch, as :class:`geoms.Geoms` names it."""
         person, body = self.person(name), self._body_of(actor, link)
         hand = person.hand(side)
         self.refresh()
@@ -562,7 +564,8 @@ class Rigid:
         self._links, self._link_body = self._list_links()
         self._link_row = np.zeros(self.world.nbody, int)
         self._link_row[self._link_body] = np.arange(len(self._link_body))
-        self.geoms = geoms.listed(self.world, self._owners())
+        self.owners = self._owners()
+        self.geoms = geoms.listed(self.world, self.owners)
 
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []
