@@ -43,8 +43,8 @@ def _slab(at: str, size: str) -> str:
 
 def _slide(name: str, parent: str, child: str, axis: str, origin: str) -> str:
     return (
-        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/>'
-        f'<axis xyz="{axis}"/><limit lower="-2" upper="2" effort="400" velocity="2"/></joint>'
+        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{origin}"/><axis xyz="{axis}"/><limit lower="-2" upper="2" effort="400" velocity="2"/></joint>'
     )
 
 
@@ -55,7 +55,8 @@ CART = f"""<robot name="cart"><link name="base_footprint">{_inertial(80)}
 {_slide("lift", "base_footprint", "hand", "0 0 1", f"{REACH} 0 1.0")}
 <link name="left">{_inertial(0.2)}{_slab("0 0 0", "0.06 0.02 0.08")}</link>
 <link name="right">{_inertial(0.2)}{_slab("0 0 0", "0.06 0.02 0.08")}</link>
-{_slide("close_left", "hand", "left", "0 -1 0", "0 0.10 0")}{_slide("close_right", "hand", "right", "0 1 0", "0 -0.10 0")}
+{_slide("close_left", "hand", "left", "0 -1 0", "0 0.10 0")}
+{_slide("close_right", "hand", "right", "0 1 0", "0 -0.10 0")}
 </robot>"""
 SIDECAR = """[base]
 linear = 1.0

@@ -168,7 +168,8 @@ class Client:
             touching |= bool(touched)
             settled = exchange.send(
                 now, robot.update(now), touched=touched, moving=moving, read=things.read,
-                grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, lies=self.physics.riding.lies, changed=things.changed,
+                grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, changed=things.changed,
+                lies=self.physics.riding.lies,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too

@@ -31,7 +31,7 @@ class Things:
         """``ours``: the names of all actors that this client moves."""
         self.physics, self._ours = physics, ours
         self._told: dict[int, ThingUpdate] = {}
-        self._lies: dict[int, tuple[str, np.ndarray]] = {}
+        self._lies: dict[int, Fact] = {}
         self._changed: set[int] = set()
         self._cut: dict[int, list[int]] = {}
         self._partings: tuple[Parting, ...] = ()
@@ -73,7 +73,7 @@ class Things:
             self._lies.pop(number, None)
             self.physics.riding.unsettle(number)
         else:
-            self._lies[number] = fact.parent, pose
+            self._lies[number] = fact
             self._put(number)
 
     def _believe_tree(self, fact: Fact, holds: bool) -> None:
@@ -103,17 +103,13 @@ class Things:
 
     def _hold(self) -> None:
         """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
-        riding = self.physics.riding
-        moving, touched = set(riding.moving), None
-        for number, (parent, _) in self._lies.items():
-            if self._moved_by_others(parent):
+        moving = set(self.physics.riding.moving)
+        pushed = moving & self._lies.keys()
+        if pushed:
+            pushed -= {number for number, actor in self.physics.riding.touched if actor in self._ours}
+        for number, fact in self._lies.items():
+            if number in pushed or self._moved_by_others(fact.parent):
                 self._put(number)
-            elif number in moving:
-                touched = (
-                    {thing for thing, actor in riding.touched if self._is_ours(actor)} if touched is None else touched
-                )
-                if number not in touched:
-                    self._put(number)
 
     def _moved_by_others(self, parent: str) -> bool:
         """Whether a parent goes where somebody else says."""
@@ -122,11 +118,11 @@ class Things:
         box = thing_named(parent)
         if box is None:
             return parent.partition("/")[0] not in self._ours
-        return box in self._told or (box in self._lies and self._moved_by_others(self._lies[box][0]))
+        return box in self._told or (box in self._lies and self._moved_by_others(self._lies[box].parent))
 
     def _put(self, number: int) -> None:
         """Put a thing where it lies."""
-        parent, relative = self._lies[number]
+        parent, relative = self._lies[number].parent, np.array(self._lies[number].pose)
         there = self.physics.riding.where(parent, relative)
         if there is not None:
             self.physics.riding.place(number, *there)
@@ -166,18 +162,21 @@ class Things:
         return [*parted, *trees]
 
     def touched(self, name: str, mine: Container[int]) -> list[int]:
-        """Everything that moves and that an actor of ours touches, or what it moves."""
-        found = []
-        for number, actor in self.physics.riding.touched:
+        """Everything that moves and that an actor of ours touches, or what it moves; and what lies in its boxes."""
+        found = [number for number in self.physics.riding.moving if self._box_of(number) == name]
+        for number, actor in (*self.physics.riding.touched, *self.physics.touched):
             other = thing_named(actor)
             if actor == name or (other is not None and other in mine):
                 found.append(number)
-                self._lies.pop(number, None)
-        for tree, actor in self.physics.touched:
-            other = thing_named(actor)
-            if actor == name or (other is not None and other in mine):
-                found.append(tree)
+        for number in found:
+            self._lies.pop(number, None)
         return found
+
+    def _box_of(self, number: int) -> str:
+        """Who put the box down in which a thing is said to lie."""
+        fact = self._lies.get(number)
+        box = None if fact is None else thing_named(fact.parent)
+        return self._lies[box].author if box in self._lies else ""
 
     @property
     def moving(self) -> list[int]:
@@ -206,7 +205,8 @@ class Things:
     def rested(self, fact: Fact | None) -> None:
         """We have said that a thing of ours lies still: from now on it does, as for everybody else."""
         if fact is not None and not fact.moving and not is_tree(fact.thing):
-            self._lies[fact.thing] = fact.parent, np.array(fact.pose)
+            self._lies[fact.thing] = fact
+            self.physics.riding.settle(fact.thing, fact.parent, np.array(fact.pose))
 
     # ------------------------------------------------------------------ inside
 
@@ -220,6 +220,3 @@ class Things:
 
     def _tree_of(self, bunch: int) -> int:
         return int(self.physics.model.body_tree[self.physics.model.bunch_body[bunch]])
-
-    def _is_ours(self, actor: str) -> bool:
-        return actor in self._ours

@@ -17,10 +17,12 @@ from vinesim.physics.people import rouse
 from vinesim.physics.rigid import Rigid
 from vinesim.world.ids import Kind, thing, thing_named
 
-BAND = 0.005
-"""[m] What moves less than this in its parent's frame, and turns less than :data:`TURN`, is still."""
-TURN = float(np.radians(1.0))
-"""[rad]"""
+STILL = 0.005, float(np.radians(1.0))
+"""[m] and [rad] What moves and turns less than this in its parent's frame is still."""
+CARRIED = 0.015, float(np.radians(5.0))
+"""The same on a robot's link: what it carries is shaken, and need not be told of while it stays about there."""
+SHAKEN = 0.05, float(np.radians(30.0))
+"""The same in a box that moves, where bunches rock and roll; when the box has come to rest, :data:`STILL` counts."""
 PATIENCE = 50
 """[tick] So long must a thing be still to be at rest."""
 FAR = 0.5
@@ -64,7 +66,7 @@ class Riding:
             self.rigid.refresh()
         pose = self._poses(awake)
         relative = self._relative(pose, self._parent[awake])
-        out = _apart(relative, self._anchor[awake])
+        out = _apart(relative, self._anchor[awake], self._bands()[awake])
         loose = awake[out | (self._still[awake] <= PATIENCE)]
         if len(loose) == 0:
             return
@@ -198,6 +200,13 @@ class Riding:
         relative[moves] = frames.compose(frames.inverse(frame), pose[moves])
         return relative
 
+    def _bands(self) -> np.ndarray:
+        """How far each thing may move and turn and still be still [n, 2] m, rad."""
+        on = self._row[self._parent]
+        carried = self._kind[self._parent] == _LINK
+        shaken = (on >= 0) & ((self._still[on] <= PATIENCE) | carried[on])
+        return np.where(shaken[:, None], SHAKEN, np.where(carried[:, None], CARRIED, STILL))
+
     def _touching(self) -> np.ndarray:
         """(row, MuJoCo body) of all contacts of the last tick [k, 2], each seen from both sides."""
         m, d = self.rigid.world, self.rigid.data
@@ -287,8 +296,8 @@ class Riding:
         return self._body_named.get(parent, 0)
 
 
-def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which poses [k, 7] differ by more than the band [k] bool."""
+def _apart(a: np.ndarray, b: np.ndarray, band: np.ndarray) -> np.ndarray:
+    """Which poses [k, 7] differ by more than a ``band`` [k, 2] m, rad: [k] bool."""
     off = a[:, :3] - b[:, :3]
     chord = np.minimum(np.square(a[:, 3:] - b[:, 3:]).sum(1), np.square(a[:, 3:] + b[:, 3:]).sum(1))
-    return (np.square(off).sum(1) > BAND * BAND) | (chord > (0.5 * TURN) ** 2)
+    return (np.square(off).sum(1) > np.square(band[:, 0])) | (chord > np.square(0.5 * band[:, 1]))
