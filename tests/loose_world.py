@@ -49,8 +49,8 @@ def _slide(name: str, parent: str, child: str, axis: str, origin: str) -> str:
 
 
 CART = f"""<robot name="cart"><link name="base_footprint">{_inertial(80)}
-{_slab("0 0 0.2", "0.6 0.5 0.1")}{_slab("-0.28 0 0.28", "0.02 0.5 0.06")}{_slab("0.28 0 0.28", "0.02 0.5 0.06")}
-{_slab("0 -0.165 0.28", "0.5 0.02 0.06")}{_slab("0 0.165 0.28", "0.5 0.02 0.06")}</link>
+{_slab("0 0 0.2", "0.6 0.5 0.1")}{_slab("-0.262 0 0.28", "0.02 0.5 0.06")}{_slab("0.262 0 0.28", "0.02 0.5 0.06")}
+{_slab("0 -0.162 0.28", "0.5 0.02 0.06")}{_slab("0 0.162 0.28", "0.5 0.02 0.06")}</link>
 <link name="hand">{_inertial(2)}</link>
 {_slide("lift", "base_footprint", "hand", "0 0 1", f"{REACH} 0 1.0")}
 <link name="left">{_inertial(0.2)}{_slab("0 0 0", "0.06 0.02 0.08")}</link>

@@ -1,5 +1,4 @@
-"""Boxes, loose bunches and what was cut, between the network and the physics: what others say of them is done here, and
-what is to be said of them is found.
+"""Boxes, loose bunches and what was cut: what others say of them is done, and what is to be said of them is found.
 
 What others move is pulled to where they say. What lies by a fact is held there: at rest in its parent's frame, wherever
 that goes, unless it is our own robot that moves it.

@@ -48,6 +48,7 @@ class Riding:
         self._still = np.zeros(0, np.int64)
         self._at: dict[int, int] = {}
         self._pairs = np.zeros((0, 2), np.int64)
+        self._bands_before = np.zeros((0, 2))
         self._renew()
 
     # ------------------------------------------------------------------ the tick
@@ -57,24 +58,27 @@ class Riding:
         if self._generation != self.rigid.generation:
             self._renew()
         d = self.rigid.data
-        awake = np.flatnonzero(d.tree_asleep[self._tree] < 0)
         self._still += 1
         self._pairs = self._touching()
+        bands, before = self._bands(), self._bands_before
+        self._bands_before = bands
+        # what fell asleep in a box that moved is judged when the box has come to rest
+        awake = np.flatnonzero((d.tree_asleep[self._tree] < 0) | (bands[:, 0] < before[:, 0]))
         if len(awake) == 0:
             return
         if (self._kind[self._parent[awake]] == _LINK).any():
             self.rigid.refresh()
         pose = self._poses(awake)
         relative = self._relative(pose, self._parent[awake])
-        out = _apart(relative, self._anchor[awake], self._bands()[awake])
-        loose = awake[out | (self._still[awake] <= PATIENCE)]
+        out = _apart(relative, self._anchor[awake], bands[awake])
+        loose = awake[out | (self._still[awake] < PATIENCE)]
         if len(loose) == 0:
             return
-        before = self._parent[loose].copy()
+        parent = self._parent[loose].copy()
         inside = np.zeros(len(self.things), bool)
         inside[awake] = ~out
         self._parent[loose] = self._supports(loose, inside)
-        changed = loose[self._parent[loose] != before]
+        changed = loose[self._parent[loose] != parent]
         anew = np.union1d(awake[out], changed)
         if len(anew):
             self.rigid.refresh()
@@ -204,7 +208,7 @@ class Riding:
         """How far each thing may move and turn and still be still [n, 2] m, rad."""
         on = self._row[self._parent]
         carried = self._kind[self._parent] == _LINK
-        shaken = (on >= 0) & ((self._still[on] <= PATIENCE) | carried[on])
+        shaken = (on >= 0) & ((self._still[on] < PATIENCE) | carried[on])
         return np.where(shaken[:, None], SHAKEN, np.where(carried[:, None], CARRIED, STILL))
 
     def _touching(self) -> np.ndarray:
@@ -277,6 +281,7 @@ class Riding:
         self._anchor = self._poses(np.arange(len(self.things)))
         self._still = np.where(self.things >= thing(Kind.BOX, 0), PATIENCE, 0)
         self._pairs = np.zeros((0, 2), np.int64)
+        self._bands_before = np.tile(STILL, (len(self.things), 1))
         for number, (parent, anchor, still) in known.items():
             if number in self._at:
                 row = self._at[number]
