@@ -10,6 +10,8 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 
 from __future__ import annotations
 
+import dataclasses
+import threading
 from typing import Any
 
 import mujoco
@@ -29,6 +31,17 @@ from vinesim.world.values import HandSample, HumanPose, HumanSpec, Link, RobotSp
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 
 
+@dataclasses.dataclass(frozen=True)
+class Draft:
+    """A world that is compiled and in which nothing has happened yet."""
+
+    robots: tuple[RobotBody, ...]
+    people: tuple[Person, ...]
+    slots: int
+    """How many loose bunches have room in it."""
+    world: mujoco.MjModel
+
+
 class Rigid:
     """Robots, boxes and what stands, in one MuJoCo world that is compiled anew when an actor comes or goes."""
 
@@ -41,6 +54,7 @@ class Rigid:
         self._waiting = 0
         self._slot: dict[int, int] = {}
         self._scene = yard.furnished(model, dt)
+        self._drafting = threading.Lock()
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
         self.faults = 0
@@ -64,13 +78,34 @@ class Rigid:
 
         Raises :class:`RobotError` and leaves the world as it was if the URDF does not compile.
         """
-        self._robots[spec.name] = RobotBody(spec, self._admit("robot", spec.name, RobotError))
+        while not self.admit(self.prepare(spec)):
+            pass
+
+    def prepare(self, spec: RobotSpec) -> Draft:
+        """The world with one more robot in it, for :meth:`admit`. Any thread may call this while the ticks go on.
+
+        Raises :class:`RobotError` if the URDF does not compile.
+        """
+        robot = RobotBody(spec, self._admit("robot", spec.name, RobotError))
         try:
-            self._compile()
+            return self._draft((*self._robots.values(), robot), tuple(self._people.values()))
         except ValueError as error:
-            del self._robots[spec.name]
             raise unfit(spec, error) from error
+
+    def admit(self, draft: Draft) -> bool:
+        """Between ticks, let the robot in for whom ``draft`` was made, at its ``spec.pose`` and ``spec.home``.
+
+        False, and nothing has happened, if others came or went meanwhile: prepare it anew.
+        """
+        *others, newcomer = draft.robots
+        here = (list(self._robots.values()), list(self._people.values()))
+        if (others, list(draft.people)) != here or draft.slots <= max(self._slot.values(), default=-1):
+            return False
+        spec = newcomer.spec
+        self._robots[spec.name] = newcomer
+        self._renew(draft)
         self.place(spec.name, spec.pose, spec.home)
+        return True
 
     def remove_robot(self, name: str) -> None:
         """Let a robot leave; all others go on exactly where they are."""
@@ -121,7 +156,7 @@ class Rigid:
         return person.sample(person.hand(side), self.data)
 
     def hold(self, name: str, side: str, actor: str, link: str) -> None:
-        """Let a hand hold a link of an actor, a box or a loose bunch, as :class:`geoms.Geoms` names it."""
+        """Let a hand hold a link of an actor, a box or a bunch where it is now; names are those of ``geoms.Geoms``."""
         person, body = self.person(name), self._body_of(actor, link)
         hand = person.hand(side)
         self.refresh()
@@ -510,22 +545,33 @@ class Rigid:
 
     # ------------------------------------------------------------------ building the world
 
-    def _compile(self) -> None:
-        """Build the world anew and carry every joint's and body's state over by its name."""
-        spec = self._scene.copy()
-        for robot in self._robots.values():
-            robot.attach(spec)
-        for person in self._people.values():
-            person.attach(spec, yard.ALL & ~(1 << person.bit), yard.GROUND, yard.ROUGH)
-        self._waiting = max(self._slot.values(), default=-1) + 1 + loose.WAITING
-        for slot in range(self._waiting):
-            loose.wait(spec, slot)
-        before = (self.world, self.data, self._contact) if self.generation else None
-        self.world = world = renewal.compiled(spec)
+    def _draft(self, robots: tuple[RobotBody, ...], people: tuple[Person, ...]) -> Draft:
+        """A world with these in it and room for loose bunches, compiled; nothing here changes."""
+        slots = max(self._slot.values(), default=-1) + 1 + loose.WAITING
+        with self._drafting:
+            spec = self._scene.copy()
+            for robot in robots:
+                robot.attach(spec)
+            for person in people:
+                person.attach(spec, yard.ALL & ~(1 << person.bit), yard.GROUND, yard.ROUGH)
+            for slot in range(slots):
+                loose.wait(spec, slot)
+            world = renewal.compiled(spec)
         # the solver's tolerance is relative to it: whoever joins would change when it stops for everybody else
         world.stat.meaninertia = 1.0
-        for slot in range(self._waiting):
+        for slot in range(slots):
             loose.untouch(world, slot)
+        return Draft(robots, people, slots, world)
+
+    def _compile(self) -> None:
+        """Build the world anew for those who are here now."""
+        self._renew(self._draft(tuple(self._robots.values()), tuple(self._people.values())))
+
+    def _renew(self, draft: Draft) -> None:
+        """Go on in another world, every joint's and body's state carried over by its name."""
+        before = (self.world, self.data, self._contact) if self.generation else None
+        self.world, self._waiting = draft.world, draft.slots
+        world = self.world
         for bunch, body in self._bunches.items():
             loose.embody(world, self._slot[bunch], body, loose.alone(body))
         if before is None:
