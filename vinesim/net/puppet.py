@@ -1,0 +1,285 @@
+"""Actors without physics: scripted poses and trees on a real exchange. What the network does is measured with them.
+
+    python -m vinesim.net.puppet '{"connect": "tcp/127.0.0.1:7447", "puppets": [{"name": "ada", "place": [1, 0]}]}'
+
+Such a process answers each line on its input, a JSON object, with one line: ``{"who": "ada", "touch": [3]}`` lets it
+act, and every answer is its :meth:`Puppet.report`. It ends with its input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, Self
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.net import interest
+from vinesim.net.bus import Bus
+from vinesim.net.exchange import Exchange
+from vinesim.net.messages import Hello
+from vinesim.world.grow import Tree, Wood, assemble
+from vinesim.world.model import Model
+from vinesim.world.values import RobotUpdate
+
+TICK = 0.01
+"""A client's tick [s]."""
+
+ROBOT_JOINTS, HUMAN_JOINTS = 27, 28
+"""Joints of a puppet: as many as vinebot has; for a person, what as many bytes say: seven tracked poses and fingers."""
+
+BEND, SWING = 0.15, 1.3
+"""Touched trees swing by this angle at every joint [rad], so often [Hz]."""
+
+
+def row(count: int = 12, *, apart: float = 1.0) -> Model:
+    """Trees of six bodies along x, the first at half the distance between them [m]."""
+    trees = []
+    for number in range(count):
+        tree = Tree(frames.pose(np.array([(number + 0.5) * apart, 0.0, 1.5])))
+        tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)
+        trees.append(tree)
+    return assemble(trees)
+
+
+class Puppet:
+    """The least client: it stands somewhere and swings its arms, touches trees, and believes what it hears."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        model: Model,
+        place: tuple[float, float],
+        *,
+        kind: str = "robot",
+        joints: int = ROBOT_JOINTS,
+        digest: str = "puppets",
+        near: float = interest.NEAR,
+        restless: bool = True,
+    ) -> None:
+        """Stand at ``place`` [2] m; ``restless`` lets the joints swing, so that no two poses are alike."""
+        hello = Hello(bus.name, kind=kind, scene="puppets", digest=digest, joints=joints)
+        self.bus, self.model, self.name = bus, model, bus.name
+        self.exchange = Exchange(bus, hello, model, near=near)
+        self.place = np.array([*place, 0.0])
+        self.joints, self.restless = joints, restless
+        self.touching: set[int] = set()
+        """Trees it touches."""
+        self.swinging: set[int] = set()
+        """Trees that move though it does not touch them."""
+        self.grabbing: set[int] = set()
+        """Trees it grabs in its next tick."""
+        self.amplitude = BEND
+        self.came: dict[str, float] = {}
+        self.went: dict[str, float] = {}
+        self.heard: dict[int, float] = {}
+        """When each tree was last heard of, by one's own clock [s]."""
+        self.shown: dict[int, np.ndarray] = {}
+        """Joint rotations of each tree as last heard, brought up to then."""
+        self.released: list[int] = []
+        self.reads = 0
+        self.ticks = 0
+        self.robots: dict[str, RobotUpdate] = {}
+        """The others, as last shown."""
+        self._now = 0.0
+
+    def tick(self, now: float) -> None:
+        """One tick of a client's share in the network."""
+        self._now = now
+        inbox = self.exchange.receive(now)
+        for hello in inbox.joined:
+            self.came[hello.name] = now
+        for name in inbox.left:
+            self.went[name] = now
+        for update in inbox.trees:
+            self.heard[update.tree] = now
+            self.shown[update.tree] = update.joint_q
+        self.released += inbox.released
+        self.robots = inbox.robots
+        grabbed, self.grabbing = self.grabbing, set()
+        self.exchange.send(
+            now, self.pose(now), touched=self.touching, moving=self.swinging, read=self.read, grabbed=grabbed
+        )
+        self.ticks += 1
+
+    def pose(self, now: float) -> RobotUpdate:
+        """What it would say of itself at ``now``."""
+        phase = np.arange(self.joints) + (2.0 * now if self.restless else 0.0)
+        speed = 0.6 * np.cos(phase) if self.restless else np.zeros(self.joints)
+        return RobotUpdate(self.name, now, frames.pose(self.place), np.zeros(6), 0.3 * np.sin(phase), speed)
+
+    def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
+        """How a tree it moves stands: a swing of every joint about one axis, the same on every clock."""
+        self.reads += 1
+        return swung(self.model, tree, self._now + self.exchange.offset, self.amplitude)
+
+    def report(self) -> dict[str, Any]:
+        """All that a test may want to know."""
+        exchange = self.exchange
+        return {
+            "name": self.name,
+            "ticks": self.ticks,
+            "reads": self.reads,
+            "now": self._now,
+            "offset": exchange.offset,
+            "others": sorted(exchange.actors),
+            "came": self.came,
+            "went": self.went,
+            "owner": {tree: exchange.owner(tree) for tree in sorted(exchange._claims)},
+            "claim": {tree: list(claim) for tree, claim in sorted(exchange._claims.items())},
+            "heard": self.heard,
+            "released": self.released,
+            "poses": {name: update.position[:1].tolist() for name, update in sorted(self.robots.items())},
+            "counters": dataclasses.asdict(exchange.counters),
+            "lost": self.bus.lost,
+            "trouble": self.bus.trouble,
+        }
+
+    def obey(self, order: dict[str, Any]) -> None:
+        """``touch``, ``swing``, ``grab``: trees; ``place``: [x, y] m; ``amplitude``: rad."""
+        for what, value in order.items():
+            if what == "touch":
+                self.touching = set(value)
+            elif what == "swing":
+                self.swinging = set(value)
+            elif what == "grab":
+                self.grabbing = set(value)
+            elif what == "place":
+                self.place[:2] = value
+            elif what == "amplitude":
+                self.amplitude = float(value)
+            else:
+                raise ValueError(f"puppets do not know {what!r}")
+
+
+def swung(model: Model, tree: int, time: float, amplitude: float = BEND) -> tuple[np.ndarray, np.ndarray]:
+    """Joint rotations [n, 4] and rates [n, 3] rad/s of a tree that swings for ever."""
+    bodies = model.bodies_of(tree)
+    phase = 2.0 * np.pi * SWING * time + tree
+    turn = frames.exp(np.array([0.0, amplitude * np.sin(phase), 0.0]))
+    settled = model.joint_settled[bodies]
+    rate = np.zeros((len(settled), 3))
+    rate[:, 1] = amplitude * 2.0 * np.pi * SWING * np.cos(phase)
+    return frames.multiply(turn, settled), rate
+
+
+# ---------------------------------------------------------------- in processes of their own
+
+
+class Stage:
+    """Puppets in a process of their own, seen from the one that plays with them. A context manager."""
+
+    def __init__(
+        self,
+        connect: str,
+        puppets: Iterable[dict[str, Any]],
+        *,
+        start: Callable[..., subprocess.Popen] = subprocess.Popen,
+        **options: Any,
+    ) -> None:
+        """``start(command, **options of Popen)`` may put it into a namespace; ``options`` as in :func:`play`."""
+        wanted = json.dumps({"connect": connect, "puppets": list(puppets), **options})
+        self.process = start(
+            [sys.executable, "-m", "vinesim.net.puppet", wanted],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self._hear()
+
+    def tell(self, who: str = "", **order: Any) -> dict[str, Any]:
+        """Order a puppet about; its report of a moment later."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps({"who": who, **order}) + "\n")
+        self.process.stdin.flush()
+        return self._hear()
+
+    def _hear(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"the puppets' process ended with {self.process.wait()}")
+        return json.loads(line)
+
+    def close(self) -> None:
+        """Let the puppets leave, and wait for it."""
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None and not pipe.closed:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+        try:
+            self.process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def play(
+    connect: str, puppets: list[dict[str, Any]], *, trees: int = 12, apart: float = 1.0, tick: float = TICK,
+    skew: float = 0.0,
+) -> None:  # fmt: skip
+    """Tick puppets over Zenoh and do what the standard input says, until it ends. ``skew`` [s] sets the clock wrong."""
+    from vinesim.net.zenoh_bus import ZenohBus
+
+    model = row(trees, apart=apart)
+    orders: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+    cast: dict[str, Puppet] = {}
+    late = 0
+    try:
+        for one in puppets:
+            name, place = one.pop("name"), one.pop("place")
+            cast[name] = Puppet(ZenohBus(name, connect=connect), model, place, **one)
+        threading.Thread(target=_listen, args=(orders,), daemon=True).start()
+        _say({"ready": True})
+        due = time.monotonic()
+        answering: list[str] = []
+        while True:
+            begin = time.monotonic()
+            for puppet in cast.values():
+                puppet.tick(begin + skew)
+            for name in answering:
+                load = {"late": late, "cpu": time.process_time(), "clock": time.monotonic()}
+                _say(cast[name].report() | load)
+            answering.clear()
+            while not orders.empty():
+                order = orders.get()
+                if order is None:
+                    return
+                name = order.pop("who") or next(iter(cast))
+                cast[name].obey(order)
+                answering.append(name)  # after its next tick
+            due += tick
+            late += time.monotonic() - due > tick
+            if time.monotonic() - due > 0.5:
+                due = time.monotonic()
+            time.sleep(max(0.0, due - time.monotonic()))
+    finally:
+        for puppet in cast.values():
+            puppet.bus.close()
+
+
+def _say(what: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
+
+
+def _listen(orders: queue.SimpleQueue) -> None:
+    for line in sys.stdin:
+        orders.put(json.loads(line))
+    orders.put(None)
+
+
+if __name__ == "__main__":
+    play(**json.loads(sys.argv[1]))
