@@ -36,8 +36,9 @@ TICK = 0.01
 ROBOT_JOINTS, HUMAN_JOINTS = 27, 28
 """Joints of a puppet: as many as vinebot has; for a person, what as many bytes say: seven tracked poses and fingers."""
 
-BEND, SWING = 0.15, 1.3
-"""Touched trees swing by this angle at every joint [rad], so often [Hz]."""
+SWAY, SWING = 0.12, 1.3
+"""The tip of a touched tree sways by so much [m], so often [Hz]: its owner must then speak 12 to 20 times a second, as
+for a cane that a robot pushes (13 times in the 0.4 s of the push itself, then 14 times in a second of holding it)."""
 
 
 def row(count: int = 12, *, apart: float = 1.0) -> Model:
@@ -77,7 +78,7 @@ class Puppet:
         """Trees that move though it does not touch them."""
         self.grabbing: set[int] = set()
         """Trees it grabs in its next tick."""
-        self.amplitude = BEND
+        self.sway = SWAY
         self.came: dict[str, float] = {}
         self.went: dict[str, float] = {}
         self.heard: dict[int, float] = {}
@@ -119,7 +120,7 @@ class Puppet:
     def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
         """How a tree it moves stands: a swing of every joint about one axis, the same on every clock."""
         self.reads += 1
-        return swung(self.model, tree, self._now + self.exchange.offset, self.amplitude)
+        return swung(self.model, tree, self._now + self.exchange.offset, self.sway)
 
     def report(self) -> dict[str, Any]:
         """All that a test may want to know."""
@@ -144,7 +145,7 @@ class Puppet:
         }
 
     def obey(self, order: dict[str, Any]) -> None:
-        """``touch``, ``swing``, ``grab``: trees; ``place``: [x, y] m; ``amplitude``: rad."""
+        """``touch``, ``swing``, ``grab``: trees; ``place``: [x, y] m; ``sway``: m."""
         for what, value in order.items():
             if what == "touch":
                 self.touching = set(value)
@@ -154,15 +155,17 @@ class Puppet:
                 self.grabbing = set(value)
             elif what == "place":
                 self.place[:2] = value
-            elif what == "amplitude":
-                self.amplitude = float(value)
+            elif what == "sway":
+                self.sway = float(value)
             else:
                 raise ValueError(f"puppets do not know {what!r}")
 
 
-def swung(model: Model, tree: int, time: float, amplitude: float = BEND) -> tuple[np.ndarray, np.ndarray]:
-    """Joint rotations [n, 4] and rates [n, 3] rad/s of a tree that swings for ever."""
+def swung(model: Model, tree: int, time: float, sway: float = SWAY) -> tuple[np.ndarray, np.ndarray]:
+    """Joint rotations [n, 4] and rates [n, 3] rad/s of a tree whose tip sways by ``sway`` [m] for ever."""
     bodies = model.bodies_of(tree)
+    length = float(model.body_length[bodies].sum())
+    amplitude = 2.0 * sway / max(length * len(model.joint_settled[bodies]), 1e-3)  # every joint bears half of it
     phase = 2.0 * np.pi * SWING * time + tree
     turn = frames.exp(np.array([0.0, amplitude * np.sin(phase), 0.0]))
     settled = model.joint_settled[bodies]
