@@ -32,7 +32,7 @@ LINES = {
 SECONDS = 26.0
 """How long the clients run: some four pushes."""
 
-START = 60.0
+START = 150.0
 """How long a client may take to start and to write what it saw [s]."""
 
 SEEN = 0.0005
@@ -67,7 +67,7 @@ def watched(line: Line) -> tuple[Rows, Rows]:
     bunch = str(bunch_in_reach(generate(scene), spawn_pose(scene, 0)))
     client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
     roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
-    with tempfile.TemporaryDirectory() as folder, Emulator({name: line for name in roles}) as net:
+    with tempfile.TemporaryDirectory() as folder, Emulator(dict.fromkeys(roles, line)) as net:
         server = net.start(
             "hub", [sys.executable, "-m", "vinesim.cli", "server", "--listen", "tcp/0.0.0.0:7447"],
             stdout=subprocess.PIPE, text=True,

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -114,15 +115,9 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
     wall = after[2] - before[2]
     routers = sum(b - a for a, b in zip(before[0], after[0], strict=True)) / wall
     clients = sum(b["cpu"] - a["cpu"] for a, b in zip(before[1], after[1], strict=True)) / wall
-    ticks = np.mean(
-        [(b["ticks"] - a["ticks"]) / (b["now"] - a["now"]) for a, b in zip(*(before[1], after[1]), strict=True)]
-    )
-    heard = np.mean(
-        [
-            (b["counters"]["actor"]["messages_in"] - a["counters"]["actor"]["messages_in"]) / (b["now"] - a["now"])
-            for a, b in zip(*(before[1], after[1]), strict=True)
-        ]
-    )
+    spans = [(a, b, b["now"] - a["now"]) for a, b in zip(before[1], after[1], strict=True)]
+    ticks = np.mean([(b["ticks"] - a["ticks"]) / seconds for a, b, seconds in spans])
+    heard = np.mean([(_poses(b) - _poses(a)) / seconds for a, b, seconds in spans])
     case = f"{count} clients, {len(ends)} router{'s' * (len(ends) > 1)}"
 
     def line(what: str, value: float, unit: str) -> Measurement:
@@ -142,6 +137,10 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
         yield line("pose under way, p50", 1e3 * np.percentile(ages, 50), "ms")
         yield line("pose under way, p99", 1e3 * np.percentile(ages, 99), "ms")
     yield line("poses lost", 100.0 * (1.0 - len(ages) / sent), "%")
+
+
+def _poses(report: dict[str, Any]) -> int:
+    return report["counters"]["actor"]["messages_in"]
 
 
 def load() -> Iterator[Measurement]:
