@@ -174,7 +174,8 @@ def bench(
     """Measure, beside a peer that runs in the same process on the same scene.
 
     Of physics and sensors: plants, contact, tick, asleep, camera. Of the network: sync (what delay does, simulated
-    time), link (real clients over emulated links; root), traffic (bytes a client hears), load (many clients).
+    time), link (real clients over emulated links; root), traffic (bytes a client hears), load (many clients), fuzz (broken
+    messages).
 
     \b
     Examples:

@@ -64,6 +64,12 @@ def _load() -> Iterator[Measurement]:
     return load()
 
 
+def _fuzz() -> Iterator[Measurement]:
+    from vinesim.net.bench_fuzz import fuzz
+
+    return fuzz()
+
+
 def _link() -> Iterator[Measurement]:
     from vinesim.client.bench_link import link
 
@@ -86,6 +92,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "link": _link,
     "traffic": _traffic,
     "load": _load,
+    "fuzz": _fuzz,
 }
 
 
