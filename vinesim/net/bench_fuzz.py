@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from vinesim import frames
 from vinesim.net import interest, messages
 from vinesim.net.authority import Claim
 from vinesim.net.bus import MemoryHub
@@ -35,7 +36,7 @@ _EXTREMES = (
 
 def sound(model: Model, actor: Puppet, now: float, chance: random.Random) -> tuple[str, bytes]:
     """A family of keys and a message as ``actor`` might send it."""
-    kind = chance.choice(("a", "c", "own", "fact", "hello"))
+    kind = chance.choice(("a", "c", "things", "own", "fact", "hello"))
     tree = chance.randrange(len(model.tree_first))
     claim = Claim(chance.randrange(3), chance.randrange(1 << 16), EVIL)
     if kind == "a":
@@ -48,10 +49,18 @@ def sound(model: Model, actor: Puppet, now: float, chance: random.Random) -> tup
             np.array([len(q)]), q, qd,
         )  # fmt: skip
         return kind, messages.encode_trees(record)[0][0]
+    if kind == "things":
+        number = np.array([thing(Kind.BOX, tree)])
+        flags = np.array([messages.TOUCHED])
+        record = messages.Things(
+            now, number, np.array([claim.ownership]), np.array([claim.authority]), flags,
+            frames.pose(np.array([[0.5, 0.5, 1.0]])), np.zeros((1, 6)),
+        )  # fmt: skip
+        return "c", messages.encode_things(record, (0, 0))[0][0]
     if kind == "own":
         return kind, messages.encode_claims([(tree, claim, chance.random() < 0.5)])
     if kind == "fact":
-        fact = Fact(thing(Kind.BUNCH, chance.randrange(20)), claim.ownership, claim.authority, EVIL)
+        fact = Fact(thing(Kind.BUNCH, tree), claim.ownership, claim.authority, EVIL)
         return kind, messages.encode_facts([fact])
     return "own", messages.encode_hello(Hello(EVIL, scene="puppets", digest="puppets"))
 
@@ -104,7 +113,7 @@ def storm(model: Model, actor: Puppet, seed: int, now: float = 0.0) -> Iterator[
 
 
 def play(count: int, seed: int = 0) -> tuple[Puppet, Puppet, np.ndarray, int]:
-    """A storm against two honest puppets: both, what each tick of the first took of its thread [s], and how many arrived at it."""
+    """A storm against two honest puppets: both, the time of each tick of the first [s], and how many reached it."""
     hub = MemoryHub(delay=0.005, seed=seed)
     server = hub.bus("server")
     server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))

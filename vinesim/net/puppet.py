@@ -27,6 +27,7 @@ from vinesim.net.bus import Bus
 from vinesim.net.exchange import Exchange
 from vinesim.net.messages import Hello
 from vinesim.world.grow import Tree, Wood, assemble
+from vinesim.world.ids import is_tree
 from vinesim.world.model import Model
 from vinesim.world.values import RobotUpdate
 
@@ -42,13 +43,15 @@ for a cane that a robot pushes (13 times in the 0.4 s of the push itself, then 1
 
 
 def row(count: int = 12, *, apart: float = 1.0) -> Model:
-    """Trees of six bodies along x, the first at half the distance between them [m]."""
+    """Trees of six bodies and a bunch along x, the first at half their distance [m], and a box below each."""
     trees = []
     for number in range(count):
         tree = Tree(frames.pose(np.array([(number + 0.5) * apart, 0.0, 1.5])))
-        tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)
+        tip = tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)[-1]
+        tree.bunch(tip, 0.4, clusters=False)
         trees.append(tree)
-    return assemble(trees)
+    boxes = np.array([frames.pose([(number + 0.5) * apart, 0.5, 0.12]) for number in range(count)])
+    return assemble(trees, box_pose=boxes, box_size=np.tile([0.4, 0.3, 0.24], (count, 1)), box_mass=np.full(count, 1.0))
 
 
 class Puppet:
@@ -77,14 +80,22 @@ class Puppet:
         self.swinging: set[int] = set()
         """Trees that move though it does not touch them."""
         self.grabbing: set[int] = set()
-        """Trees it grabs in its next tick."""
+        """Things it grabs in its next tick."""
+        self.picking: set[int] = set()
+        """Bunches that it takes off their vines in its next tick, and carries then."""
+        self.carrying: set[int] = set()
+        """Boxes and loose bunches that move in its hands; what is let go rests where it is at once."""
+        self.parents: dict[int, str] = {}
+        """Where what it lets go of comes to lie, if not on the ground."""
         self.sway = SWAY
         self.came: dict[str, float] = {}
         self.went: dict[str, float] = {}
         self.heard: dict[int, float] = {}
         """When each tree was last heard of, by one's own clock [s]."""
-        self.shown: dict[int, np.ndarray] = {}
-        """Joint rotations of each tree as last heard, brought up to then."""
+        self.moved: dict[int, np.ndarray] = {}
+        """Where others last moved boxes and loose bunches [7]."""
+        self.facts: dict[int, dict[str, Any]] = {}
+        """What it was told for good of each thing."""
         self.released: list[int] = []
         self.reads = 0
         self.ticks = 0
@@ -102,13 +113,20 @@ class Puppet:
             self.went[name] = now
         for update in inbox.trees:
             self.heard[update.tree] = now
-            self.shown[update.tree] = update.joint_q
+        for thing in inbox.things:
+            if thing.thing not in self.moved or not np.array_equal(self.moved[thing.thing], thing.pose):
+                self.moved[thing.thing], self.heard[thing.thing] = thing.pose, now
+        for fact, holds in inbox.facts:
+            self.facts[fact.thing] = {"parent": fact.parent, "moving": fact.moving, "holds": holds, "pose": fact.pose}
         self.released += inbox.released
         self.robots = inbox.robots
         grabbed, self.grabbing = self.grabbing, set()
+        picked, self.picking = self.picking, set()
+        self.carrying |= picked
         self.exchange.send(
-            now, self.pose(now), touched=self.touching, moving=self.swinging, read=self.read, grabbed=grabbed
-        )
+            now, self.pose(now), touched=self.touching | self.carrying, moving=self.swinging, read=self.read,
+            grabbed=grabbed | picked, parted=picked, lies=self.lies,
+        )  # fmt: skip
         self.ticks += 1
 
     def pose(self, now: float) -> RobotUpdate:
@@ -117,10 +135,23 @@ class Puppet:
         speed = 0.6 * np.cos(phase) if self.restless else np.zeros(self.joints)
         return RobotUpdate(self.name, now, frames.pose(self.place), np.zeros(6), 0.3 * np.sin(phase), speed)
 
-    def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
-        """How a tree it moves stands: a swing of every joint about one axis, the same on every clock."""
+    def held(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pose [7] and velocity [6] of what it carries: to and fro above where it stands."""
+        phase = 2.0 * np.pi * SWING * (self._now + self.exchange.offset) + thing
+        pose, velocity = frames.pose(self.place + np.array([0.2 * np.sin(phase), 0.0, 1.0])), np.zeros(6)
+        velocity[0] = 0.4 * np.pi * SWING * np.cos(phase)
+        return pose, velocity
+
+    def lies(self, thing: int) -> tuple[str, np.ndarray]:
+        """Parent and pose [7] of what was let go."""
+        return self.parents.get(thing, ""), self.held(thing)[0]
+
+    def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
+        """How a thing it moves stands; a tree swings about one axis of every joint, the same on every clock."""
         self.reads += 1
-        return swung(self.model, tree, self._now + self.exchange.offset, self.sway)
+        if not is_tree(thing):
+            return self.held(thing)
+        return swung(self.model, thing, self._now + self.exchange.offset, self.sway)
 
     def report(self) -> dict[str, Any]:
         """All that a test may want to know."""
@@ -134,8 +165,9 @@ class Puppet:
             "others": sorted(exchange.actors),
             "came": self.came,
             "went": self.went,
-            "owner": {tree: exchange.owner(tree) for tree in sorted(exchange._claims)},
-            "claim": {tree: list(claim) for tree, claim in sorted(exchange._claims.items())},
+            "owner": {thing: exchange.owner(thing) for thing in sorted(exchange.known)},
+            "claim": {thing: list(exchange.claim(thing)) for thing in sorted(exchange.known)},
+            "facts": self.facts,
             "heard": self.heard,
             "released": self.released,
             "poses": {name: update.position[:1].tolist() for name, update in sorted(self.robots.items())},
@@ -145,7 +177,10 @@ class Puppet:
         }
 
     def obey(self, order: dict[str, Any]) -> None:
-        """``touch``, ``swing``, ``grab``: trees; ``place``: [x, y] m; ``sway``: m."""
+        """``touch``, ``swing``, ``grab``, ``pick``, ``carry``: things; ``lay``: {thing: parent} of what is let go.
+
+        ``place``: [x, y] m; ``sway``: m.
+        """
         for what, value in order.items():
             if what == "touch":
                 self.touching = set(value)
@@ -153,6 +188,13 @@ class Puppet:
                 self.swinging = set(value)
             elif what == "grab":
                 self.grabbing = set(value)
+            elif what == "pick":
+                self.picking = set(value)
+            elif what == "carry":
+                self.carrying = set(value)
+            elif what == "lay":
+                self.parents |= {int(thing): parent for thing, parent in value.items()}
+                self.carrying -= self.parents.keys()
             elif what == "place":
                 self.place[:2] = value
             elif what == "sway":
