@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 log = logging.getLogger(__name__)
@@ -28,7 +29,8 @@ class WrongUse(ValueError):
 
 
 def run(
-    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: list[str] | None,
+    *, role: str, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None,
+    robot: list[str] | None,
     spawn: int, place: tuple[float, float, float] | None, back: float, namespace: str, ros: bool, push: int | None,
     job: str | None, watch: int | None, near: float, device: str,
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
@@ -39,6 +41,9 @@ def run(
         raise WrongUse(f"role {role!r} {built}; give --role robot")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
+
+    if tls is not None and connect is None:
+        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
     from vinesim.physics.memory import device_of
 
@@ -90,7 +95,7 @@ def run(
                 return stack.enter_context(hub.bus(name))
             from vinesim.net.zenoh_bus import ZenohBus
 
-            return stack.enter_context(ZenohBus(name, connect=connect))
+            return stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
 
         perceptions = [
             stack.enter_context(
@@ -106,7 +111,7 @@ def run(
         senses = perceptions[0]
         client = Client(
             plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, near=near, device=device,
-            threads=threads,
+            threads=threads, executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
         for i in range(1, len(names)):
             client.add_robot(descriptions[i], names[i], start_pose(plan, spawn, back, i), bus(names[i]))

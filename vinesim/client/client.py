@@ -13,16 +13,17 @@ a person.
 from __future__ import annotations
 
 import logging
-import tempfile
 import time
 import zlib
 from collections.abc import Callable
-from pathlib import Path
+from concurrent.futures import Executor
 
 import numpy as np
 
 from vinesim import frames
+from vinesim.client.arrivals import Arrivals
 from vinesim.client.person import Person, RemotePerson
+from vinesim.client.things import PULL, Things
 from vinesim.client.trace import Trace
 from vinesim.net import interest
 from vinesim.net.bus import Bus
@@ -32,17 +33,13 @@ from vinesim.physics.people import standing
 from vinesim.physics.step import Physics
 from vinesim.physics.urdf import RobotError
 from vinesim.physics.wind import Wind
-from vinesim.robot import description as descriptions
-from vinesim.robot.description import Description, DescriptionError
+from vinesim.robot.description import Description
 from vinesim.robot.drives import RemoteRobot, Robot
 from vinesim.world.model import Model
 from vinesim.world.scene import Scene
 from vinesim.world.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
 
 log = logging.getLogger(__name__)
-
-PULL = 0.2
-"""Share of the way to its owner's state by which the copy of a tree moves in one tick."""
 
 
 def label_index(name: str) -> int:
@@ -68,12 +65,14 @@ class Client:
         device: str = "cpu",
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
+        executor: Executor | None = None,
     ) -> None:
-        """A robot of this ``description``; None: a person of ``height`` [m], still or where ``source`` says."""
+        """A robot of this ``description``; None: a person of ``height`` [m], still or where ``source`` says.
+
+        ``executor`` prepares others who join, so that no tick has to; without one they are there at once.
+        """
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(
-            model, device=device, threads=threads, picking=False
-        )  # the network does not carry it yet
+        self.physics = Physics(model, device=device, threads=threads)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
@@ -83,6 +82,7 @@ class Client:
         """All people that this client moves, by name."""
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
+        self.things = Things(self.physics, self.exchanges)
         self._near = near
         if description is None:
             self.add_human(HumanSpec(name, label_index(name), standing(pose, height), height), source, bus)
@@ -101,8 +101,7 @@ class Client:
         self.far = Faraway()
         self._clock = clock
         self._copies: dict[int, TreeUpdate] = {}
-        self._expected: dict[str, Hello] = {}
-        """Robots and people that joined and whose place is not known yet."""
+        self.arrivals = Arrivals(self.physics.rigid, description, executor)
 
     def add_robot(self, description: Description, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Move one more robot, standing at ``pose`` [7]; ``bus`` is opened in its name."""
@@ -149,16 +148,17 @@ class Client:
         for hello in inbox.joined:
             log.info("%s joined as %s", hello.name, hello.kind)
             if hello.kind in ("robot", "human"):
-                self._expected[hello.name] = hello
+                self.arrivals.expect(hello)
         for name in inbox.left:
-            self._expected.pop(name, None)
+            self.arrivals.forget(name)
             if (other := self.others.pop(name, None)) is not None:
                 other.leave()
                 self.physics.touching.copies.discard(name)
                 log.info("%s left", name)
         for name, update in (*inbox.robots.items(), *inbox.people.items()):
-            if name in self._expected:
-                self._embody(self._expected.pop(name), update)
+            if name in self.arrivals and (other := self.arrivals.embody(name, update)) is not None:
+                self.others[name] = other
+                self.physics.touching.copies.add(name)
             if name in self.others:
                 self.others[name].follow(update)
         self._pull(inbox)
@@ -188,19 +188,25 @@ class Client:
 
     def send(self, now: float) -> None:
         """Say where robots and people are, and what they touch to those who are near."""
-        physics = self.physics
-        touching = False
+        things = self.things
+        things.look()
+        moving, touching = things.moving, False
+        mine = frozenset().union(*(exchange.mine for exchange in self.exchanges.values()))
         for name, actor in (*self.robots.items(), *self.people.items()):
-            update = actor.update(now)
-            pushed = actor.pushed(self.others) if isinstance(actor, Person) else {}
-            touched = [tree for tree, toucher in physics.touched if toucher == name]
+            exchange, pose = self.exchanges[name], actor.update(now)
+            parted = things.parted(name, all_others=name == self.name)
+            touched = things.touched(name, exchange.mine)
             touching |= bool(touched)
-            settled = self.exchanges[name].send(
-                now, update, touched=touched, moving=physics.sleep.moving, read=self._read, pushed=pushed
+            settled = exchange.send(
+                now, pose, touched=touched, moving=moving, read=things.read,
+                grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, changed=things.changed,
+                lies=self.physics.riding.lies, pushed=actor.pushed(self.others) if isinstance(actor, Person) else None,
             )  # fmt: skip
-            for last in settled:
+            for update in settled:
                 # the last word is what all copies hold: hold it too
-                physics.plants.pull(last.tree, last.joint_q, last.joint_qd, 1.0)
+                things.pull_tree(update, 1.0)
+            for number in mine - exchange.mine:
+                things.rested(exchange.fact(number))
         self.far.note(self, touching)
 
     def side_of(self, point: np.ndarray) -> str:
@@ -221,6 +227,7 @@ class Client:
             return inbox
         here = {name: self.physics.rigid.stands(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
+        loose = {update.thing: update for update in inbox.things}
         nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
         for name, heard in inboxes.items():
             for other, update in (*heard.robots.items(), *heard.people.items()):
@@ -228,31 +235,20 @@ class Client:
                 if other not in nearest or away < nearest[other][0]:
                     nearest[other] = away, update
             trees.update((update.tree, update) for update in heard.trees)
+            loose.update((update.thing, update) for update in heard.things)
+            if heard is not inbox:
+                inbox.facts += heard.facts
         shown = [update for _, (_, update) in sorted(nearest.items())]
         inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
         inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
         inbox.trees = [trees[tree] for tree in sorted(trees)]
+        inbox.things = [loose[number] for number in sorted(loose) if self._told_by_others(number)]
         return inbox
 
-    def _told_by_others(self, tree: int) -> bool:
-        """Whether another client owns a tree: none of one's own robots does, and somebody is known to."""
-        owners = {exchange.owner(tree) for exchange in self.exchanges.values()} - {None}
-        return bool(owners) and not owners & self.robots.keys()
-
-    def _embody(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> None:
-        """Let another client's robot or person stand where it is."""
-        try:
-            if isinstance(update, HumanUpdate):
-                self.others[hello.name] = RemotePerson(self.physics, hello, update)
-                return
-            description = _description_of(hello, [robot.description for robot in self.robots.values()])
-            self.others[hello.name] = RemoteRobot(
-                self.physics.rigid, description, hello.name, hello.index, update.base_q
-            )
-        except ValueError as error:
-            log.warning("%s cannot be shown: %s", hello.name, error)
-            return
-        self.physics.touching.copies.add(hello.name)
+    def _told_by_others(self, thing: int) -> bool:
+        """Whether another client owns a thing: nobody of one's own does, and somebody is known to."""
+        owners = {exchange.owner(thing) for exchange in self.exchanges.values()} - {None}
+        return bool(owners) and not owners & self.exchanges.keys()
 
     def _bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
         """Let a robot feel what other clients' people do to it."""
@@ -263,26 +259,22 @@ class Client:
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
-        plants, told = self.physics.plants, self.physics.touching.told
+        things, told = self.things, self.physics.touching.told
         for update in inbox.trees:
             if update.tree not in self._copies:
-                plants.wake(update.tree)
-                plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
+                self.physics.plants.wake(update.tree)
+                things.pull_tree(update, 1.0)
                 told[update.tree] = True
             self._copies[update.tree] = update
         for tree in [tree for tree in self._copies if not self._told_by_others(tree)]:
             update = self._copies.pop(tree)
             told[tree] = False
             if update.resting:
-                plants.pull(tree, update.joint_q, update.joint_qd, 1.0)
+                things.pull_tree(update, 1.0)
         for tree, update in self._copies.items():
-            plants.wake(tree)
-            plants.pull(tree, update.joint_q, update.joint_qd, PULL)
-
-    def _read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
-        here = self.model.bodies_of(tree)
-        state = self.physics.state
-        return state.joint_q[here], state.joint_qd[here]
+            self.physics.plants.wake(tree)
+            things.pull_tree(update, PULL)
+        things.receive(inbox)
 
 
 class Faraway:
@@ -309,19 +301,3 @@ class Faraway:
             self.bytes += sent - self._seen
             self.ticks_touching += touching
         self._seen = sent
-
-
-def _description_of(hello: Hello, own: list[Description]) -> Description:
-    """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
-    if same := [description for description in own if description.urdf == hello.urdf]:
-        return same[0]
-    try:
-        known = descriptions.load(hello.robot)
-        if known.urdf == hello.urdf:
-            return known
-    except DescriptionError:
-        pass
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"{hello.robot or 'robot'}.urdf"
-        file.write_text(hello.urdf)
-        return descriptions.load(file)

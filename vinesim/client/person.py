@@ -10,6 +10,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.net.messages import Hello
 from vinesim.physics.people import JUMP, LINGER, SIDES
+from vinesim.physics.rigid import Rigid
 from vinesim.physics.step import Physics
 from vinesim.world.values import POINTS, HumanPose, HumanSpec, HumanUpdate
 
@@ -64,14 +65,19 @@ class Person:
 class RemotePerson:
     """The copy of a person whom another client moves: bit for bit where that client says; the hands push what lies."""
 
-    def __init__(self, physics: Physics, hello: Hello, update: HumanUpdate) -> None:
-        self.physics, self.name = physics, hello.name
-        physics.add_human(HumanSpec(hello.name, hello.index, update.pose, hello.height), copy=True)
+    def __init__(self, rigid: Rigid, name: str) -> None:
+        """``name`` is here already; see :func:`spec_of`."""
+        self.rigid, self.name = rigid, name
 
     def follow(self, update: HumanUpdate) -> None:
         """Be where ``update`` says at the end of the coming tick."""
-        self.physics.move_human(self.name, update.pose)
+        self.rigid.move_human(self.name, update.pose)
 
     def leave(self) -> None:
         """Go."""
-        self.physics.remove_human(self.name)
+        self.rigid.remove_human(self.name)
+
+
+def spec_of(hello: Hello, update: HumanUpdate) -> HumanSpec:
+    """A person as physics needs one, from what another client tells."""
+    return HumanSpec(hello.name, hello.index, update.pose, hello.height)

@@ -35,6 +35,8 @@ class Actor:
         """Take a newer pose at network ``time``; False if it is not newer."""
         if (self.hello.kind == "human") != isinstance(update, HumanUpdate):
             raise MessageError(f"pose of a {type(update).__name__} by {update.actor!r}, which is a {self.hello.kind}")
+        if update.time > time + smooth.FUTURE:
+            update = dataclasses.replace(update, time=time + smooth.FUTURE)
         if self.update is not None and update.time <= self.update.time:
             return False
         if isinstance(update, RobotUpdate):

@@ -40,22 +40,22 @@ class Geoms:
 
 def listed(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> Geoms:
     """What touches anything of the MuJoCo bodies in ``owner``, which tells actor and link of each."""
-    ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] in owner and m.geom_contype[g]], int)
-    return _of(m, ids, [owner[int(b)] for b in m.geom_bodyid[ids]])
+    ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)) & (m.geom_contype != 0))
+    return _of(m, ids, [owner[body] for body in m.geom_bodyid[ids].tolist()])
 
 
 def standing(m: mujoco.MjModel) -> Geoms:
     """Ground, poles and trunks: MuJoCo's first geoms, whoever comes and goes."""
-    ids = np.array([g for g in range(m.ngeom) if m.geom_bodyid[g] == 0 and m.geom_contype[g]], int)
+    ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
     return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 
 
 def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Geoms:
     """What there is to know of some geoms; ``names``: actor and link of each."""
-    last = np.full(m.nbody, -1)
-    for body in range(1, m.nbody):
-        count = m.body_dofnum[body]
-        last[body] = m.body_dofadr[body] + count - 1 if count else last[m.body_parentid[body]]
+    last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1).tolist()
+    for body, parent in enumerate(m.body_parentid.tolist()):  # parents come first
+        if last[body] < 0:
+            last[body] = last[parent]
     body, kind, size = m.geom_bodyid[ids], m.geom_type[ids].copy(), m.geom_size[ids].copy()
     mesh = kind == mujoco.mjtGeom.mjGEOM_MESH
     kind[mesh], size[mesh] = mujoco.mjtGeom.mjGEOM_BOX, m.geom_aabb[ids][mesh, 3:]
@@ -77,7 +77,7 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Geo
         center=center,
         radius=radius,
         friction=m.geom_friction[ids, 0].copy(),
-        dof=last[body].astype(np.int32),
+        dof=np.array(last, np.int32)[body],
         root=m.body_rootid[body].astype(np.int32),
         actor=tuple(actor for actor, _ in names),
         link=tuple(link for _, link in names),

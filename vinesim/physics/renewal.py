@@ -25,6 +25,12 @@ def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return world
 
 
+def names(m: mujoco.MjModel, of: np.ndarray) -> list[str]:
+    """Names of all joints, bodies or the like, ``of`` being MuJoCo's ``name_jntadr``, ``name_bodyadr`` and so on."""
+    text = m.names
+    return [text[at : text.index(b"\0", at)].decode() for at in of.tolist()]
+
+
 def carried(
     old: mujoco.MjModel, old_data: mujoco.MjData, old_contact: np.ndarray, new: mujoco.MjModel, parked: set[str]
 ) -> tuple[mujoco.MjData, np.ndarray]:
@@ -32,46 +38,58 @@ def carried(
 
     ``parked`` names joints that only seem to be the same ones.
     """
-    joints = {old.joint(i).name: i for i in range(old.njnt)}
-    pairs = [(i, joints[name]) for i in range(new.njnt) if (name := new.joint(i).name) in joints and name not in parked]
+    pairs = _pairs(names(new, new.name_jntadr), names(old, old.name_jntadr), parked)
+    to, source = np.array(pairs, int).reshape(-1, 2).T
     asleep = _sleepers(old, old_data, new, pairs)
-    leaning = _leaning(old, old_data, pairs)
+    leaning = _leaning(old, old_data, source)
     # Only making its data lets MuJoCo take things for asleep. They lie where they are and depend on nothing.
-    for i, j in pairs:
-        if new.jnt_type[i] == _FREE:
-            to, source, tree = new.jnt_qposadr[i], old.jnt_qposadr[j], int(new.dof_treeid[new.jnt_dofadr[i]])
-            new.qpos0[to : to + 7] = old_data.qpos[source : source + 7]
-            new.tree_sleep_policy[tree] = _INIT if tree in asleep else _ALLOWED
+    free = new.jnt_type[to] == _FREE
+    to_q, from_q = (_spread(m.jnt_qposadr[joint], np.where(free, 7, 1)) for m, joint in ((new, to), (old, source)))
+    to_v, from_v = (_spread(m.jnt_dofadr[joint], np.where(free, 6, 1)) for m, joint in ((new, to), (old, source)))
+    lying = np.repeat(free, np.where(free, 7, 1))
+    new.qpos0[to_q[lying]] = old_data.qpos[from_q[lying]]
+    for tree in np.unique(new.dof_treeid[new.jnt_dofadr[to[free]]]).tolist():
+        new.tree_sleep_policy[tree] = _INIT if tree in asleep else _ALLOWED
     new.opt.disableflags |= _CONSTRAINT
     data = mujoco.MjData(new)
     new.opt.disableflags &= ~_CONSTRAINT
     contact = np.zeros(new.nv)
     data.time = old_data.time
-    for i, j in pairs:
-        q, v = (7, 6) if new.jnt_type[i] == _FREE else (1, 1)
-        to_q, from_q, to_v, from_v = new.jnt_qposadr[i], old.jnt_qposadr[j], new.jnt_dofadr[i], old.jnt_dofadr[j]
-        data.qpos[to_q : to_q + q] = old_data.qpos[from_q : from_q + q]
-        for name in OF_DOFS:
-            getattr(data, name)[to_v : to_v + v] = getattr(old_data, name)[from_v : from_v + v]
-        contact[to_v : to_v + v] = old_contact[from_v : from_v + v]
-        tree, was = new.dof_treeid[to_v], old.dof_treeid[from_v]
+    data.qpos[to_q], contact[to_v] = old_data.qpos[from_q], old_contact[from_v]
+    for name in OF_DOFS:
+        getattr(data, name)[to_v] = getattr(old_data, name)[from_v]
+    trees = set(zip(new.dof_treeid[to_v].tolist(), old.dof_treeid[from_v].tolist(), strict=True))
+    for tree, was in sorted(trees):
         if tree in asleep:
             data.tree_asleep[tree] = asleep[tree]
         elif old_data.tree_asleep[was] < 0:
             data.tree_asleep[tree] = ROUSED if was in leaning else old_data.tree_asleep[was]
-    bodies = {old.body(i).name: i for i in range(1, old.nbody)}
-    for i in range(1, new.nbody):
-        if (j := bodies.get(new.body(i).name)) is not None and new.body(i).name not in parked:
-            data.xfrc_applied[i] = old_data.xfrc_applied[j]
-            if new.body_mocapid[i] >= 0 and old.body_mocapid[j] >= 0:
-                data.mocap_pos[new.body_mocapid[i]] = old_data.mocap_pos[old.body_mocapid[j]]
-                data.mocap_quat[new.body_mocapid[i]] = old_data.mocap_quat[old.body_mocapid[j]]
+    bodies = _pairs(names(new, new.name_bodyadr), names(old, old.name_bodyadr), parked)
+    to, source = np.array(bodies, int).reshape(-1, 2).T
+    data.xfrc_applied[to] = old_data.xfrc_applied[source]
+    to, source = new.body_mocapid[to], old.body_mocapid[source]
+    led = (to >= 0) & (source >= 0)
+    data.mocap_pos[to[led]], data.mocap_quat[to[led]] = (
+        old_data.mocap_pos[source[led]],
+        old_data.mocap_quat[source[led]],
+    )
     return data, contact
 
 
-def _leaning(old: mujoco.MjModel, old_data: mujoco.MjData, pairs: list[tuple[int, int]]) -> set[int]:
+def _pairs(new: list[str], old: list[str], parked: set[str]) -> list[tuple[int, int]]:
+    """(number in the new world, number in the old) of whatever is in both."""
+    was = {name: number for number, name in enumerate(old)}
+    return [(number, was[name]) for number, name in enumerate(new) if name in was and name not in parked]
+
+
+def _spread(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """``count`` [k] numbers in a row from each ``first`` [k]."""
+    return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
+
+
+def _leaning(old: mujoco.MjModel, old_data: mujoco.MjData, staying: np.ndarray) -> set[int]:
     """Trees of the old world that were in touch with one that is gone, or held by it: they may not sleep at once."""
-    gone = np.setdiff1d(np.arange(old.ntree), old.dof_treeid[old.jnt_dofadr[[j for _, j in pairs]]])
+    gone = np.setdiff1d(np.arange(old.ntree), old.dof_treeid[old.jnt_dofadr[staying]])
     islands = np.unique(old_data.tree_island[gone])
     return set(np.flatnonzero(np.isin(old_data.tree_island, islands[islands >= 0])).tolist())
 

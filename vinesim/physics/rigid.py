@@ -10,6 +10,8 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 
 from __future__ import annotations
 
+import dataclasses
+import threading
 from typing import Any
 
 import mujoco
@@ -29,6 +31,17 @@ from vinesim.world.values import HandSample, HumanPose, HumanSpec, Link, RobotSp
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 
 
+@dataclasses.dataclass(frozen=True)
+class Draft:
+    """A world that is compiled and in which nothing has happened yet."""
+
+    robots: tuple[RobotBody, ...]
+    people: tuple[Person, ...]
+    slots: int
+    """How many loose bunches have room in it."""
+    world: mujoco.MjModel
+
+
 class Rigid:
     """Robots, boxes and what stands, in one MuJoCo world that is compiled anew when an actor comes or goes."""
 
@@ -41,6 +54,7 @@ class Rigid:
         self._waiting = 0
         self._slot: dict[int, int] = {}
         self._scene = yard.furnished(model, dt)
+        self._drafting = threading.Lock()
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
         self.faults = 0
@@ -48,6 +62,8 @@ class Rigid:
         self.complaint = ""
         self.generation = 0
         """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
+        self.owners: dict[int, tuple[str, str]] = {}
+        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`geoms.Geoms` names them."""
         self._compile()
 
     # ------------------------------------------------------------------ who is here
@@ -62,13 +78,43 @@ class Rigid:
 
         Raises :class:`RobotError` and leaves the world as it was if the URDF does not compile.
         """
-        self._robots[spec.name] = RobotBody(spec, self._admit("robot", spec.name, RobotError))
+        while not self.admit(self.prepare(spec)):
+            pass
+
+    def prepare(self, spec: RobotSpec | HumanSpec, *, copy: bool = False) -> Draft:
+        """The world with one more actor in it, for :meth:`admit`. Any thread may call this while the ticks go on.
+
+        Raises :class:`RobotError` if the URDF does not compile. ``copy``: see :meth:`add_human`.
+        """
+        robots, people = tuple(self._robots.values()), tuple(self._people.values())
+        if isinstance(spec, HumanSpec):
+            return self._draft(robots, (*people, Person(spec, self._admit("human", spec.name, HumanError), copy=copy)))
+        robot = RobotBody(spec, self._admit("robot", spec.name, RobotError))
         try:
-            self._compile()
+            return self._draft((*robots, robot), people)
         except ValueError as error:
-            del self._robots[spec.name]
             raise unfit(spec, error) from error
+
+    def admit(self, draft: Draft) -> bool:
+        """Between ticks, let the actor in for whom ``draft`` was made, where its ``spec`` says.
+
+        False, and nothing has happened, if others came or went meanwhile: prepare it anew.
+        """
+        here = (*self._robots.values(), *self._people.values())
+        those = (*draft.robots, *draft.people)
+        (newcomer, *more) = [actor for actor in those if actor not in here] or [None]
+        others = tuple(actor for actor in those if actor is not newcomer)
+        if newcomer is None or more or others != here or draft.slots <= max(self._slot.values(), default=-1):
+            return False
+        if isinstance(newcomer, Person):
+            self._people[newcomer.spec.name] = newcomer
+            self._renew(draft)
+            return True
+        spec = newcomer.spec
+        self._robots[spec.name] = newcomer
+        self._renew(draft)
         self.place(spec.name, spec.pose, spec.home)
+        return True
 
     def remove_robot(self, name: str) -> None:
         """Let a robot leave; all others go on exactly where they are."""
@@ -107,8 +153,8 @@ class Rigid:
 
         ``copy``: another client moves the person; here the hands neither hold anything nor touch robots.
         """
-        self._people[spec.name] = Person(spec, self._admit("human", spec.name, HumanError), copy=copy)
-        self._compile()
+        while not self.admit(self.prepare(spec, copy=copy)):
+            pass
 
     def remove_human(self, name: str) -> None:
         """Let a person leave, and whatever the hands hold."""
@@ -536,22 +582,33 @@ class Rigid:
 
     # ------------------------------------------------------------------ building the world
 
-    def _compile(self) -> None:
-        """Build the world anew and carry every joint's and body's state over by its name."""
-        spec = self._scene.copy()
-        for robot in self._robots.values():
-            robot.attach(spec)
-        for person in self._people.values():
-            person.attach(spec, sum(1 << robot.bit for robot in self._robots.values()))
-        self._waiting = max(self._slot.values(), default=-1) + 1 + loose.WAITING
-        for slot in range(self._waiting):
-            loose.wait(spec, slot)
-        before = (self.world, self.data, self._contact) if self.generation else None
-        self.world = world = renewal.compiled(spec)
+    def _draft(self, robots: tuple[RobotBody, ...], people: tuple[Person, ...]) -> Draft:
+        """A world with these in it and room for loose bunches, compiled; nothing here changes."""
+        slots = max(self._slot.values(), default=-1) + 1 + loose.WAITING
+        with self._drafting:
+            spec = self._scene.copy()
+            for robot in robots:
+                robot.attach(spec)
+            for person in people:
+                person.attach(spec, sum(1 << robot.bit for robot in robots))
+            for slot in range(slots):
+                loose.wait(spec, slot)
+            world = renewal.compiled(spec)
         # the solver's tolerance is relative to it: whoever joins would change when it stops for everybody else
         world.stat.meaninertia = 1.0
-        for slot in range(self._waiting):
+        for slot in range(slots):
             loose.untouch(world, slot)
+        return Draft(robots, people, slots, world)
+
+    def _compile(self) -> None:
+        """Build the world anew for those who are here now."""
+        self._renew(self._draft(tuple(self._robots.values()), tuple(self._people.values())))
+
+    def _renew(self, draft: Draft) -> None:
+        """Go on in another world, every joint's and body's state carried over by its name."""
+        before = (self.world, self.data, self._contact) if self.generation else None
+        self.world, self._waiting = draft.world, draft.slots
+        world = self.world
         for bunch, body in self._bunches.items():
             loose.embody(world, self._slot[bunch], body, loose.alone(body))
         if before is None:
@@ -590,7 +647,8 @@ class Rigid:
         self._links, self._link_body = self._list_links()
         self._link_row = np.zeros(self.world.nbody, int)
         self._link_row[self._link_body] = np.arange(len(self._link_body))
-        self.geoms = geoms.listed(self.world, self._owners())
+        self.owners = self._owners()
+        self.geoms = geoms.listed(self.world, self.owners)
 
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics import renewal
 from vinesim.physics.urdf import RobotError, check, shapes_of, touchable
 from vinesim.physics.yard import ALL, GROUND, GUEST, ROUGH
 from vinesim.world.values import RobotSpec
@@ -131,7 +132,7 @@ class RobotBody:
         self.base_q = np.array([j.qposadr[0] for j in planar], int)
         self.base_v = np.array([j.dofadr[0] for j in planar], int)
         self.base_actuator = np.array([m.actuator(f"{name}:{axis}").id for axis in _PLANAR], int)
-        names = [m.body(i).name for i in range(m.nbody)]
+        names = renewal.names(m, m.name_bodyadr)
         self.bodies = {n.removeprefix(name + "/"): i for i, n in enumerate(names) if n.startswith(name + "/")}
         self._set_gains(m)
 
