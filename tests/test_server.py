@@ -404,8 +404,12 @@ def test_a_server_that_carries_waits_for_the_one_that_keeps():
     (endpoint,) = chosen(["tcp/127.0.0.1:0"])
     with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as relay, ZenohBus("ada", connect=relay.endpoint) as ada:
         ada.join(hello("ada"))  # nobody decides yet
+        assert not ada.trouble
         with Server(str(endpoint)) as hub:
             wait(lambda: hub._agreement.plan("vineyard") == Plan("vsp", "D1"), "ada to say who she is")
+        wait(lambda: "the server that keeps world 'vineyard' is gone" in ada.trouble, "ada to miss the one that keeps")
+        with Server(str(endpoint)) as hub:
+            wait(lambda: not ada.trouble and hub.actors == ["vineyard/ada"], "ada to be well")
 
 
 def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):

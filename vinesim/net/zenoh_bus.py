@@ -198,6 +198,8 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._gone: set[str] = set()
         """Endpoints that do not answer now."""
+        self._kept = True
+        """The server that keeps this world is there, or never was."""
         self._refusal = ""
         self._session = self._poses = _opened(way.bulk, self._credentials)
         try:
@@ -299,10 +301,14 @@ class ZenohBus:
     def trouble(self) -> str:
         if self._refusal:
             return self._refusal
-        gone = sorted(self._gone)
-        if not gone:
-            return ""
-        return f"the server at {gone[0]} is gone; the local simulation goes on and reconnects by itself"
+        for endpoint in sorted(self._gone):
+            return f"the server at {endpoint} is gone; the local simulation goes on and reconnects by itself"
+        if not self._kept:
+            return (
+                f"behind {self.endpoint} the server that keeps world {self.world!r} is gone; what is said for good is "
+                "said again when it is back"
+            )
+        return ""
 
     def join(self, greeting: bytes) -> None:
         key = f"{self._prefix}join/{self.name}/{self._session.zid()}"
@@ -334,10 +340,12 @@ class ZenohBus:
             if refused:
                 log.error("%s: the server that came back lets this actor in no more: %s", self.name, self._refusal)
 
-        self._declared += [
-            doorkeeper,
-            doorkeeper.declare_matching_listener(lambda status: status.matching and self.outside(ask_again)),
-        ]
+        def notice(status: zenoh.MatchingStatus) -> None:
+            self._kept = status.matching
+            if status.matching:
+                self.outside(ask_again)
+
+        self._declared += [doorkeeper, doorkeeper.declare_matching_listener(notice)]
         if not welcomes and doorkeeper.matching_status.matching:
             self.outside(ask_again)
 
