@@ -17,9 +17,11 @@ from vinesim.net import archive, messages
 from vinesim.net.agreement import Plan
 from vinesim.net.archive import Quota
 from vinesim.net.bus import EVERY, NameTaken, Refused
+from vinesim.net.counters import Counters
 from vinesim.net.endpoints import chosen
 from vinesim.net.messages import Fact, Hello, Welcome
 from vinesim.net.server import PortTaken, Server
+from vinesim.net.telling import Telling
 from vinesim.net.zenoh_bus import ZenohBus, close_session, config, open_session
 from vinesim.world.ids import Kind, thing
 
@@ -328,6 +330,42 @@ def test_a_server_killed_in_full_flight_has_lost_nothing_it_told(tmp_path):
             again = snapshot(ada, (0, 0), 50)
             assert again[:50] == told
             assert again == [box(number) for number in range(len(again))]  # and of the rest the first that came
+
+
+def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
+    """Those who are there are its memory."""
+    with (
+        serving("tcp/127.0.0.1:0", tmp_path / "one") as (first, endpoint),
+        ZenohBus("ada", connect=endpoint) as ada,
+        ZenohBus("late", connect=endpoint) as late,
+    ):
+        ada.join(hello("ada"))
+        telling = Telling(ada, Counters())
+        told: list = []
+
+        def ticking(condition):
+            def check():
+                telling.follow([(0, 0)], time.monotonic())
+                telling.speak()
+                time.sleep(0.005)
+                return condition()
+
+            return check
+
+        def known():
+            late.ask("snap/0/0")
+            told[:] = [fact for answer in late.answers() for fact in messages.decode_facts(answer.payload)] or told
+            return told == [box(number) for number in range(30)]
+
+        for number in range(30):
+            telling.say((0, 0), box(number))
+        wait(ticking(known), "thirty facts")
+        first.kill()
+        first.wait()
+        wait(ticking(lambda: ada.trouble), "ada to miss the server")
+        with serving(endpoint, tmp_path / "another"):  # a folder with nothing in it
+            told.clear()
+            wait(ticking(known), "the same facts again")
 
 
 def test_the_scene_is_kept_with_the_facts(tmp_path):

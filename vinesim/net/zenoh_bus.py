@@ -43,6 +43,9 @@ CONNECT = "tcp/127.0.0.1:7447"
 LEASE = 2000
 """A peer that is silent for this long is gone [ms]."""
 
+HUGE = 4 * messages.LARGEST
+"""What is larger [B] is not even put together from its fragments, here or in the router."""
+
 PATIENCE = 2.0
 """How long connecting may take [s]."""
 
@@ -72,6 +75,7 @@ def config(mode: str, **settings: Any) -> zenoh.Config:
         "scouting__gossip__enabled": False,
         "scouting__delay": 0,
         "transport__link__tx__lease": LEASE,
+        "transport__link__rx__max_message_size": HUGE,
         "transport__shared_memory__enabled": False,
         "transport__unicast__open_timeout": 1500,
         "transport__unicast__accept_timeout": 1500,
