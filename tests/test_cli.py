@@ -156,7 +156,8 @@ def test_secured_from_certificate_to_client(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[-2:] == [str(certs / "ada.key"), str(certs / "ada.pem")]
     refused(vinesim("certs", "new", "ada", "--dir", str(certs)), 4, "ada.pem", "there already")
-    with serving("--listen", "tls/127.0.0.1:0", "--tls", str(certs), "--status", "text") as (_, line):
+    arguments = ["--listen", "tls/127.0.0.1:0", "--tls", str(certs), "--status", "text", "--scene", "demo"]
+    with serving(*arguments) as (_, line):
         endpoint = line.split()[-1]
         common = [
             "client",
