@@ -217,6 +217,7 @@ class Rigid:
         """Several at once, each with its pose [7] and velocity [6]: they are listed but once."""
         if known := sorted(bunches.keys() & self._bunches.keys()):
             raise ValueError(f"bunch {known[0]} is loose already")
+        derived = {bunch: loose.alone(body) for bunch, (body, _, _) in bunches.items()}
         free = iter(sorted(set(range(self._waiting + len(bunches))) - set(self._slot.values())))
         for bunch, (body, _, _) in bunches.items():
             self._bunches[bunch], self._slot[bunch] = body, next(free)
@@ -224,7 +225,7 @@ class Rigid:
             self._compile()
         else:
             for bunch, (body, _, _) in bunches.items():
-                loose.embody(self.world, self._slot[bunch], body, loose.alone(body))
+                loose.embody(self.world, self._slot[bunch], body, derived[bunch])
             self._list()
         for bunch, (_, pose, velocity) in bunches.items():
             self.place_bunch(bunch, pose, velocity)
