@@ -238,7 +238,7 @@ class Exchange:
         if not self._telling.hear(cell, fact):
             return
         claim = Claim(fact.ownership, fact.authority, fact.author if fact.moving else NOBODY)
-        holds = self._own.hear_fact(fact.thing, claim, time)
+        holds = self._own.hear_fact(fact.thing, claim, fact.moving, time)
         if told:
             inbox.facts.append((self._telling.facts.of(fact.thing) or fact, holds))
 

@@ -232,18 +232,24 @@ class Rigid:
 
     def add_bunch(self, bunch: int, body: Loose, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Take a bunch over from its vine: ``pose`` [7] and ``velocity`` [6] (of its origin, angular; world axes)."""
-        if bunch in self._bunches:
-            raise ValueError(f"bunch {bunch} is loose already")
-        derived = loose.alone(body)
-        taken = set(self._slot.values())
-        slot = next((i for i in range(self._waiting) if i not in taken), self._waiting)
-        self._bunches[bunch], self._slot[bunch] = body, slot
-        if slot == self._waiting:
+        self.add_bunches({bunch: (body, pose, velocity)})
+
+    def add_bunches(self, bunches: dict[int, tuple[Loose, np.ndarray, np.ndarray]]) -> None:
+        """Several at once, each with its pose [7] and velocity [6]: they are listed but once."""
+        if known := sorted(bunches.keys() & self._bunches.keys()):
+            raise ValueError(f"bunch {known[0]} is loose already")
+        derived = {bunch: loose.alone(body) for bunch, (body, _, _) in bunches.items()}
+        free = iter(sorted(set(range(self._waiting + len(bunches))) - set(self._slot.values())))
+        for bunch, (body, _, _) in bunches.items():
+            self._bunches[bunch], self._slot[bunch] = body, next(free)
+        if max(self._slot[bunch] for bunch in bunches) >= self._waiting:
             self._compile()
         else:
-            loose.embody(self.world, slot, body, derived)
+            for bunch, (body, _, _) in bunches.items():
+                loose.embody(self.world, self._slot[bunch], body, derived[bunch])
             self._list()
-        self.place_bunch(bunch, pose, velocity)
+        for bunch, (_, pose, velocity) in bunches.items():
+            self.place_bunch(bunch, pose, velocity)
 
     def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put a loose bunch somewhere: ``pose`` [7], ``velocity`` [6] in world axes."""

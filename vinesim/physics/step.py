@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vinesim import frames
 from vinesim.physics.detail import Detail
 from vinesim.physics.guard import Guard
 from vinesim.physics.holding import Holding
+from vinesim.physics.lying import Lying
 from vinesim.physics.parting import Blade, Partings
 from vinesim.physics.plants import Plants
 from vinesim.physics.riding import Riding
@@ -18,7 +20,7 @@ from vinesim.physics.touching import Touching
 from vinesim.physics.wind import Wind
 from vinesim.world.model import Model
 from vinesim.world.state import State
-from vinesim.world.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Parting, RobotSpec, View
+from vinesim.world.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
 
 STIRRED = 4.0
 """[m] With robots or people about, wind moves only the trees whose foot is so near to one of them."""
@@ -42,6 +44,8 @@ class Physics:
         self.parting = Partings(self.plants, self.rigid, self.touching)
         self.holding = Holding(self.plants, self.rigid, self.touching)
         self.riding = Riding(self.rigid)
+        self.lying = Lying(self.plants, self.rigid, self.touching, self.riding)
+        self._links: tuple[tuple[Link, ...], tuple[Link, ...], tuple[Link, ...]] = ((), (), ())
         self._picking = picking
         self.detail = Detail(self.plants)
         self.sleep = Sleep(self.plants)
@@ -50,6 +54,8 @@ class Physics:
         """What blows, if anything does; set it as you like."""
         self.partings: tuple[Parting, ...] = ()
         """What left its plant in the last tick, or by command before it; sorted by body."""
+        self.stirred = np.zeros(0, np.int32)
+        """Trees that have moved without being awake [k], because others said so since the last tick."""
         self.tick = 0
         self._body_q: np.ndarray | None = None
         self._fresh = True
@@ -116,10 +122,22 @@ class Physics:
             tick=self.tick,
             body_q=self._body_q,
             bunch_attached=self.state.bunch_attached.copy(),
-            links=self.rigid.links(),
-            link_q=self.rigid.link_q(),
-            moved=self.plants.awake.copy(),
+            links=self.links(),
+            link_q=self.link_q(),
+            moved=np.union1d(self.plants.awake, self.stirred),
         )
+
+    def links(self) -> tuple[Link, ...]:
+        """All rigid bodies that can be seen, with a body or without; the same object until one comes or goes."""
+        rigid, lying = self.rigid.links(), self.lying.links()
+        if self._links[0] is not rigid or self._links[1] is not lying:
+            self._links = rigid, lying, rigid + lying
+        return self._links[2]
+
+    def link_q(self) -> np.ndarray:
+        """Poses [link, 7] of :meth:`links`."""
+        rigid = self.rigid.link_q()
+        return np.concatenate([rigid, self.lying.link_q()]) if len(self.lying) else rigid
 
     # ------------------------------------------------------------------ who is here
 
@@ -170,6 +188,15 @@ class Physics:
     def told_cut(self, body: int) -> None:
         """Another client has cut a piece of wood off; see :meth:`Partings.told_cut`."""
         self.parting.told_cut(body)
+        self._body_q = None
+
+    def told_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
+        """Others say in what shape trees rest ([body of the tree, 4] each): so they do here, and none wakes for it."""
+        for tree, turned in zip(trees, joint_q, strict=True):
+            self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(turned, np.float32))
+        self.plants.rest(np.array(trees, np.int32))
+        self.touching.moved(np.array(trees, np.int32))
+        self.stirred = np.union1d(self.stirred, trees).astype(np.int32)
         self._body_q = None
 
     def watch(self, points: np.ndarray, radius: float) -> None:
