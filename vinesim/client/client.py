@@ -191,11 +191,11 @@ class Client:
         things = self.things
         things.look()
         moving, touching = things.moving, False
-        mine = frozenset().union(*(exchange.mine for exchange in self.exchanges.values()))
         for name, actor in (*self.robots.items(), *self.people.items()):
             exchange, pose = self.exchanges[name], actor.update(now)
+            mine = exchange.mine
             parted = things.parted(name, all_others=name == self.name)
-            touched = things.touched(name, exchange.mine)
+            touched = things.touched(name, mine)
             touching |= bool(touched)
             settled = exchange.send(
                 now, pose, touched=touched, moving=moving, read=things.read,
