@@ -29,6 +29,8 @@ scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Viney
 ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: set-up and state.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
+certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certificates for secured links.")
+app.add_typer(certs_app, name="certs")
 
 Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
 Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, harvest, tendone, vsp.")]
@@ -83,25 +85,64 @@ def demo(
 
 @app.command()
 def server(
-    listen: Annotated[str, typer.Option(help="Where to listen; port 0 takes a free one.")] = "tcp/0.0.0.0:7447",
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where to listen, several times if need be; port 0 takes a free one. tcp/0.0.0.0:7447 for everything "
+            "and udp/0.0.0.0:7447 for poses, unless given; with --tls tls/ and quic/."
+        ),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Link to the server at this endpoint and only carry: that one answers and keeps."),
+    ] = None,
+    keep: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Folder in which picked bunches, boxes and cuts are kept; in memory unless given."),
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="Let in this scene only; unless given, the first actor decides.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of that scene, instead of its own.")] = None,
+    max_clients: Annotated[
+        int | None, typer.Option(min=1, help="So many actors at a time; no bound unless given.")
+    ] = None,
+    quota: Annotated[
+        tuple[float, float],
+        typer.Option(help="MESSAGES/s and BYTES/s that one actor may say for good (cuts, where things lie)."),
+    ] = (200.0, 200_000.0),
+    tls: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): nobody else gets in.")
+    ] = None,
+    status: Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")] = "none",
 ) -> None:
-    """Carry messages between clients. The server simulates nothing.
+    """Carry messages between clients, and keep what stays true. The server simulates nothing.
+
+    Facts are kept in memory unless --keep is given: a demonstration begins with an unpicked vineyard every time.
 
     \b
     Examples:
       vinesim server
-      vinesim server --listen tcp/127.0.0.1:0
+      vinesim server --listen tcp/127.0.0.1:0 --status text
+      vinesim server --scene vsp --max-clients 12 --keep harvest/
+      vinesim server --tls certs/
+      vinesim server --connect tcp/192.168.1.5:7447
     """
+    options = dict(locals())
     from vinesim.cli.serve import run
 
-    raise typer.Exit(run(listen))
+    raise typer.Exit(run(**options))
 
 
 @app.command()
 def client(
-    role: Annotated[str, typer.Option(help="robot. (human and spectator are not built yet.)")] = "robot",
+    role: Annotated[str, typer.Option(help="robot or human. (spectator is not built yet.)")] = "robot",
     name: Annotated[str | None, typer.Option(help="The actor's name, one of a kind; robot-PID unless given.")] = None,
     connect: Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")] = None,
+    tls: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Folder with ca.pem, NAME.pem and NAME.key; the server is then tls/HOST:7447."),
+    ] = None,
     scene: Scene = "demo",
     seed: Seed = None,
     robot: Annotated[
@@ -118,6 +159,11 @@ def client(
     ros: Annotated[bool, typer.Option(help="Talk ROS 2, if it is installed.")] = True,
     push: Annotated[int | None, typer.Option(help="Reach for this bunch and push it, again and again.")] = None,
     job: Annotated[str | None, typer.Option(help="Do a job and stop: pick or exchange.")] = None,
+    walk: Annotated[tuple[float, float] | None, typer.Option(help="A human: walk to this place, x y [m].")] = None,
+    reach: Annotated[
+        int | None, typer.Option(help="A human: walk to this bunch, hold it, pull at it, let go, again and again.")
+    ] = None,
+    height: Annotated[float, typer.Option(min=1.0, max=2.5, help="Of a human [m].")] = 1.75,
     watch: Annotated[int | None, typer.Option(help="Record force and displacement of this bunch.")] = None,
     near: Annotated[
         float, typer.Option(min=0.1, max=5.0, help="Others nearer than this to a thing hear of it [m].")
@@ -141,11 +187,16 @@ def client(
       vinesim client --role robot --connect tcp/127.0.0.1:7447 --name picker --spawn 1
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
+      vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva --reach 12
     """
     options = dict(locals())
+    if role == "human":
+        from vinesim.cli.human import run as visit
+
+        raise typer.Exit(visit(**options))
     from vinesim.cli.join import run
 
-    raise typer.Exit(run(**options))
+    raise typer.Exit(run(**{name: value for name, value in options.items() if name not in ("walk", "reach", "height")}))
 
 
 @scene_app.command("show")
@@ -168,19 +219,25 @@ def scene_show(
 
 @app.command()
 def bench(
-    names: Annotated[list[str], typer.Argument(help="plants, camera; several are run one after the other.")],
+    names: Annotated[list[str], typer.Argument(help="plants, camera, sync; several are run one after the other.")],
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
+    plot: Annotated[pathlib.Path | None, typer.Option(help="Where sync draws what it measured (.png).")] = None,
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
+
+    Of physics and sensors: plants, contact, tick, asleep, camera. Of the network: sync (what delay does, in simulated
+    time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
+    fuzz (broken messages).
 
     \b
     Examples:
       vinesim bench plants --json
       vinesim bench plants camera
+      vinesim bench sync --json --plot docs/pictures/network-sync.png
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json))
+    raise typer.Exit(run(names, json, plot))
 
 
 @ros_app.command("build-interfaces")
@@ -196,6 +253,33 @@ def ros_build(
     from vinesim.cli.ros import build
 
     raise typer.Exit(build(quiet))
+
+
+@certs_app.command("new")
+def certs_new(
+    actor: Annotated[str, typer.Argument(help="The actor's name, or server.")],
+    dir: Annotated[pathlib.Path, typer.Option(help="Folder of the authority; made at first use.")] = pathlib.Path(
+        "certs"
+    ),
+    role: Annotated[str, typer.Option(help="robot, human or spectator, who only reads.")] = "robot",
+    host: Annotated[
+        list[str] | None, typer.Option(help="For server: name or address by which clients reach it; repeatable.")
+    ] = None,
+) -> None:
+    """Make the certificate and key of an actor; at first use the authority's and the server's as well.
+
+    An actor needs ca.pem, NAME.pem and NAME.key; ca.key stays where it is made. The server reads its folder when it
+    starts: an actor made later is let in after a restart, one whose .pem is removed is not.
+
+    \b
+    Examples:
+      vinesim certs new server --host 192.168.1.5
+      vinesim certs new picker
+      vinesim certs new visitor --role spectator --dir certs
+    """
+    from vinesim.cli.certs import new
+
+    raise typer.Exit(new(actor, dir, role, host or []))
 
 
 @app.callback()

@@ -12,6 +12,7 @@ import re
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -28,17 +29,21 @@ class WrongUse(ValueError):
 
 
 def run(
-    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: list[str] | None,
+    *, role: str, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None,
+    robot: list[str] | None,
     spawn: int, place: tuple[float, float, float] | None, back: float, namespace: str, ros: bool, push: int | None,
     job: str | None, watch: int | None, near: float, device: str,
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
-        built = "is not built yet" if role in ("human", "spectator") else "is none of robot, human, spectator"
+        built = "is not built yet" if role == "spectator" else "is none of robot, human, spectator"
         raise WrongUse(f"role {role!r} {built}; give --role robot")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
+
+    if tls is not None and connect is None:
+        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
     from vinesim.physics.memory import device_of
 
@@ -90,7 +95,7 @@ def run(
                 return stack.enter_context(hub.bus(name))
             from vinesim.net.zenoh_bus import ZenohBus
 
-            return stack.enter_context(ZenohBus(name, connect=connect))
+            return stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
 
         perceptions = [
             stack.enter_context(
@@ -134,7 +139,7 @@ def run(
         elif client.trace is not None:
             client.jobs.append(LookAt(client.robot, client.trace.centre))
         reporter = Status(client, pace, senses.sent, script)
-        speaker = threading.Thread(target=_speak, args=(reporter, senses, status, stop), name="status")
+        speaker = threading.Thread(target=speak, args=(reporter, senses.diagnose, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
@@ -166,12 +171,12 @@ def ros_name(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def _speak(reporter: Any, senses: Any, status: str, stop: threading.Event) -> None:
-    """Once a second, say how it goes: to the terminal and to ROS."""
+def speak(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
+    """Once a second, say how it goes: to the terminal, and to whoever wants to ``diagnose``."""
     try:
         while not stop.wait(STATUS_PERIOD):
             figures = reporter.now()
-            senses.diagnose(figures)
+            diagnose(figures)
             if status == "json":
                 print(json.dumps(figures), flush=True)
             elif status == "text":

@@ -23,7 +23,7 @@ from vinesim.world.state import State
 from vinesim.world.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
 
 STIRRED = 4.0
-"""[m] With robots about, wind moves only the trees whose foot is so near to one of them."""
+"""[m] With robots or people about, wind moves only the trees whose foot is so near to one of them."""
 
 
 class Physics:
@@ -150,14 +150,17 @@ class Physics:
         self.rigid.remove_robot(name)
         self.parting.blades = [blade for blade in self.parting.blades if blade.actor != name]
 
-    def add_human(self, spec: HumanSpec) -> None:
-        """See :meth:`Rigid.add_human`."""
-        self.rigid.add_human(spec)
+    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
+        """See :meth:`Rigid.add_human`; a copy touches only trees of which its own client tells."""
+        self.rigid.add_human(spec, copy=copy)
+        if copy:
+            self.touching.copies.add(spec.name)
 
     def remove_human(self, name: str) -> None:
         """See :meth:`Rigid.remove_human`; what the hands held is let go."""
         self.rigid.remove_human(name)
         self.holding.forget(name)
+        self.touching.copies.discard(name)
 
     def move_human(self, name: str, pose: HumanPose) -> None:
         """Tell where a person's tracked points are at the end of the coming tick, and which hands are closed."""
@@ -214,8 +217,8 @@ class Physics:
 
     def _blow(self) -> None:
         if self.wind is not None:
-            robots = [self.rigid.base(name)[0][:3] for name in self.rigid.robots]
-            self.wind.update(self.plants, self.time, (np.array(robots), STIRRED) if robots else None)
+            actors = [self.rigid.stands(name) for name in self.rigid.actors]
+            self.wind.update(self.plants, self.time, (np.array(actors), STIRRED) if actors else None)
 
     def _refine(self) -> None:
         self.detail.update(self.touching.near)
