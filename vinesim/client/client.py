@@ -209,6 +209,17 @@ class Client:
                 things.rested(exchange.fact(number))
         self.far.note(self, touching)
 
+    def leave(self) -> None:
+        """Before the buses close: say of what rides on our robots where it is, for with them its parent goes."""
+        now = self._clock()
+        for name, robot in self.robots.items():
+            riders = self.things.riders(name)
+            if riders:
+                self.exchanges[name].send(
+                    now, robot.update(now), read=self.things.read, grabbed=riders, parted=riders,
+                    lies=self.physics.riding.lies,
+                )  # fmt: skip
+
     def side_of(self, point: np.ndarray) -> str:
         """The arm that is on the same side as a point [3] in the world."""
         base, _ = self.physics.rigid.base(self.name)
