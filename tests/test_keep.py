@@ -81,6 +81,30 @@ def test_torn_at_any_byte_the_records_before_hold_and_the_file_is_kept(tmp_path_
     assert len(list(folder.glob("*.torn-*"))) == len(asides)
 
 
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_whatever_is_in_the_file_nothing_of_it_is_lost(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("any")
+    with fresh(folder) as journal:
+        for index in range(3):
+            add(journal, (index, 0), fact(index))
+    content = bytearray(journal.path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+    journal.path.write_bytes(content)
+    try:
+        again = Journal.load(journal.path)
+    except NotKept as error:
+        assert "\n" not in str(error)
+        assert journal.path.read_bytes() == content
+        return
+    again.close()
+    asides = [aside.read_bytes() for aside in folder.glob("*.torn-*")]
+    assert asides == ([] if len(again.facts) == 3 else [bytes(content)])
+    assert held(again) == [((index, 0), fact(index)) for index in range(len(again.facts))]
+
+
 def test_a_flipped_bit_ends_what_is_believed_in_one_line(tmp_path, caplog):
     with fresh(tmp_path) as journal:
         add(journal, (0, 0), fact(0))
