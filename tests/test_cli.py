@@ -178,7 +178,7 @@ def test_secured_from_certificate_to_client(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["client", "--role", "human"], ["human", "not built yet"]),
+        (["client", "--role", "spectator"], ["spectator", "not built yet"]),
         (["client", "--role", "tractor"], ["tractor", "robot"]),
         (["client", "--push", "99999", "--no-ros"], ["99999"]),
         (["client", "--tls", "certs", "--no-ros"], ["--tls certs", "--connect tls/HOST:7447"]),
