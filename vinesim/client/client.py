@@ -56,6 +56,7 @@ class Client:
         name: str,
         pose: np.ndarray,
         near: float = interest.NEAR,
+        jitter_buffer: float = 0.0,
         device: str = "cpu",
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
@@ -72,7 +73,7 @@ class Client:
         self.things = Things(self.physics, self.robots)
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
-        self._near = near
+        self._near, self._jitter_buffer = near, jitter_buffer
         self.robot = self.add_robot(description, name, pose, bus)
         self.exchange = self.exchanges[name]
         self.others: dict[str, RemoteRobot] = {}
@@ -95,7 +96,7 @@ class Client:
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=self.scene.name,
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._near)
+        exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
         self.exchanges[name] = exchange

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vinesim.net import interest, messages, smooth
+from vinesim.net.buffer import Buffer
 from vinesim.net.bus import NEWEST, Answer, Bus, Publisher, Subscription
 from vinesim.net.clock import WINDOW, Clock, Ping
 from vinesim.net.counters import Counters
@@ -45,8 +46,10 @@ class Mismatch(RuntimeError):
 class Actor:
     """Another actor and the last that is known of its pose."""
 
-    def __init__(self, hello: Hello) -> None:
+    def __init__(self, hello: Hello, buffer: float = 0.0) -> None:
+        """``buffer`` [s]: its poses are shown so much later, see :class:`Buffer`; 0 extrapolates them to now."""
         self.hello = hello
+        self._buffer = Buffer(buffer)
         self.joints = hello.joints
         self.update: RobotUpdate | None = None
         self.near: Subscription | None = None
@@ -70,7 +73,12 @@ class Actor:
         self.update = update
         self._state = np.concatenate([update.base_q, update.position])
         self._rate = np.concatenate([update.base_qd[:3], smooth.spin(q, update.base_qd[3:]), update.velocity])
-        if shown is not None:
+        if self._buffer.delay > 0.0:
+            if self._buffer.states and self._buffer.states[-1][3:7] @ q < 0.0:
+                self._state[3:7] *= -1.0
+                self._rate[3:7] *= -1.0
+            self._buffer = self._buffer.heard(update.time, self._state, self._rate)
+        elif shown is not None:
             if shown[3:7] @ q < 0.0:
                 shown[3:7] *= -1.0
             self._off = np.zeros(0)
@@ -83,6 +91,11 @@ class Actor:
         heard = self.update
         assert heard is not None
         shown = self._shown(time)
+        if self._buffer.delay > 0.0:
+            rate = self._buffer.rate(time)
+            shown[3:7] /= np.sqrt(shown[3:7] @ shown[3:7])
+            twist = np.concatenate([rate[:3], heard.base_qd[3:]])
+            return RobotUpdate(heard.actor, now, shown[:7], twist, shown[7:], rate[7:])
         going = 1.0 if time - heard.time <= smooth.EXTRAPOLATION else 0.0
         shown[3:7] /= np.sqrt(shown[3:7] @ shown[3:7])
         return RobotUpdate(
@@ -91,6 +104,8 @@ class Actor:
 
     def _shown(self, time: float) -> np.ndarray:
         assert self.update is not None
+        if self._buffer.delay > 0.0:
+            return self._buffer.shown(time)
         shown = self._state + self._rate * smooth.horizon(time - self.update.time)
         if len(self._off):
             shown += self._off * smooth.remaining(time - self.moved_at)
@@ -100,8 +115,10 @@ class Actor:
 class Actors:
     """All others in this world: who came, who went, where they are."""
 
-    def __init__(self, bus: Bus, me: Hello, counters: Counters) -> None:
+    def __init__(self, bus: Bus, me: Hello, counters: Counters, buffer: float = 0.0) -> None:
+        """``buffer`` [s]: all others' poses are shown so much later, see :class:`Buffer`."""
         self.bus, self.me, self.counters = bus, me, counters
+        self._buffer = Buffer(buffer).delay
         self.kin: set[str] = set()
         self.clock = Clock()
         self.known: dict[str, Actor] = {}
@@ -182,7 +199,7 @@ class Actors:
                 f"{self.me.name!r} has {self.me.scene!r} with {self.me.digest!r}",
             )
             return
-        self.known[name] = Actor(hello)
+        self.known[name] = Actor(hello, self._buffer)
         yield hello
 
     def _refuse(self, name: str, why: str) -> None:
