@@ -28,7 +28,8 @@ class WrongUse(ValueError):
 
 
 def run(
-    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: list[str] | None,
+    *, role: str, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None,
+    robot: list[str] | None,
     spawn: int, place: tuple[float, float, float] | None, back: float, namespace: str, ros: bool, push: int | None,
     job: str | None, watch: int | None, near: float, jitter_buffer: float,
     device: str,
@@ -40,6 +41,9 @@ def run(
         raise WrongUse(f"role {role!r} {built}; give --role robot")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
+
+    if tls is not None and connect is None:
+        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
     from vinesim.physics.memory import device_of
 
@@ -91,7 +95,7 @@ def run(
                 return stack.enter_context(hub.bus(name))
             from vinesim.net.zenoh_bus import ZenohBus
 
-            return stack.enter_context(ZenohBus(name, connect=connect))
+            return stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
 
         perceptions = [
             stack.enter_context(
