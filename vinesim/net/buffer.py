@@ -66,7 +66,7 @@ class Buffer:
         return (1.0 - share) * self.rates[before] + share * self.rates[after]
 
     def _between(self, now: float) -> tuple[int, int, float, float]:
-        """The samples around what is shown (one twice at either end), how far between them, how long after the first."""
+        """The samples around what is shown (one twice at an end), how far between them, how long after the first."""
         time = now - self.delay
         after = bisect.bisect_right(self.times, time)
         if after in (0, len(self.times)):
