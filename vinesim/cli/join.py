@@ -12,6 +12,7 @@ import re
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -37,7 +38,7 @@ def run(
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
-        built = "is not built yet" if role in ("human", "spectator") else "is none of robot, human, spectator"
+        built = "is not built yet" if role == "spectator" else "is none of robot, human, spectator"
         raise WrongUse(f"role {role!r} {built}; give --role robot")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
@@ -139,7 +140,7 @@ def run(
         elif client.trace is not None:
             client.jobs.append(LookAt(client.robot, client.trace.centre))
         reporter = Status(client, pace, senses.sent, script)
-        speaker = threading.Thread(target=_speak, args=(reporter, senses, status, stop), name="status")
+        speaker = threading.Thread(target=speak, args=(reporter, senses.diagnose, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
@@ -171,12 +172,12 @@ def ros_name(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def _speak(reporter: Any, senses: Any, status: str, stop: threading.Event) -> None:
-    """Once a second, say how it goes: to the terminal and to ROS."""
+def speak(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
+    """Once a second, say how it goes: to the terminal, and to whoever wants to ``diagnose``."""
     try:
         while not stop.wait(STATUS_PERIOD):
             figures = reporter.now()
-            senses.diagnose(figures)
+            diagnose(figures)
             if status == "json":
                 print(json.dumps(figures), flush=True)
             elif status == "text":
