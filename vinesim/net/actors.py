@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vinesim.net import interest, messages
+from vinesim.net.buffer import Buffer
 from vinesim.net.bus import NEWEST, Answer, Bus, Publisher
 from vinesim.net.clock import WINDOW, Clock, Ping
 from vinesim.net.counters import Counters
@@ -47,11 +48,15 @@ class Mismatch(RuntimeError):
 class Actors:
     """All others in this world: who came, who went, where they are."""
 
-    def __init__(self, bus: Bus, me: Hello, counters: Counters) -> None:
+    def __init__(self, bus: Bus, me: Hello, counters: Counters, buffer: float = 0.0) -> None:
+        """``buffer`` [s]: all others' poses are shown so much later, see :class:`Buffer`."""
         self.bus, self.me, self.counters = bus, me, counters
+        self._buffer = Buffer(buffer).delay
         self.kin: set[str] = set()
         self.clock = Clock()
         self.known: dict[str, Actor] = {}
+        self.met: set[str] = set()
+        """Who was ever let in: last words may arrive when their author has gone."""
         greeting = messages.encode_hello(me)
         bus.join(greeting)
         bus.serve(f"hello/{me.name}", lambda _: greeting)
@@ -130,7 +135,8 @@ class Actors:
                 f"{self.me.name!r} has {self.me.scene!r} with {self.me.digest!r}",
             )
             return
-        self.known[name] = Actor(hello)
+        self.known[name] = Actor(hello, self._buffer)
+        self.met.add(name)
         yield hello
 
     def _refuse(self, name: str, why: str) -> None:
@@ -140,6 +146,11 @@ class Actors:
             raise Mismatch(text)
         log.warning("ignoring a newcomer: %s", text)
         self._refused.add(name)
+        self.met.discard(name)
+
+    def refused(self, name: str) -> bool:
+        """Whether an actor was found to live in another world."""
+        return name in self._refused
 
     def blame(self, sender: str, error: MessageError) -> None:
         """Count a message that cannot be believed, and say so once for each sender."""
