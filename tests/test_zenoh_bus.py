@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.net import messages
+from vinesim.net import messages, zenoh_bus
 from vinesim.net.bus import EVERY, NameTaken
 from vinesim.net.certificates import new
 from vinesim.net.endpoints import chosen
@@ -437,7 +437,8 @@ class DatagramWire:
             each.close()
 
 
-def test_when_datagrams_pass_no_more_poses_take_the_stream(caplog):
+def test_when_datagrams_pass_no_more_poses_take_the_stream(caplog, monkeypatch):
+    monkeypatch.setattr(zenoh_bus, "SILENT", 1.0)
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, Wire(server.endpoint) as wire:
         port = int(wire.endpoint.rpartition(":")[2])
         datagrams = DatagramWire(port, server.endpoints[1].port)
