@@ -177,7 +177,8 @@ class Riding:
 
     def unsettle(self, thing: int) -> None:
         """Take it for moving, as others say it does."""
-        self._still[self._row_of(thing)] = 0
+        row = self._row_of(thing)  # first: what has just come renews the rows
+        self._still[row] = 0
 
     # ------------------------------------------------------------------ inside
 
