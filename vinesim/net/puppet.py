@@ -179,6 +179,7 @@ class Puppet:
             "released": self.released,
             "poses": {name: getattr(one, "position", one.base_q)[:1].tolist() for name, one in self.robots.items()},
             "counters": dataclasses.asdict(exchange.counters),
+            "bytes_in": self.bus.bytes_in,
             "lost": self.bus.lost,
             "trouble": self.bus.trouble,
         }
