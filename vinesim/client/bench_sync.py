@@ -60,7 +60,9 @@ SEEN = 0.001
 @functools.cache
 def _stage() -> tuple[Scene, Model, Description]:
     scene = msgspec.structs.replace(load("demo"), boxes=())  # in their place the second robot will stand
-    return scene, generate(scene), load_robot("vinebot")
+    model = generate(scene)
+    model.bunch_pull[:] = model.bunch_bend[:] = 1e6  # who fights by the wrong rule would tear the bunch off
+    return scene, model, load_robot("vinebot")
 
 
 class Pair:
