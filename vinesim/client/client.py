@@ -62,6 +62,7 @@ class Client:
         source: Callable[[float], HumanPose] | None = None,
         height: float = 1.75,
         near: float = interest.NEAR,
+        jitter_buffer: float = 0.0,
         device: str = "cpu",
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
@@ -83,7 +84,7 @@ class Client:
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
         self.things = Things(self.physics, self.exchanges)
-        self._near = near
+        self._near, self._jitter_buffer = near, jitter_buffer
         if description is None:
             self.add_human(HumanSpec(name, label_index(name), standing(pose, height), height), source, bus)
         else:
@@ -109,7 +110,7 @@ class Client:
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=self.scene.name,
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._near)
+        exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
         self._share(name, exchange)
@@ -121,7 +122,7 @@ class Client:
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._near)
+        exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
         self.people[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
         self._share(spec.name, exchange)
         return person
