@@ -15,7 +15,7 @@ import logging
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +53,7 @@ class Client:
         self,
         scene: Scene,
         model: Model,
-        description: Description,
+        description: Description | None,
         bus: Bus,
         *,
         name: str,
@@ -75,7 +75,7 @@ class Client:
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
         self._near = near
-        self.robot = self.add_robot(description, name, pose, bus)
+        self._enter(description, pose, bus)
         self.exchange = self.exchanges[name]
         self.others: dict[str, RemoteRobot] = {}
         self.jobs: list[Callable[[float], None]] = []
@@ -92,11 +92,16 @@ class Client:
         self._expected: dict[str, Hello] = {}
         """Robots that joined and whose place is not known yet."""
 
+    def _enter(self, description: Description | None, pose: np.ndarray, bus: Bus) -> None:
+        assert description is not None
+        self.robot = self.add_robot(description, self.name, pose, bus)
+
     def add_robot(self, description: Description, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Move one more robot, standing at ``pose`` [7]; ``bus`` is opened in its name."""
         hello = Hello(
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=self.scene.name,
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
+            seed=self.scene.seed,
         )  # fmt: skip
         exchange = Exchange(bus, hello, self.model, near=self._near)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
@@ -208,7 +213,7 @@ class Client:
     def _embody(self, hello: Hello, update: RobotUpdate) -> None:
         """Let another client's robot stand where it is."""
         try:
-            description = _description_of(hello, self.robot.description)
+            description = _description_of(hello, [robot.description for robot in self.robots.values()])
             self.others[hello.name] = RemoteRobot(
                 self.physics.rigid, description, hello.name, hello.index, update.base_q
             )
@@ -267,10 +272,11 @@ class Faraway:
         self._seen = sent
 
 
-def _description_of(hello: Hello, own: Description) -> Description:
+def _description_of(hello: Hello, own: Iterable[Description]) -> Description:
     """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
-    if hello.urdf == own.urdf:
-        return own
+    for description in own:
+        if hello.urdf == description.urdf:
+            return description
     try:
         known = descriptions.load(hello.robot)
         if known.urdf == hello.urdf:

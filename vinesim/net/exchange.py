@@ -46,6 +46,9 @@ ANSWER_PERIOD = 0.2
 FORGOTTEN = 3.0
 """An owner that says nothing of its tree for so long [s] (three heartbeats) is believed to own it no more."""
 
+ONLOOKER = "spectator"
+"""Kind of actor that owns nothing and says nothing but where it is."""
+
 _LONG_AGO = -1e9
 
 
@@ -345,8 +348,10 @@ class Exchange:
         self._blamed.discard(name)
         if actor.near is not None:
             actor.near.close()
-        where = {n: a.update.base_q for n, a in self._actors.items() if a.update is not None}
-        if self._window is not None:
+        where = {
+            n: a.update.base_q for n, a in self._actors.items() if a.update is not None and a.hello.kind != ONLOOKER
+        }
+        if self._window is not None and self.me.kind != ONLOOKER:
             where[self.me.name] = self._position
         # its claims still hold, should it come back; only its silence counts, or two would never agree again
         for tree in [tree for tree, claim in sorted(self._claims.items()) if claim.owner == name]:
@@ -440,6 +445,8 @@ class Exchange:
 
     def _correct(self, lost: list[tuple[int, Claim, bool]], time: float) -> None:
         """Tell whoever claims from old knowledge what holds: that is how everybody agrees again after a loss."""
+        if self.me.kind == ONLOOKER:
+            return
         for tree, claim, _ in lost:
             held = self.claim(tree)
             if claim == held or authority.wins(claim, held):

@@ -148,8 +148,8 @@ class _Subscription:
 class ZenohBus:
     """See :class:`vinesim.net.bus.Bus`. A context manager: a session left open hangs at exit."""
 
-    def __init__(self, name: str, *, connect: str = CONNECT, world: str = WORLD) -> None:
-        """Join ``world`` as ``name`` through the server at ``connect``.
+    def __init__(self, name: str, *, connect: str = CONNECT, world: str = WORLD, live: bool = True) -> None:
+        """Join ``world`` as ``name`` through the server at ``connect``; not ``live``: nobody sees that one is there.
 
         :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the name is live,
         :class:`ValueError` if name or world cannot be part of a key.
@@ -163,7 +163,8 @@ class ZenohBus:
         self._store = Store()
         self._answers: collections.deque[tuple[str, bytes, float]] = collections.deque()
         self._live: dict[str, set[str]] = {}
-        self._alive = frozenset((name,))
+        self._me = frozenset((name,)) if live else frozenset()
+        self._alive = self._me
         self._lock = threading.Lock()
         self._connected = True
         with _meant_for_the_user(connect):
@@ -180,7 +181,7 @@ class ZenohBus:
             liveliness = self._session.liveliness()
             self._declared: list[object] = [
                 self._session.info.declare_transport_events_listener(self._transport),
-                self._claim_name(),
+                *([self._claim_name()] if live else []),
             ]
             for reply in liveliness.get(f"{self._prefix}live/*/*", timeout=PATIENCE):
                 if reply.ok is not None:
@@ -228,7 +229,7 @@ class ZenohBus:
         with self._lock:
             sessions = self._live.setdefault(name, set())
             (sessions.add if there else sessions.discard)(session)
-            self._alive = frozenset(name for name, sessions in self._live.items() if sessions) | {self.name}
+            self._alive = frozenset(name for name, sessions in self._live.items() if sessions) | self._me
 
     # ------------------------------------------------------------ the bus
 
