@@ -33,11 +33,29 @@ def run(
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
-    if role != "robot":
-        built = "is not built yet" if role in ("human", "spectator") else "is none of robot, human, spectator"
-        raise WrongUse(f"role {role!r} {built}; give --role robot")
+    if role not in ("robot", "spectator"):
+        built = "is not built yet" if role == "human" else "is none of robot, human, spectator"
+        raise WrongUse(f"role {role!r} {built}; give --role robot or spectator")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
+    if role == "spectator":
+        from vinesim.cli.spectate import run as spectate
+
+        return spectate(
+            name=name,
+            connect=connect,
+            scene=scene,
+            seed=seed,
+            spawn=spawn,
+            place=place,
+            near=near,
+            device=device,
+            threads=threads,
+            seconds=seconds,
+            out=out,
+            status=status,
+            hz=sensor_hz,
+        )
 
     from vinesim.physics.memory import device_of
 

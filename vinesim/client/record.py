@@ -54,14 +54,18 @@ class Timekeeper:
         self._asked, self._count = -math.inf, 0
         self._begun = now
 
-    def keep(self, now: float) -> float:
-        """Network time [s] at own time ``now``; asks the server when that is due."""
+    def keep(self, now: float) -> None:
+        """Note that it is own time ``now`` [s]; ask the server when that is due."""
         self.clock = self.clock.after(now - self._now)
         self._now = now
         if now - self._asked >= PING_PERIOD[self._count >= 2 * WINDOW]:
             self._asked, self._count = now, self._count + 1
             self._bus.ask("clock", messages.encode_time(now))
-        return now + self.clock.offset
+
+    @property
+    def time(self) -> float:
+        """Network time [s]."""
+        return self._now + self.clock.offset
 
     def hear(self, payload: bytes, age: float) -> None:
         """Take the clock's answer, which arrived ``age`` seconds ago."""
@@ -111,7 +115,6 @@ class Recorder:
         self._far: Subscription | None = None
         self._near: dict[str, tuple[Publisher, Subscription | None]] = {}
         self._at = 0
-        """Network time of this step [ns], 0 until it is known."""
 
     @property
     def actors(self) -> frozenset[str]:
@@ -121,13 +124,12 @@ class Recorder:
     def step(self) -> None:
         """Write down what arrived, and follow who is heard by whom."""
         now = self._clock()
-        at = self._keeper.keep(now)
-        if self._keeper.settled:
-            self._at = max(self._at + 1, int(at * 1e9))
+        self._keeper.keep(now)
         self._take_answers()
         self.recording.check()
-        if not self._at:
+        if not self._keeper.settled:
             return
+        self._at = max(self._at + 1, int(self._keeper.time * 1e9))
         if not self._listening:
             self._listen()
         self._roster(now)
@@ -307,11 +309,11 @@ class Stand:
 
     def step(self, now: float) -> None:
         """Say five times a second that one is there."""
-        at = self._keeper.keep(now)
+        self._keeper.keep(now)
         for key, payload, age in self.bus.answers():
             if key == "clock":
                 self._keeper.hear(payload, age)
         if now >= self._due:
             self._due = now + FAR_PERIOD
-            update = RobotUpdate(self.bus.name, at, self._place, np.zeros(6), np.zeros(0), np.zeros(0))
+            update = RobotUpdate(self.bus.name, self._keeper.time, self._place, np.zeros(6), np.zeros(0), np.zeros(0))
             self._pose.put(messages.encode_robot(update))

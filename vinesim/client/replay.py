@@ -56,7 +56,7 @@ class Cursor:
                 self.greetings[sender_of(entry.key)] = entry.payload
         self._know_before()
         self._next = bisect.bisect_left(tape.entries, self.time, key=lambda entry: entry.time)
-        for entry in tape.entries[: self._next]:
+        for entry in tape.entries[: bisect.bisect_right(tape.entries, self.time, key=lambda entry: entry.time)]:
             self._note(entry)
 
     @property
@@ -269,14 +269,14 @@ class Replay:
 
     def step(self, now: float) -> None:
         """Say all that is due at own time ``now`` [s]."""
-        at = self._keeper.keep(now)
+        self._keeper.keep(now)
         for key, payload, age in self._bus.answers():
             if key == "clock":
                 self._keeper.hear(payload, age)
         if not self._keeper.settled:
             return
         if self._begun is None:
-            self._begun, self._begun_at = now, at
+            self._begun, self._begun_at = now, self._keeper.time
         # what was true before is said once somebody listens; without a server that keeps it, never
         self._before = [(key, payload) for key, payload in self._before if not self._say(key, payload)]
         entries = self.cursor.play(self._start + (now - self._begun) * self._speed)

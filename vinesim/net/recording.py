@@ -258,7 +258,6 @@ class Recording:
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
-        self.describe()
 
     def describe(self, **about: str) -> None:
         """Say more of what is recorded."""
@@ -295,6 +294,7 @@ class Recording:
     def _run(self) -> None:
         try:
             self._writer.start(library=f"vinesim {__version__}")
+            self._write(dict(self.about))
             self._save()
             due = time.monotonic() + FLUSH
             while True:
@@ -343,9 +343,9 @@ class Recording:
     def _give_up(self, error: OSError) -> str:
         """Leave the file as it was when it was last whole."""
         with contextlib.suppress(OSError):
-            os.truncate(self.path, self.size)
-        with contextlib.suppress(OSError):
             self._file.close()
+        with contextlib.suppress(OSError):
+            os.truncate(self.path, self.size)
         return (
             f"recording stopped, {self.path} cannot be written any more ({error.strerror}): "
             f"its {self.size} B stay readable; make room and record into another file"

@@ -1,0 +1,69 @@
+"""``vinesim client --role spectator``: look at a vineyard and touch nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pathlib
+import signal
+import threading
+
+import numpy as np
+
+STATUS_PERIOD = 1.0
+"""Between two status lines [s]."""
+
+
+def run(
+    *, name: str | None, connect: str | None, scene: str, seed: int | None, spawn: int,
+    place: tuple[float, float, float] | None, near: float, device: str, threads: int, seconds: float | None,
+    out: pathlib.Path | None, status: str, hz: float | None,
+) -> int:  # fmt: skip
+    """Look until told to stop; pictures go to ``out``."""
+    from vinesim.client.pace import Pace
+    from vinesim.client.places import spawn_pose
+    from vinesim.client.spectator import Pictures, Spectator, viewpoint
+    from vinesim.client.status import Status
+    from vinesim.net.bus import MemoryHub
+    from vinesim.net.zenoh_bus import ZenohBus
+    from vinesim.world.generate import generate
+    from vinesim.world.scene import load, reseeded
+
+    plan = reseeded(load(scene), seed)
+    if place is None:
+        start = spawn_pose(plan, spawn)
+        place = float(start[0]), float(start[1]), 2.0 * float(np.arctan2(start[5], start[6]))
+    model = generate(plan)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    name = name or f"spectator-{os.getpid()}"
+    with contextlib.ExitStack() as stack:
+        bus = MemoryHub().bus(name) if connect is None else stack.enter_context(ZenohBus(name, connect=connect))
+        spectator = Spectator(
+            plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads
+        )  # fmt: skip
+        pictures = None if out is None else Pictures(spectator, out, 1.0 / (hz or 1.0))
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        pace = Pace(spectator.physics.dt)
+        reporter = Status(spectator, pace)
+        said, limit = 0.0, None if seconds is None else round(seconds / spectator.physics.dt)
+        while not (stop.is_set() or pace.ticks == limit):
+            pace.begin()
+            spectator.tick()
+            pace.end()
+            if status != "none" and pace.elapsed >= said + STATUS_PERIOD:
+                said = pace.elapsed
+                figures = reporter.now()
+                company = ", ".join(figures["others"]) or "nobody"
+                words = f"{figures['time']:7.1f} s  {figures['tick_hz']:6.2f} Hz  awake {figures['awake']:3d}  "
+                words += f"in {figures['bytes_in']} B  out {figures['bytes_out']} B  sees {company}"
+                try:
+                    print(json.dumps(figures) if status == "json" else words, flush=True)
+                except BrokenPipeError:  # whoever listened is gone
+                    break
+        if pictures is not None:
+            pictures.save(spectator)
+    return 0
