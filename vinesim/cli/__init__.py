@@ -197,9 +197,7 @@ def replay(
     ] = None,
     place: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(
-            help="With --out: look from X Y [m] along YAW [rad]; over a robot's shoulder unless given."
-        ),
+        typer.Option(help="With --out: look from X Y [m] along YAW [rad]; unless given, follow a robot."),
     ] = None,
     scene: Annotated[str | None, typer.Option(help="With --out: its scene file, if it is none that ships.")] = None,
     seed: Seed = None,
