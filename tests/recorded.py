@@ -40,6 +40,7 @@ class Light:
         joints = np.array([0.1, -0.2][: hello["joints"]])
         self.robot = RobotUpdate(bus.name, 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), joints, np.zeros(len(joints)))
         self.touched: set[int] = set()
+        self.moving: set[int] = set()
         self.inbox = Inbox()
         self.heard: list[TreeUpdate] = []
         self.joined: list[str] = []
@@ -51,7 +52,7 @@ class Light:
         for update in self.inbox.trees:
             here = self.model.bodies_of(update.tree)
             self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
-        for update in self.exchange.send(now, self.robot, touched=self.touched, read=self.read):
+        for update in self.exchange.send(now, self.robot, touched=self.touched, moving=self.moving, read=self.read):
             here = self.model.bodies_of(update.tree)
             self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
 
