@@ -11,7 +11,8 @@ import pytest
 from touch_scenes import bunch_scene
 
 from vinesim import frames
-from vinesim.physics.rigid import Loose, Rigid
+from vinesim.physics.loose import Loose
+from vinesim.physics.rigid import Rigid
 from vinesim.physics.step import Physics
 from vinesim.robot.description import Description, load
 from vinesim.robot.drives import CommandError, Interface, RemoteRobot, Robot

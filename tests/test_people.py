@@ -12,7 +12,8 @@ from touch_scenes import probe
 
 from vinesim import frames
 from vinesim.physics.people import PARTS, THICK, TRACKED, HumanError, posture, standing
-from vinesim.physics.rigid import FRICTION, Rigid
+from vinesim.physics.rigid import Rigid
+from vinesim.physics.yard import FRICTION
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.values import Drive, HumanPose, HumanSpec

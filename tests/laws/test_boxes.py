@@ -8,8 +8,8 @@ import pytest
 from touch_scenes import cane
 
 from vinesim import frames
-from vinesim.physics.rigid import FRICTION
 from vinesim.physics.step import Physics
+from vinesim.physics.yard import FRICTION
 from vinesim.world.grow import GRAVITY, assemble
 from vinesim.world.values import Drive, RobotSpec
 
@@ -140,7 +140,7 @@ def airborne() -> Physics:
 def momentum(physics: Physics) -> np.ndarray:
     """Of all that moves freely [3] kg m/s; of a ram, along its way."""
     rigid, model = physics.rigid, physics.model
-    rigid._refresh()
+    rigid.refresh()
     total, J = np.zeros(3), np.zeros((3, rigid.world.nv))
     names = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._slot.values())]
     for name in (*names, "ram0/tool", "ram1/tool"):

@@ -8,8 +8,8 @@ import pytest
 from touch_scenes import cane
 
 from vinesim import frames
-from vinesim.physics.rigid import FRICTION
 from vinesim.physics.step import Physics
+from vinesim.physics.yard import FRICTION
 from vinesim.world.grow import GRAVITY, assemble
 
 MASSES = 0.4 + 0.03 * np.arange(10)

@@ -87,9 +87,13 @@ class TestDemo:
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_everything(tmp_path):
+def test_ctrl_c_ends_everything_also_in_the_background_of_a_script(tmp_path):
     out = tmp_path / "interrupted"
-    demo = subprocess.Popen([*DEMO, "--seconds", "60", "--out", str(out)], stderr=subprocess.PIPE, text=True)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for "vinesim demo &"; children inherit it
+    try:
+        demo = subprocess.Popen([*DEMO, "--seconds", "60", "--out", str(out)], stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
     try:
         for line in demo.stderr:
             if " Hz " in line:

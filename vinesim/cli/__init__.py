@@ -4,7 +4,7 @@ This module knows the commands and their options and nothing else; a command imp
 so that ``vinesim --help`` opens at once.
 
 Exit codes: 0 done; 2 wrong use or bad input; 3 a part is missing on this machine; 4 the network or the server;
-5 a job was not done; 130 stopped by Ctrl-C where stopping is not the ordinary end.
+5 a job was not done; 130 stopped by Ctrl-C or SIGTERM where stopping is not the ordinary end.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import contextlib
 import logging
 import os
 import pathlib
+import signal
 import sys
 import traceback
 from typing import Annotated
@@ -283,6 +284,9 @@ def main() -> None:
     """
     # Small matrices gain nothing from BLAS threads, and those would take the other core from the eyes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # A shell lets what it starts in the background ignore Ctrl-C; whoever sends it means it, and so with SIGTERM.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     code = _run()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):

@@ -12,6 +12,7 @@ import re
 import signal
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 log = logging.getLogger(__name__)
@@ -42,20 +43,9 @@ def run(
         from vinesim.cli.spectate import run as spectate
 
         return spectate(
-            name=name,
-            connect=connect,
-            scene=scene,
-            seed=seed,
-            spawn=spawn,
-            place=place,
-            near=near,
-            device=device,
-            threads=threads,
-            seconds=seconds,
-            out=out,
-            status=status,
-            hz=sensor_hz,
-        )
+            name=name, connect=connect, scene=scene, seed=seed, spawn=spawn, place=place, near=near, device=device,
+            threads=threads, seconds=seconds, out=out, status=status, hz=sensor_hz,
+        )  # fmt: skip
 
     from vinesim.physics.memory import device_of
 
@@ -123,7 +113,7 @@ def run(
         senses = perceptions[0]
         client = Client(
             plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, near=near, device=device,
-            threads=threads,
+            threads=threads, executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
         for i in range(1, len(names)):
             client.add_robot(descriptions[i], names[i], start_pose(plan, spawn, back, i), bus(names[i]))

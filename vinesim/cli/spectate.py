@@ -8,6 +8,7 @@ import os
 import pathlib
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -41,7 +42,8 @@ def run(
     with contextlib.ExitStack() as stack:
         bus = MemoryHub().bus(name) if connect is None else stack.enter_context(ZenohBus(name, connect=connect))
         spectator = Spectator(
-            plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads
+            plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads,
+            executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
         pictures = None if out is None else Pictures(spectator, out, 1.0 / (hz or 1.0))
         stop = threading.Event()

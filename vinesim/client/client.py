@@ -12,15 +12,15 @@ One client moves one robot, or several (D6.4 section 4.1): then each is an actor
 from __future__ import annotations
 
 import logging
-import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
+from concurrent.futures import Executor
 
 import numpy as np
 
 from vinesim import frames
+from vinesim.client.arrivals import Arrivals
 from vinesim.client.trace import Trace
 from vinesim.net import interest
 from vinesim.net.bus import Bus
@@ -28,8 +28,7 @@ from vinesim.net.exchange import Exchange, Inbox
 from vinesim.net.messages import Hello
 from vinesim.physics.step import Physics
 from vinesim.physics.wind import Wind
-from vinesim.robot import description as descriptions
-from vinesim.robot.description import Description, DescriptionError
+from vinesim.robot.description import Description
 from vinesim.robot.drives import RemoteRobot, Robot
 from vinesim.world.model import Model
 from vinesim.world.scene import Scene
@@ -62,7 +61,9 @@ class Client:
         device: str = "cpu",
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
+        executor: Executor | None = None,
     ) -> None:
+        """``executor`` prepares robots that join, so that no tick has to; without one they are there at once."""
         self.name, self.model, self.scene = name, model, scene
         self.physics = Physics(
             model, device=device, threads=threads, picking=False
@@ -89,8 +90,7 @@ class Client:
         self.far = Faraway()
         self._clock = clock
         self._copies: dict[int, TreeUpdate] = {}
-        self._expected: dict[str, Hello] = {}
-        """Robots that joined and whose place is not known yet."""
+        self.arrivals = Arrivals(self.physics.rigid, description, executor)
 
     def _enter(self, description: Description | None, pose: np.ndarray, bus: Bus) -> None:
         assert description is not None
@@ -128,16 +128,17 @@ class Client:
         for hello in inbox.joined:
             log.info("%s joined as %s", hello.name, hello.kind)
             if hello.kind == "robot":
-                self._expected[hello.name] = hello
+                self.arrivals.expect(hello)
         for name in inbox.left:
-            self._expected.pop(name, None)
+            self.arrivals.forget(name)
             if (other := self.others.pop(name, None)) is not None:
                 other.leave()
                 self.physics.touching.copies.discard(name)
                 log.info("%s left", name)
         for name, update in inbox.robots.items():
-            if name in self._expected:
-                self._embody(self._expected.pop(name), update)
+            if name in self.arrivals and (other := self.arrivals.embody(name, update)) is not None:
+                self.others[name] = other
+                self.physics.touching.copies.add(name)
             if name in self.others:
                 self.others[name].follow(update)
         self._pull(inbox)
@@ -210,18 +211,6 @@ class Client:
         owners = {exchange.owner(tree) for exchange in self.exchanges.values()} - {None}
         return bool(owners) and not owners & self.robots.keys()
 
-    def _embody(self, hello: Hello, update: RobotUpdate) -> None:
-        """Let another client's robot stand where it is."""
-        try:
-            description = _description_of(hello, [robot.description for robot in self.robots.values()])
-            self.others[hello.name] = RemoteRobot(
-                self.physics.rigid, description, hello.name, hello.index, update.base_q
-            )
-        except ValueError as error:
-            log.warning("the robot of %s cannot be shown: %s", hello.name, error)
-            return
-        self.physics.touching.copies.add(hello.name)
-
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
         plants, told = self.physics.plants, self.physics.touching.told
@@ -270,20 +259,3 @@ class Faraway:
             self.bytes += sent - self._seen
             self.ticks_touching += touching
         self._seen = sent
-
-
-def _description_of(hello: Hello, own: Iterable[Description]) -> Description:
-    """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
-    for description in own:
-        if hello.urdf == description.urdf:
-            return description
-    try:
-        known = descriptions.load(hello.robot)
-        if known.urdf == hello.urdf:
-            return known
-    except DescriptionError:
-        pass
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"{hello.robot or 'robot'}.urdf"
-        file.write_text(hello.urdf)
-        return descriptions.load(file)

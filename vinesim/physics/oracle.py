@@ -10,8 +10,10 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid import _FIXED, FRICTION, Rigid, _attach, _scene
+from vinesim.physics.rigid import Rigid
+from vinesim.physics.robots import RobotBody
 from vinesim.physics.touching import shapes_of
+from vinesim.physics.yard import FIRST_ACTOR, FIXED, ROUGH, furnished
 from vinesim.world.grow import GRAVITY
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -67,11 +69,11 @@ class Whole:
         self.rigid = mine = Rigid(model, dt=dt)
         for robot in robots:
             mine.add_robot(robot)
-        spec = _scene(model, dt)
+        spec = furnished(model, dt)
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-        for robot in mine._robots.values():
-            _attach(spec, robot)
+        for bit, robot in enumerate(robots, FIRST_ACTOR):
+            RobotBody(robot, bit).attach(spec)
         made = _grow(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
         shapes = shapes_of(model)
         for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
@@ -79,8 +81,8 @@ class Whole:
             if (start != end).any():
                 kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
             made[body].add_geom(
-                type=kind, size=[float(radius), 0, 0], contype=_FIXED, conaffinity=0, mass=0.0,
-                friction=[FRICTION, 0.005, 0.0001], solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
+                type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
+                friction=ROUGH, solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
             )  # fmt: skip
         world = spec.compile()
         if give is not None:
@@ -93,20 +95,18 @@ class Whole:
                 data.joint(joint.name).qpos[:] = mine.data.joint(j).qpos
         for body, q in enumerate(model.joint_settled):
             data.joint(f"plant/{body}").qpos[:] = frames.to_wxyz(q)
-        mine.world, mine.data, mine._contact = world, data, np.zeros(world.nv)  # robots now live in the whole world
-        for robot in mine._robots.values():
-            mine._locate(robot)
+        mine.inhabit(world, data)
         self.world, self.data = world, data
 
     def step(self) -> None:
         """One tick of everything."""
-        self.rigid._servo()
+        self.rigid.drive()
         mujoco.mj_step(self.world, self.data)
-        self.rigid._fresh = False
+        self.rigid.stale()
 
     def body_q(self, body: int) -> np.ndarray:
         """Pose [7] of a plant's body after the last step."""
-        self.rigid._refresh()
+        self.rigid.refresh()
         there = self.data.body(f"plant/{body}")
         return np.concatenate([there.xpos, frames.from_wxyz(there.xquat)])
 

@@ -12,8 +12,9 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.loose import Loose
 from vinesim.physics.plants import Plants
-from vinesim.physics.rigid import Loose, Rigid
+from vinesim.physics.rigid import Rigid
 from vinesim.physics.touching import Touching
 from vinesim.world.ids import Organ
 from vinesim.world.values import Contact, Parting

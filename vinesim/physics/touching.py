@@ -17,8 +17,10 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels import contact as kernels
 from vinesim.kernels.launch import bind
+from vinesim.physics.geoms import WIDE, Geoms
 from vinesim.physics.plants import Plants
-from vinesim.physics.rigid import FRICTION, WIDE, Geoms, Rigid
+from vinesim.physics.rigid import Rigid
+from vinesim.physics.yard import FRICTION
 from vinesim.world.model import Model
 from vinesim.world.values import Contact
 

@@ -56,13 +56,17 @@ class Embodied:
         name: str = "",
         index: int = 0,
         pose: np.ndarray | None = None,
+        *,
+        here: bool = False,
     ) -> None:
+        """``here``: it was admitted to ``rigid`` already."""
         self.rigid = rigid
         self.description = description
         self.name = name or description.name
         self._index = index
         spec = description.spec(self.name, index, pose)
-        rigid.add_robot(spec)
+        if not here:
+            rigid.add_robot(spec)
         back = frames.conjugate(spec.pose[3:])
         self._start = spec.pose[:3].copy()
         self._start_turn = frames.matrix(back)

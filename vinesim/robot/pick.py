@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid import CRATE_WALL
 from vinesim.physics.step import Physics
+from vinesim.physics.yard import CRATE_WALL
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.hand import Hand, axes_of
 from vinesim.robot.script import Failed, Script

@@ -1,0 +1,84 @@
+"""Rigid shapes as plants touch them: MuJoCo's geoms with the names of those whom they belong to."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+WIDE = 1e6
+"""[m] The ground reaches so far from the middle."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Geoms:
+    """Rigid shapes that plants can touch, sorted by MuJoCo geom."""
+
+    id: np.ndarray
+    """[geom] index in MuJoCo's geom arrays."""
+    body: np.ndarray
+    """[geom] MuJoCo body."""
+    kind: np.ndarray
+    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box; a mesh stands as its box."""
+    size: np.ndarray
+    """[geom, 3] as MuJoCo writes it for the kind."""
+    half: np.ndarray
+    """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`WIDE` and no height."""
+    center: np.ndarray
+    """[geom, 3] middle of the shape in the geom's frame (not zero for meshes)."""
+    radius: np.ndarray
+    """[geom] of the bounding sphere about the middle."""
+    friction: np.ndarray
+    dof: np.ndarray
+    """[geom] last degree of freedom that moves it (-1: none); its ancestors follow ``dof_parentid``."""
+    root: np.ndarray
+    """[geom] root body of its kinematic tree, about whose centre of mass MuJoCo writes ``cvel`` and ``cdof``."""
+    actor: tuple[str, ...]
+    link: tuple[str, ...]
+
+
+def listed(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> Geoms:
+    """What touches anything of the MuJoCo bodies in ``owner``, which tells actor and link of each."""
+    ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)) & (m.geom_contype != 0))
+    return _of(m, ids, [owner[body] for body in m.geom_bodyid[ids].tolist()])
+
+
+def standing(m: mujoco.MjModel) -> Geoms:
+    """Ground, poles and trunks: MuJoCo's first geoms, whoever comes and goes."""
+    ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
+    return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
+
+
+def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Geoms:
+    """What there is to know of some geoms; ``names``: actor and link of each."""
+    last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1).tolist()
+    for body, parent in enumerate(m.body_parentid.tolist()):  # parents come first
+        if last[body] < 0:
+            last[body] = last[parent]
+    body, kind, size = m.geom_bodyid[ids], m.geom_type[ids].copy(), m.geom_size[ids].copy()
+    mesh = kind == mujoco.mjtGeom.mjGEOM_MESH
+    kind[mesh], size[mesh] = mujoco.mjtGeom.mjGEOM_BOX, m.geom_aabb[ids][mesh, 3:]
+    center = np.where(mesh[:, None], m.geom_aabb[ids, :3], 0.0)
+    radius = np.where(mesh, np.linalg.norm(size, axis=1), m.geom_rbound[ids])
+    half = size.copy()
+    round_ = (kind == mujoco.mjtGeom.mjGEOM_SPHERE) | (kind == mujoco.mjtGeom.mjGEOM_CAPSULE)
+    half[round_] = size[round_, :1] + size[round_, 1:2] * [0.0, 0.0, 1.0]
+    cylinder = kind == mujoco.mjtGeom.mjGEOM_CYLINDER
+    half[cylinder] = size[cylinder][:, [0, 0, 1]]
+    plane = kind == mujoco.mjtGeom.mjGEOM_PLANE
+    half[plane], radius[plane] = (WIDE, WIDE, 0.0), np.inf
+    return Geoms(
+        id=ids.astype(np.int32),
+        body=body.astype(np.int32),
+        kind=kind.astype(np.int32),
+        size=size,
+        half=half,
+        center=center,
+        radius=radius,
+        friction=m.geom_friction[ids, 0].copy(),
+        dof=np.array(last, np.int32)[body],
+        root=m.body_rootid[body].astype(np.int32),
+        actor=tuple(actor for actor, _ in names),
+        link=tuple(link for _, link in names),
+    )

@@ -1,0 +1,93 @@
+"""How impulses change velocities within one tick, from MuJoCo's sparse arrays."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
+_CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
+
+
+class Metric:
+    """H = M^ + Jc^T D Jc: implicit servos, and the stiffness of the native constraints that are active now.
+
+    These are limits, mimics, a robot against a pole. Only the kinematic trees concerned are factored.
+    """
+
+    def __init__(self, world: mujoco.MjModel) -> None:
+        self._world = world
+        self._blocks: dict[bytes, _Block] = {}
+        self._each = np.arange(world.ntree, dtype=np.int32)
+
+    def inverse(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
+        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T."""
+        dofs = self._coupled(d, J)
+        block = self._blocks.get(dofs.tobytes())
+        if block is None:
+            block = self._blocks[dofs.tobytes()] = _Block(self._world, dofs)
+        change = np.zeros((self._world.nv, len(J)))
+        change[dofs] = np.linalg.solve(block.hessian(d), J[:, dofs].T)
+        return change
+
+    def group(self, d: mujoco.MjData) -> np.ndarray:
+        """[MuJoCo kinematic tree] a label that two share if a force on one may move the other in this tick."""
+        m = self._world
+        if d.nefc == 0:
+            return self._each
+        return np.where(d.tree_island >= 0, m.ntree + d.tree_island, self._each) if d.nisland else 0 * self._each
+
+    def bound(self, d: mujoco.MjData, bodies: np.ndarray) -> bool:
+        """Whether native constraints that are active now bind one of these MuJoCo bodies [k].
+
+        If not, the metric of the tick is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.
+        """
+        if d.nefc == 0:
+            return False
+        tree = self._world.body_treeid[bodies]
+        return d.nisland == 0 or bool((d.tree_island[tree[tree >= 0]] >= 0).any())
+
+    def _coupled(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
+        """Degrees of freedom [k] that feel an impulse along ``J``: its trees and those in constraint with them."""
+        m = self._world
+        touched = np.zeros(m.ntree, bool)
+        touched[m.dof_treeid[J.any(axis=0)]] = True
+        if d.nefc and d.nisland:
+            islands = np.unique(d.tree_island[touched])
+            touched |= np.isin(d.tree_island, islands[islands >= 0])
+        return np.flatnonzero(touched[m.dof_treeid])
+
+
+class _Block:
+    """The metric of one tick for some degrees of freedom, gathered from MuJoCo's sparse arrays."""
+
+    def __init__(self, world: mujoco.MjModel, dofs: np.ndarray) -> None:
+        self.count = len(dofs)
+        self.at = np.full(world.nv, -1)
+        self.at[dofs] = np.arange(len(dofs))
+        self.dofs = dofs
+        row, column = np.repeat(np.arange(world.nv), world.M_rownnz), world.M_colind
+        self.entry = np.flatnonzero(self.at[row] >= 0)
+        self.row, self.column = self.at[row[self.entry]], self.at[column[self.entry]]
+
+    def hessian(self, d: mujoco.MjData) -> np.ndarray:
+        """[k, k]: M^ and the tangent of the active constraints."""
+        H = np.zeros((self.count, self.count))
+        diagonal = d.qHDiagInv[self.dofs]
+        if diagonal.all():
+            H[self.row, self.column] = d.qH[self.entry]
+            np.fill_diagonal(H, 1.0)
+            H = H.T @ (H / diagonal[:, None])
+        else:  # nothing implicit in the whole world: MuJoCo leaves the factor unset and M^ is M
+            H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]
+        if d.nefc:
+            state = d.efc_state
+            stiff = (state == _QUADRATIC) | (state == _CONE)
+            row = np.repeat(np.arange(d.nefc), d.efc_J_rownnz)
+            column = self.at[d.efc_J_colind[: len(row)]]
+            entry = np.flatnonzero(stiff[row] & (column >= 0))
+            if len(entry):
+                J = np.zeros((d.nefc, self.count))
+                J[row[entry], column[entry]] = d.efc_J[: len(row)][entry]
+                H += J.T @ (d.efc_D[:, None] * J)
+        return H
