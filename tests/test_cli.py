@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from vinesim.net.recording import Recording
 from vinesim.net.server import Server
 
 
@@ -32,9 +33,13 @@ def free_port():
 
 def test_help_shows_every_command_with_examples():
     top = vinesim("--help").stdout
-    for command in ("demo", "server", "client", "scene", "bench", "ros"):
+    for command in ("demo", "server", "client", "record", "replay", "scene", "bench", "ros"):
         assert command in top
-    for command in (["demo"], ["server"], ["client"], ["scene", "show"], ["bench"], ["ros", "build-interfaces"]):
+    commands = (
+        ["demo"], ["server"], ["client"], ["record"], ["replay"], ["scene", "show"], ["bench"],
+        ["ros", "build-interfaces"],
+    )  # fmt: skip
+    for command in commands:
         assert "Examples:" in vinesim(*command, "--help").stdout, command
 
 
@@ -79,6 +84,26 @@ def test_port_taken():
         refused(vinesim("server", "--listen", endpoint), 4, endpoint)
 
 
+def test_files_that_cannot_be_replayed(tmp_path):
+    (tmp_path / "scene.toml").write_text('name = "demo"\n')
+    refused(vinesim("replay", "scene.toml", "--out", "pictures", cwd=tmp_path), 2, "scene.toml", "no MCAP file")
+    with Recording(tmp_path / "old.mcap", {"protocol": "0", "release": "0.0.9"}):
+        pass
+    refused(vinesim("replay", "old.mcap", "--out", "pictures", cwd=tmp_path), 2, "version 0", "0.0.9")
+    with Recording(tmp_path / "empty.mcap"):
+        pass
+    refused(vinesim("replay", "empty.mcap", "--out", "pictures", cwd=tmp_path), 2, "empty.mcap", "no message")
+    assert not (tmp_path / "pictures").exists()
+
+
+def test_no_server_to_record_and_nowhere_to_write(tmp_path):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    refused(vinesim("record", "run.mcap", "--connect", endpoint, cwd=tmp_path), 4, endpoint, "vinesim server")
+    assert list(tmp_path.iterdir()) == []
+    with Server("tcp/127.0.0.1:0") as server:
+        refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 4, "no/run.mcap")
+
+
 def test_two_actors_with_one_name():
     with Server("tcp/127.0.0.1:0") as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "twin", "--no-ros", "--status", "json"]
@@ -103,6 +128,10 @@ def test_two_actors_with_one_name():
         (["client", "--spawn", "99", "--no-ros"], ["99"]),
         (["client", "--status", "xml"], ["xml", "json"]),
         (["bench", "nothing"], ["nothing", "plants", "camera"]),
+        (["record", "run.mcap", "--only", "cats"], ["cats", "poses", "trees"]),
+        (["record", "run.mcap", "--area", "0", "0", "-1", "1"], ["area 0 0 -1 1", "X0 < X1"]),
+        (["replay", "nowhere.mcap", "--out", "pictures"], ["nowhere.mcap", "No such file"]),
+        (["replay", "run.mcap"], ["--connect", "--listen", "--out"]),
         (["demo", "--scene", "nowhere"], ["nowhere"]),
         (["demo", "--robot", "nobody"], ["nobody"]),
         (["demo", "--job", "dance"], ["dance", "push", "pick", "exchange"]),

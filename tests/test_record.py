@@ -129,7 +129,7 @@ def test_an_actor_alone_sends_nothing_for_a_recorder(tmp_path):
     world.run(1.0)
     world.touch()
     assert world.ada.bus.bytes_out == 0
-    assert families(world.tape()) == {"live", "hello"}
+    assert families(world.tape()) == {"live", "hello", "snap"}  # what it was told because it asked
 
 
 def test_a_recorder_that_asks_for_everything_hears_one_who_is_alone(tmp_path):

@@ -110,7 +110,6 @@ class Recorder:
         self._live: set[str] = set()
         self._asked: dict[str, float] = {}
         self._strangers: set[str] = set()
-        self._snapped: set[interest.Cell] = set()
         self._place: dict[str, np.ndarray] = {}
         self._far: Subscription | None = None
         self._near: dict[str, tuple[Publisher, Subscription | None]] = {}
@@ -155,6 +154,7 @@ class Recorder:
             self.bus.subscribe("own/**", EVERY)
         if "facts" in self._only:
             self.bus.subscribe("fact/**", EVERY)
+            self.bus.ask("snap/*/*")  # what became true before
         if "forces" in self._only:
             self.bus.subscribe("force/**", EVERY)
 
@@ -225,7 +225,6 @@ class Recorder:
             if family == "a":
                 name = rest.partition("/")[0]
                 self._place[name] = messages.decode_robot(payload, name).base_q[:3]
-                self._ask_around(self._place[name])
         except MessageError:
             self.malformed += 1
         if family == "a" and "poses" not in self._only:
@@ -233,14 +232,6 @@ class Recorder:
         if family == "c" and self._only.isdisjoint({"trees"} if kind == messages.TREES else {"things"}):
             return
         self._put(key, payload)
-
-    def _ask_around(self, position: np.ndarray) -> None:
-        """Ask the server, once, what became true around here before the recording began."""
-        if "facts" not in self._only:
-            return
-        for cell in sorted(interest.window(interest.cell(position)) - self._snapped):
-            self._snapped.add(cell)
-            self.bus.ask(f"snap/{cell[0]}/{cell[1]}")
 
     # ------------------------------------------------------------ who is heard by whom
 

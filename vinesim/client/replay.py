@@ -176,9 +176,11 @@ class ReplayBus:
             self._reply(key, messages.encode_time(asked, self.time))
         elif family == "hello" and rest in self._cursor.live and rest in self._cursor.greetings:
             self._reply(key, self._cursor.greetings[rest])
-        elif family == "snap" and (cell := _cell(key)) is not None:
-            for part in _parts(self._cursor.facts.cell(cell)):
-                self._reply(key, messages.encode_facts(part))
+        elif family == "snap":
+            facts = self._cursor.facts
+            for x, y in sorted({cell for cell, _ in facts if matches(key, f"snap/{cell[0]}/{cell[1]}")}):
+                for part in _parts(facts.cell((x, y))):
+                    self._reply(f"snap/{x}/{y}", messages.encode_facts(part))
 
     def answers(self) -> list[Answer]:
         answers, self._answers = self._answers, []
