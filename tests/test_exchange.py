@@ -154,7 +154,7 @@ def test_a_driving_robot_is_seen_where_it_is_now_not_where_it_was():
     where = []
     for _ in range(60):
         hub.advance(TICK)
-        where.append(ada.exchange._actors["bob"].at(hub.time, hub.time))
+        where.append(ada.exchange._actors.known["bob"].at(hub.time, hub.time))
     assert where[-1].base_q[0] == pytest.approx(where[-20].base_q[0], abs=1e-9)
     assert not where[-1].base_qd.any()
     assert not where[-1].velocity.any()
@@ -277,10 +277,9 @@ def test_a_steady_touch_costs_a_heartbeat_and_a_moving_one_what_extrapolation_mi
         ada.bend(0, 0.2 + 0.1 * np.sin(3 * t), 0.3 * np.cos(3 * t))
         run(hub, [ada, bob], TICK)
         if k > 20:
-            late = ada.exchange
-            said = smooth.ahead(
-                late._said_q[bodies], late._said_rate[bodies], smooth.horizon(hub.time - late._said_at[0])
-            )
+            late = ada.exchange._trees
+            silence = smooth.horizon(hub.time - ada.exchange._own[0].said_at)
+            said = smooth.ahead(late._said_q[bodies], late._said_rate[bodies], silence)
             worst = max(worst, smooth.angle_between(ada.state.joint_q[bodies].astype(float), said).max())
     moved = ada.exchange.counters.environment.messages_out - before - 10
     assert 20 < moved < 200

@@ -33,6 +33,24 @@ def trees(rng: np.random.Generator, sizes: list[int], rate: float = 5.0) -> Tree
     return Trees(3.25, ids, *sequences, rng.integers(0, 4, count), np.array(sizes), q, qd)
 
 
+def cut(batch: Trees, roots: list[int], rng: np.random.Generator) -> Trees:
+    """The same trees with some bodies cut off each."""
+    where = [np.sort(rng.choice(size, k, replace=False)) for size, k in zip(batch.bodies, roots, strict=True)]
+    x, xd = rng.uniform(-50, 50, (sum(roots), 3)), rng.uniform(-5, 5, (sum(roots), 3))
+    return dataclasses.replace(batch, roots=np.array(roots), root=np.concatenate(where), root_x=x, root_xd=xd)
+
+
+def things(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0) -> messages.Things:
+    kinds = rng.choice([ids.Kind.BUNCH, ids.Kind.BOX], count) * ids.THING_STRIDE
+    numbers = np.sort(kinds + rng.choice(10000, count, replace=False))
+    at = rng.uniform([0.0, 0.0, -0.5], [6.0, 6.0, 5.5], (count, 3)) + 6.0 * np.array([*cell, 0.0])
+    pose = np.concatenate([at, frames.normalize(rng.standard_normal((count, 4)))], -1)
+    sequences = rng.integers(0, 65536, (2, count))
+    return messages.Things(
+        7.5, numbers, *sequences, rng.integers(0, 2, count), pose, rng.uniform(-speed, speed, (count, 6))
+    )
+
+
 def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(frames.log(frames.multiply(a, frames.conjugate(b))), axis=-1)
 
@@ -202,7 +220,7 @@ def test_greeting_comes_back_and_strangers_are_refused():
 
 def test_claims_come_back_and_impossible_ones_are_refused():
     claims = [(3, Claim(1, 65535, "ada"), True), (4, Claim(0, 7, ""), False)]
-    assert messages.decode_claims(messages.encode_claims(claims), 5) == claims
+    assert messages.decode_claims(messages.encode_claims(claims), (5, 0, 0)) == claims
     for wrong in (
         (5, Claim(), False),
         (-1, Claim(), False),
@@ -210,7 +228,7 @@ def test_claims_come_back_and_impossible_ones_are_refused():
         (0, Claim(0, 0, "a/b"), True),
     ):
         with pytest.raises(MessageError):
-            messages.decode_claims(messages.encode_claims([wrong]), 5)
+            messages.decode_claims(messages.encode_claims([wrong]), (5, 0, 0))
 
 
 def test_clock_messages_come_back():
@@ -224,7 +242,9 @@ DECODERS = (
     lambda payload: messages.decode_trees(payload, np.array([3, 4])),
     messages.decode_trees,
     messages.decode_hello,
-    lambda payload: messages.decode_claims(payload, 5),
+    lambda payload: messages.decode_claims(payload, (5, 0, 0)),
+    lambda payload: messages.decode_things(payload, (0, 0)),
+    lambda payload: messages.decode_facts(payload, (5, 3, 2)),
     messages.decode_time,
     messages.kind_of,
 )
@@ -237,7 +257,7 @@ def hold(payload: bytes) -> None:
             decode(payload)
 
 
-@given(st.binary(max_size=200), st.sampled_from([1, 2, 3, 16, 17]), st.booleans())
+@given(st.binary(max_size=200), st.sampled_from([1, 2, 3, 4, 5, 16, 17]), st.booleans())
 @settings(max_examples=1500, deadline=None)
 def test_arbitrary_bytes_raise_nothing_else(tail, kind, framed):
     hold((b"VS\x01" + bytes([kind]) if framed else b"") + tail)
@@ -250,6 +270,9 @@ def test_damaged_messages_raise_nothing_else(data):
     sound = [
         messages.encode_robot(robot(rng, 3)),
         one_message(trees(rng, [3, 4])),
+        one_message(cut(trees(rng, [3, 4]), [1, 2], rng)),
+        messages.encode_things(things(rng, 3), (0, 0))[0][0],
+        messages.encode_facts([fact(), fact(thing=3)]),
         messages.encode_hello(Hello("a", urdf="<robot/>")),
         messages.encode_claims([(1, Claim(1, 2, "a"), True)]),
         messages.encode_time(1.0, 2.0),
@@ -258,6 +281,54 @@ def test_damaged_messages_raise_nothing_else(data):
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     hold(bytes(payload[: data.draw(st.integers(0, len(payload)))]) if data.draw(st.booleans()) else bytes(payload))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 100), st.integers(-9, 9), st.sampled_from([0.0, 1e-3, 0.3, 4.0, 60.0]))
+@settings(max_examples=100, deadline=None)
+def test_things_come_back_within_quantisation(seed, count, where, speed):
+    sent, cell = things(np.random.default_rng(seed), count, (where, -where), speed), (where, -where)
+    payloads, heard = messages.encode_things(sent, cell)
+    assert max(len(payload) for payload in payloads) <= messages.SAMPLE
+    assert sum(len(payload) - 14 for payload in payloads) == 26 * count
+    parts = [messages.decode_things(payload, cell) for payload in payloads]
+    for field in dataclasses.fields(messages.Things)[1:]:
+        decoded = np.concatenate([getattr(part, field.name) for part in parts])
+        assert decoded.tobytes() == getattr(heard, field.name).tobytes(), "owner and copies hold the same bits"
+        if field.name not in ("pose", "velocity"):
+            np.testing.assert_array_equal(decoded, getattr(sent, field.name))
+    assert np.abs(heard.pose[:, :3] - sent.pose[:, :3]).max() <= 0.5e-4 + 1e-9
+    assert between(heard.pose[:, 3:], sent.pose[:, 3:]).max() < np.radians(0.2)
+    np.testing.assert_allclose(np.linalg.norm(heard.pose[:, 3:], axis=1), 1.0, atol=1e-12)
+    for part, least in ((slice(0, 3), 2.0**-11), (slice(3, 6), 2.0**-9)):
+        fastest = np.abs(sent.velocity[:, part]).max(1)
+        assert (np.abs(heard.velocity - sent.velocity)[:, part].max(1) <= np.maximum(fastest / 126.0, least)).all()
+
+
+@pytest.mark.parametrize("number", [5, 3 * ids.THING_STRIDE])
+def test_a_thing_that_is_none_is_refused(number):
+    batch = things(np.random.default_rng(0), 1)
+    (payload,), _ = messages.encode_things(dataclasses.replace(batch, thing=np.array([number])), (0, 0))
+    with pytest.raises(MessageError, match="of no kind"):
+        messages.decode_things(payload, (0, 0))
+    with pytest.raises(MessageError, match="bunch 17, this vineyard has 17"):
+        messages.check_thing(ids.thing(ids.Kind.BUNCH, 17), (100, 17, 2))
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.tuples(st.integers(1, 20), st.integers(0, 4)), min_size=1, max_size=40))
+@settings(max_examples=60, deadline=None)
+def test_trees_come_back_with_what_was_cut_off_them(seed, shapes):
+    rng = np.random.default_rng(seed)
+    sent = trees(rng, [size for size, _ in shapes])
+    sent = cut(sent, [min(k, size) for size, k in shapes], rng)
+    payloads, heard = messages.encode_trees(sent)
+    parts = [update for payload in payloads for update in messages.decode_trees(payload).updates("ada")]
+    ends = np.cumsum(sent.roots)
+    for update, here, end, count in zip(parts, heard.updates("ada"), ends, sent.roots, strict=True):
+        assert update.joint_q.tobytes() == here.joint_q.tobytes()
+        assert update.root.tolist() == sent.root[end - count : end].tolist()
+        np.testing.assert_allclose(update.root_x, sent.root_x[end - count : end], atol=1e-5)
+        assert update.root_x.tobytes() == here.root_x.tobytes()
+        np.testing.assert_allclose(update.root_xd, sent.root_xd[end - count : end], atol=0.51e-3)
 
 
 def fact(**change) -> messages.Fact:

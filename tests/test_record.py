@@ -155,10 +155,10 @@ def test_two_recorders_do_not_keep_each_other_listening(tmp_path):
         other = Recorder(world.hub.bus("other", live=False), recording, clock=lambda: world.hub.time)
         world.steps.append(other.step)
         world.run(1.0)
-        assert world.ada.exchange._pose.matching
+        assert world.ada.exchange._actors._pose.matching
         world.bob.robot.base_q[0] = 60.0
         world.run(1.0)
-        assert not world.ada.exchange._pose.matching
+        assert not world.ada.exchange._actors._pose.matching
 
 
 @pytest.mark.parametrize("only", FAMILIES)
@@ -214,7 +214,7 @@ def test_the_official_reader_reads_words_and_numbers(tmp_path):
     assert stamp == message.publish_time <= message.log_time
     assert messages_of["c/0/0/ada"][0][2]["trees"][0]["tree"] == 0
     assert messages_of["own/0/0/ada"][0][2]["claims"][0] == {
-        "tree": 0, "ownership": 0, "authority": 1, "owner": "ada", "touched": True,
+        "kind": "tree", "index": 0, "ownership": 0, "authority": 1, "owner": "ada", "touched": True,
     }  # fmt: skip
     assert messages_of["snap/0/0"][0][2]["facts"][0]["kind"] == "bunch"
     assert messages_of["hello/ada"][0][2]["scene"] == "rows"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import errno
 import json
 import pathlib
 import time
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,6 +19,7 @@ from mcap.writer import Writer
 
 from vinesim.net import messages, recording
 from vinesim.net.recording import NotARecording, Recording, RecordingStopped, free_path, read
+from vinesim.world.ids import Kind, thing
 
 
 def write(path: pathlib.Path, entries: list[tuple[int, str, bytes]], **about: str) -> pathlib.Path:
@@ -49,6 +52,39 @@ def until(condition) -> None:
         time.sleep(0.01)
 
 
+def test_what_a_message_says():
+    """Every kind in words and numbers that can be read without us, and the bytes beside them."""
+    pose = np.array([13.0, -3.5, 0.2, 0.0, 0.0, 0.6, 0.8])
+    box = thing(Kind.BOX, 2)
+    things = messages.Things(
+        1e9 + 0.5, np.array([box]), np.array([3]), np.array([4]), np.array([messages.TOUCHED]), pose[None],
+        np.array([[0.5, 0.0, 0.0, 0.0, 0.0, 1.0]]),
+    )  # fmt: skip
+    (payload,), heard = messages.encode_things(things, (2, -1))
+    said = recording.said("c/2/-1/ada", payload)
+    assert base64.b64decode(said["raw"]) == payload
+    assert said["actor"] == "ada"
+    assert said["timestamp"] == {"sec": 10**9, "nsec": 500_000_000}
+    (one,) = said["things"]
+    assert (one["kind"], one["index"], one["ownership"], one["authority"], one["touched"]) == ("box", 2, 3, 4, True)
+    assert list(one["pose"]["position"].values()) == pytest.approx(pose[:3], abs=2e-4)
+    assert list(one["pose"]["orientation"].values()) == pytest.approx(pose[3:], abs=2e-3)
+    assert one["velocity"] == heard.velocity[0].tolist()
+    assert messages.time_of(messages.restamped(payload, 2.0)) == 1e9 + 2.5
+    assert messages.restamped(payload, 2.0)[14:] == payload[14:]
+
+    fact = messages.Fact(box, 1, 2, "ada", pose=tuple(pose.tolist()), parent="bob/arm", moving=True)
+    (told,) = recording.said("fact/2/-1/ada", messages.encode_facts([fact]))["facts"]
+    assert (told["kind"], told["index"], told["parent"], told["moving"]) == ("box", 2, "bob/arm", True)
+    assert told["pose"]["position"]["x"] == 13.0
+    assert messages.time_of(messages.encode_facts([fact])) is None
+
+    assert recording.said("live/ada", b"\x01")["live"] is True
+    assert recording.said("live/ada", b"")["live"] is False
+    assert "error" in recording.said("c/nowhere/ada", payload)
+    assert "cut off" in recording.said("a/ada", b"VS")["error"]
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> bytes:
     """A file of five chunks of twenty messages, a second apart."""
@@ -57,7 +93,7 @@ def whole(tmp_path_factory) -> bytes:
         for second in range(5):
             for number in range(20):
                 file.put(int(1e9 * (second + number / 20)), "live/ada", bytes([1, second, number]))
-            until(lambda count=20 * (second + 1): len(read(path).entries) == count)
+            until(lambda count=20 * (second + 1): file.size and len(read(path).entries) == count)
     return path.read_bytes()
 
 

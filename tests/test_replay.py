@@ -115,6 +115,10 @@ def test_facts_are_answered_as_the_server_would(tape):
         bus.play(TICK)
     assert known() == {before, told}
     bus.ask("snap/9/9")
+    (empty,) = bus.answers()
+    assert (empty.key, messages.decode_facts(empty.payload)) == ("snap/9/9", [])
+    bus.ask("snap/*/*")
+    assert {answer.key for answer in bus.answers()} == {"snap/0/0"}
     bus.ask("snap/nonsense")
     assert bus.answers() == []
 
@@ -165,7 +169,7 @@ def test_on_a_network_it_happens_again(tape):
     rest = recorded_trees(tape)[-1]
     np.testing.assert_array_equal(stage.viewer.read(0)[0], rest.joint_q.astype(np.float32))
     # stamped anew: nobody extrapolates from the year of the recording, and velocities are believed
-    heard = stage.viewer.exchange._actors["ada"].update
+    heard = stage.viewer.exchange._actors.known["ada"].update
     assert 0.0 <= 5e8 + stage.hub.time - heard.time < 1.0  # since Bob left she had nobody to tell
     assert {fact.thing for fact in stage.kept} == {thing(Kind.BUNCH, 3), thing(Kind.BUNCH, 4)}
     stage.replay.close()

@@ -198,10 +198,10 @@ def count(endpoint: str, path: pathlib.Path | None, apart: float) -> list[int]:
             time.sleep(0.002)
 
         def settled() -> bool:
-            there = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.exchange._far_pose.matching
+            there = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.exchange._actors._far_pose.matching
             if apart < 5.0:
                 streams = [s.matching and e.matching for s, e in ada.exchange._spoken_cells.values()]
-                there &= ada.exchange._pose.matching and bob.exchange._pose.matching and any(streams)
+                there &= ada.exchange._actors._pose.matching and bob.exchange._actors._pose.matching and any(streams)
             if recorder is not None:
                 there &= recorder.greetings.keys() == {"ada", "bob"} and bool(recorder.recording.count > 6)
                 there &= apart > 5.0 or recorder._near.get("ada", (None, None))[1] is not None

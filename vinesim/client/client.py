@@ -21,6 +21,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.arrivals import Arrivals
+from vinesim.client.things import PULL, Things
 from vinesim.client.trace import Trace
 from vinesim.net import interest
 from vinesim.net.bus import Bus
@@ -35,9 +36,6 @@ from vinesim.world.scene import Scene
 from vinesim.world.values import RobotUpdate, TreeUpdate
 
 log = logging.getLogger(__name__)
-
-PULL = 0.2
-"""Share of the way to its owner's state by which the copy of a tree moves in one tick."""
 
 
 def label_index(name: str) -> int:
@@ -65,14 +63,13 @@ class Client:
     ) -> None:
         """``executor`` prepares robots that join, so that no tick has to; without one they are there at once."""
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(
-            model, device=device, threads=threads, picking=False
-        )  # the network does not carry it yet
+        self.physics = Physics(model, device=device, threads=threads, picking=description is not None)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robots: dict[str, Robot] = {}
         """All that this client moves, by name; the first is :attr:`robot`."""
+        self.things = Things(self.physics, self.robots)
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
         self._near = near
@@ -166,17 +163,25 @@ class Client:
 
     def send(self, now: float) -> None:
         """Say where the robot is, and what it touches to those who are near."""
-        physics = self.physics
-        touching = False
+        things = self.things
+        things.look()
+        moving, touching = things.moving, False
+        mine = frozenset().union(*(exchange.mine for exchange in self.exchanges.values()))
         for name, robot in self.robots.items():
-            touched = [tree for tree, actor in physics.touched if actor == name]
+            exchange = self.exchanges[name]
+            parted = things.parted(name, all_others=name == self.name)
+            touched = things.touched(name, exchange.mine)
             touching |= bool(touched)
-            settled = self.exchanges[name].send(
-                now, robot.update(now), touched=touched, moving=physics.sleep.moving, read=self._read,
+            settled = exchange.send(
+                now, robot.update(now), touched=touched, moving=moving, read=things.read,
+                grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, changed=things.changed,
+                lies=self.physics.riding.lies,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too
-                physics.plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
+                things.pull_tree(update, 1.0)
+            for number in mine - exchange.mine:
+                things.rested(exchange.fact(number))
         self.far.note(self, touching)
 
     def side_of(self, point: np.ndarray) -> str:
@@ -195,6 +200,7 @@ class Client:
             return inbox
         here = {name: self.physics.rigid.base(name)[0][:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
+        loose = {update.thing: update for update in inbox.things}
         nearest: dict[str, tuple[float, RobotUpdate]] = {}
         for name, heard in inboxes.items():
             for other, update in heard.robots.items():
@@ -202,37 +208,37 @@ class Client:
                 if other not in nearest or away < nearest[other][0]:
                     nearest[other] = away, update
             trees.update((update.tree, update) for update in heard.trees)
+            loose.update((update.thing, update) for update in heard.things)
+            if heard is not inbox:
+                inbox.facts += heard.facts
         inbox.robots = {other: update for other, (_, update) in sorted(nearest.items())}
         inbox.trees = [trees[tree] for tree in sorted(trees)]
+        inbox.things = [loose[number] for number in sorted(loose) if self._told_by_others(number)]
         return inbox
 
-    def _told_by_others(self, tree: int) -> bool:
-        """Whether another client owns a tree: none of one's own robots does, and somebody is known to."""
-        owners = {exchange.owner(tree) for exchange in self.exchanges.values()} - {None}
+    def _told_by_others(self, thing: int) -> bool:
+        """Whether another client owns a thing: none of one's own robots does, and somebody is known to."""
+        owners = {exchange.owner(thing) for exchange in self.exchanges.values()} - {None}
         return bool(owners) and not owners & self.robots.keys()
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
-        plants, told = self.physics.plants, self.physics.touching.told
+        things, told = self.things, self.physics.touching.told
         for update in inbox.trees:
             if update.tree not in self._copies:
-                plants.wake(update.tree)
-                plants.pull(update.tree, update.joint_q, update.joint_qd, 1.0)
+                self.physics.plants.wake(update.tree)
+                things.pull_tree(update, 1.0)
                 told[update.tree] = True
             self._copies[update.tree] = update
         for tree in [tree for tree in self._copies if not self._told_by_others(tree)]:
             update = self._copies.pop(tree)
             told[tree] = False
             if update.resting:
-                plants.pull(tree, update.joint_q, update.joint_qd, 1.0)
+                things.pull_tree(update, 1.0)
         for tree, update in self._copies.items():
-            plants.wake(tree)
-            plants.pull(tree, update.joint_q, update.joint_qd, PULL)
-
-    def _read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
-        here = self.model.bodies_of(tree)
-        state = self.physics.state
-        return state.joint_q[here], state.joint_qd[here]
+            self.physics.plants.wake(tree)
+            things.pull_tree(update, PULL)
+        things.receive(inbox)
 
 
 class Faraway:

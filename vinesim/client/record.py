@@ -16,9 +16,9 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.net import interest, messages
+from vinesim.net.actors import ASK_PERIOD, FAR_PERIOD, PING_PERIOD, Mismatch
 from vinesim.net.bus import EVERY, Bus, Publisher, Subscription
 from vinesim.net.clock import WINDOW, Clock, Ping
-from vinesim.net.exchange import ASK_PERIOD, FAR_PERIOD, PING_PERIOD, Mismatch
 from vinesim.net.messages import Hello, MessageError
 from vinesim.net.recording import Recording, sender_of
 from vinesim.world.values import RobotUpdate

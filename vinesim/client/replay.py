@@ -178,7 +178,9 @@ class ReplayBus:
             self._reply(key, self._cursor.greetings[rest])
         elif family == "snap":
             facts = self._cursor.facts
-            for x, y in sorted({cell for cell, _ in facts if matches(key, f"snap/{cell[0]}/{cell[1]}")}):
+            asked = _cell(key)  # of one cell even that there is nothing is an answer
+            cells = {cell for cell, _ in facts if matches(key, f"snap/{cell[0]}/{cell[1]}")}
+            for x, y in sorted(cells if asked is None else {asked}):
                 for part in _parts(facts.cell((x, y))):
                     self._reply(f"snap/{x}/{y}", messages.encode_facts(part))
 
@@ -223,7 +225,7 @@ class _Unheard:
 
 
 def _parts(facts: list[messages.Fact]) -> Iterable[list[messages.Fact]]:
-    """Facts in portions, each small enough to travel; none makes no portion."""
+    """Facts in portions, each small enough to travel, at least one."""
     part: list[messages.Fact] = []
     size = 0
     for fact in facts:
@@ -232,7 +234,7 @@ def _parts(facts: list[messages.Fact]) -> Iterable[list[messages.Fact]]:
         if size > ENOUGH:
             yield part
             part, size = [], 0
-    if part:
+    if part or not facts:
         yield part
 
 

@@ -63,7 +63,8 @@ class Spectator(Client):
     def send(self, now: float) -> None:
         """Say where the eyes are, and no more."""
         here = RobotUpdate(self.name, now, self.pose, np.zeros(6), np.zeros(0), np.zeros(0))
-        self.exchange.send(now, here, read=self._read)
+        self.things.look()
+        self.exchange.send(now, here, read=self.things.read)
 
 
 class Pictures:

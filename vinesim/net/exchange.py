@@ -1,89 +1,46 @@
 """The network as a client's tick sees it: :meth:`Exchange.receive` before the step, :meth:`Exchange.send` after it.
 
 What is decided here is decided by pure functions: who owns (:mod:`authority`), who is near (:mod:`interest`), whether
-a record is due (:mod:`smooth`). This class only holds what was said and heard. Environment records leave only when
-another actor is near the moved tree and somebody listens to its cell; else not one byte does.
+a record is due (:mod:`smooth`). Who is here is kept by :mod:`actors`, who owns what by :mod:`ownership`, what was said
+of what moves by :mod:`streams`, and what stays true by :mod:`telling`; this class puts them together. Environment
+records leave only when another actor is near what moves and somebody listens to its cell; else not one byte does.
+A fact leaves once, whoever is near: the server keeps it.
 
-Keys: ``a/<actor>`` pose at the full rate for those who are near, ``a/<actor>/far`` the same at 5 Hz for everybody,
-``c/<x>/<y>/<actor>`` moving trees of a cell, ``own/<x>/<y>/<actor>`` claims and rest (reliable), and the questions
-``hello/<actor>`` and ``clock``.
+Keys: ``c/<x>/<y>/<actor>`` what moves in a cell, ``own/<x>/<y>/<actor>`` claims and rest (reliable),
+``fact/<x>/<y>/<actor>`` facts (reliable), and the question ``snap/<x>/<y>``: what is known of a cell.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Callable, Iterable
 
+import msgspec
 import numpy as np
 
 from vinesim.net import authority, interest, messages, smooth
-from vinesim.net.authority import NOBODY, UNTOUCHED, Claim
-from vinesim.net.bus import EVERY, NEWEST, RECENT, Bus, Publisher, Subscription
-from vinesim.net.clock import WINDOW, Clock, Ping
+from vinesim.net.actors import Actors, Mismatch
+from vinesim.net.authority import NOBODY, Claim
+from vinesim.net.bus import EVERY, RECENT, Answer, Bus, Publisher, Subscription
+from vinesim.net.counters import Counters, Traffic
 from vinesim.net.interest import Cell
-from vinesim.net.messages import Hello, MessageError, Trees
+from vinesim.net.messages import Fact, Hello, MessageError, Things, Trees
+from vinesim.net.ownership import Ownership
+from vinesim.net.streams import NO_ROOTS, Read, Roots, Said, ThingStream, TreeStream, counts, with_roots
+from vinesim.net.telling import Telling
+from vinesim.world.ids import is_tree
 from vinesim.world.model import Model
-from vinesim.world.values import RobotUpdate, TreeUpdate
+from vinesim.world.values import RobotUpdate, ThingUpdate, TreeUpdate
 
-log = logging.getLogger(__name__)
+__all__ = ["Counters", "Exchange", "Inbox", "Mismatch", "Traffic"]
 
-ACTOR_PERIOD = 1.0 / 60.0
-"""Between poses for those who are near [s]."""
-
-FAR_PERIOD = 1.0 / 5.0
-"""Between poses for everybody [s]."""
-
-ASK_PERIOD = 0.5
-"""Between two attempts to hear an actor's greeting [s]."""
-
-PING_PERIOD = (0.05, 2.0)
-"""Between pings of the clock at the start, twice as many as are needed, and later [s]."""
-
-ANSWER_PERIOD = 0.2
-"""Between two corrections of the same tree [s]."""
-
-FORGOTTEN = 3.0
-"""An owner that says nothing of its tree for so long [s] (three heartbeats) is believed to own it no more."""
+ORPHANED = 0.5
+"""What moves and is nobody's for so long [s] becomes the nearest actor's: somebody must say where it comes to rest."""
 
 ONLOOKER = "spectator"
 """Kind of actor that owns nothing and says nothing but where it is."""
 
-_LONG_AGO = -1e9
-
-
-class Mismatch(RuntimeError):
-    """Actors that cannot share a world: their vineyards or their protocols differ."""
-
-    exit_code = 4
-
-
-@dataclasses.dataclass(slots=True)
-class Traffic:
-    """Messages and payload bytes of one family, each way."""
-
-    messages_in: int = 0
-    bytes_in: int = 0
-    messages_out: int = 0
-    bytes_out: int = 0
-
-
-@dataclasses.dataclass(slots=True)
-class Counters:
-    """What crossed the network and what was not believed."""
-
-    actor: Traffic = dataclasses.field(default_factory=Traffic)
-    """Poses of robots and humans."""
-    environment: Traffic = dataclasses.field(default_factory=Traffic)
-    """Moving trees."""
-    event: Traffic = dataclasses.field(default_factory=Traffic)
-    """Claims, corrections and rest."""
-    control: Traffic = dataclasses.field(default_factory=Traffic)
-    """Greetings and clock (received only)."""
-    malformed: int = 0
-    """Messages that could not be believed."""
-    dropped: int = 0
-    """Sound messages and records not used: overtaken, of a stranger, too far away, or of a lesser claim."""
+_NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclasses.dataclass(slots=True)
@@ -96,365 +53,225 @@ class Inbox:
     """Every other actor whose pose is known, every tick: extrapolated at most 150 ms, corrections blended in 100 ms."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
     """Trees of which their owner sent news: the last record of each, extrapolated at most 150 ms."""
+    things: list[ThingUpdate] = dataclasses.field(default_factory=list)
+    """Every box and loose bunch that somebody else moves, every tick, extrapolated at most 150 ms."""
+    facts: list[tuple[Fact, bool]] = dataclasses.field(default_factory=list)
+    """What has become known for good, and whether its poses hold: they do not if something newer is known, but what
+    was picked or cut stays so."""
     released: list[int] = dataclasses.field(default_factory=list)
-    """Trees another actor owned until now and nobody does any more: they rest, or their owner is gone."""
-
-
-class _Actor:
-    """Another actor and the last that is known of its pose."""
-
-    def __init__(self, hello: Hello) -> None:
-        self.hello = hello
-        self.joints = hello.joints
-        self.update: RobotUpdate | None = None
-        self.near: Subscription | None = None
-        self.moved_at = _LONG_AGO
-        self._state = np.zeros(0)
-        self._rate = np.zeros(0)
-        self._off = np.zeros(0)
-
-    def hear(self, update: RobotUpdate, time: float) -> bool:
-        """Take a newer pose at network ``time``; False if it is not newer."""
-        if self.update is not None and update.time <= self.update.time:
-            return False
-        if self.joints < 0:
-            self.joints = len(update.position)
-        if len(update.position) != self.joints:
-            raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
-        shown = None if self.update is None else self._shown(time)
-        q = update.base_q[3:]
-        self.update = update
-        self._state = np.concatenate([update.base_q, update.position])
-        self._rate = np.concatenate([update.base_qd[:3], smooth.spin(q, update.base_qd[3:]), update.velocity])
-        if shown is not None:
-            if shown[3:7] @ q < 0.0:
-                shown[3:7] *= -1.0
-            self._off = np.zeros(0)
-            self._off = shown - self._shown(time)
-            self.moved_at = time
-        return True
-
-    def at(self, time: float, now: float) -> RobotUpdate:
-        """The pose at network ``time``, to be shown ``now``."""
-        heard = self.update
-        assert heard is not None
-        shown = self._shown(time)
-        going = 1.0 if time - heard.time <= smooth.EXTRAPOLATION else 0.0
-        shown[3:7] /= np.sqrt(shown[3:7] @ shown[3:7])
-        return RobotUpdate(
-            heard.actor, now, shown[:7], heard.base_qd * going, shown[7:], heard.velocity * going
-        )  # fmt: skip
-
-    def _shown(self, time: float) -> np.ndarray:
-        assert self.update is not None
-        shown = self._state + self._rate * smooth.horizon(time - self.update.time)
-        if len(self._off):
-            shown += self._off * smooth.remaining(time - self.moved_at)
-        return shown
+    """Things another actor owned until now and nobody does any more: they rest, or their owner is gone."""
 
 
 class Exchange:
     """One client's share in a world: call :meth:`receive` and :meth:`send` once a tick, from one thread.
 
-    ``now`` is any clock of the client that runs in seconds; the offset to the server's clock is kept inside.
+    ``now`` is any clock of the client that runs in seconds; the offset to the server's clock is kept inside. Trees,
+    boxes and loose bunches are things, numbered by :func:`vinesim.world.ids.thing`.
     """
 
     def __init__(self, bus: Bus, me: Hello, model: Model, *, near: float = interest.NEAR) -> None:
-        """``near`` [m]: others nearer than this to a tree see what I do to it (at most 5 m, what cells cover)."""
+        """``near`` [m]: others nearer than this to a thing see what I do to it (at most 5 m, what cells cover)."""
         if me.name != bus.name:
             raise ValueError(f"greeting of {me.name!r} on the bus of {bus.name!r}: one actor has one name")
         self.bus, self.me, self.model = bus, me, model
         self.near = interest.checked(near)
-        self.kin: set[str] = set()
-        """Actors of the same client: they share its world and need not be told of it, nor heard."""
         self.counters = Counters()
-        self.clock = Clock()
-        greeting = messages.encode_hello(me)
-        bus.serve(f"hello/{me.name}", lambda _: greeting)
-        self._elders = bus.alive() - {me.name}
-
-        # others
-        self._actors: dict[str, _Actor] = {}
-        self._asked: dict[str, float] = {}
-        self._refused: set[str] = set()
-        self._blamed: set[str] = set()
-
-        # trees: what was last said of each, by me or by its owner
-        self._claims: dict[int, Claim] = {}
-        self._touching: dict[int, bool] = {}
-        self._before: dict[int, Claim] = {}
-        self._announced: set[int] = set()
-        self._mine: set[int] = set()
-        self._theirs: set[int] = set()
-        self._silent: set[int] = set()
-        self._answered: dict[int, float] = {}
-        tree_count, body_count = len(model.tree_first), len(model.body_mass)
-        self._said_at = np.full(tree_count, _LONG_AGO)
-        self._heard_at = np.full(tree_count, _LONG_AGO)
-        self._said_to = np.zeros(tree_count, np.int64)
-        self._said_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (body_count, 1))
-        self._said_rate = np.zeros((body_count, 4))
-        self._middle = _middles(model)
-        self._cells: list[Cell] = [tuple(cell) for cell in interest.cells(self._middle).tolist()]
-        self._reach = _reaches(model)
-        self._bodies = [model.bodies_of(tree) for tree in range(tree_count)]
-        self._plan: tuple[tuple[int, ...], np.ndarray, np.ndarray, np.ndarray] | None = None
-
-        # keys
+        self._actors = Actors(bus, me, self.counters)
+        self._own = Ownership(me.name, self._actors.known)
+        self._telling = Telling(bus, self.counters)
+        self._trees = TreeStream(model)
+        self._things = ThingStream()
+        self._counts = counts(model)
+        self._orphans: dict[int, float] = {}
         self._window: Cell | None = None
+        self._position = np.zeros(3)
         self._heard_cells: dict[Cell, tuple[Subscription, Subscription]] = {}
         self._spoken_cells: dict[Cell, tuple[Publisher, Publisher]] = {}
-        self._pose = bus.publisher(f"a/{me.name}")
-        self._far_pose = bus.publisher(f"a/{me.name}/far")
-        bus.subscribe("a/*/far", NEWEST)
-        self._pose_due: dict[Publisher, float] = {}
-        self._pinged, self._pings = _LONG_AGO, 0
         self._now: float | None = None
-        self._last_sent = _LONG_AGO
+        self._last_sent = -1e9
 
     # ------------------------------------------------------------ questions
 
-    def owner(self, tree: int) -> str | None:
-        """Who owns a tree now: a live actor's name (perhaps one's own), or None."""
-        owner = self._claims.get(tree, UNTOUCHED).owner
-        if owner == self.me.name:
-            return owner
-        return owner if owner in self._actors and tree not in self._silent else None
+    @property
+    def kin(self) -> set[str]:
+        """Actors of the same client: they share its world and need not be told of it, nor heard."""
+        return self._actors.kin
 
-    def claim(self, tree: int) -> Claim:
-        """The greatest claim on a tree that was made or heard."""
-        return self._claims.get(tree, UNTOUCHED)
+    @kin.setter
+    def kin(self, names: set[str]) -> None:
+        self._actors.kin = set(names)
+
+    def owner(self, thing: int) -> str | None:
+        """Who owns a thing now: a live actor's name (perhaps one's own), or None."""
+        return self._own.owner(thing)
+
+    def claim(self, thing: int) -> Claim:
+        """The greatest claim on a thing that was made or heard."""
+        return self._own.claim(thing)
+
+    def fact(self, thing: int) -> Fact | None:
+        """What is known of a thing for good."""
+        return self._telling.facts.of(thing)
+
+    @property
+    def mine(self) -> frozenset[int]:
+        """What I own."""
+        return frozenset(self._own.mine)
 
     @property
     def actors(self) -> dict[str, Hello]:
         """The greetings of all others who are in this world now."""
-        return {name: actor.hello for name, actor in self._actors.items()}
+        return {name: actor.hello for name, actor in self._actors.known.items()}
 
     @property
     def offset(self) -> float:
         """Network time minus the client's own [s]."""
-        return self.clock.offset
+        return self._actors.clock.offset
 
     # ------------------------------------------------------------ receive
 
     def receive(self, now: float) -> Inbox:
         """All that arrived since the last call, decided upon; :class:`Mismatch` if I do not belong to this world."""
-        inbox = Inbox()
-        self.clock = self.clock.after(now - self._now if self._now is not None else 0.0)
+        inbox, actors = Inbox(), self._actors
+        actors.clock = actors.clock.after(now - self._now if self._now is not None else 0.0)
         self._now = now
-        time = now + self.clock.offset
-        self._roster(now, inbox)
-        self._answers(now, inbox)
+        time = now + self.offset
+        inbox.left = actors.roster(now)
+        for name in inbox.left:
+            self._own.leave(name, time, self._heir)
+        inbox.joined, answers = actors.answers(now)
+        for answer in answers:
+            self._take_snapshot(answer, time, inbox)
         news: dict[int, tuple[Trees, str]] = {}
-        lost: list[tuple[int, Claim, bool]] = []
         for key, payload in self.bus.drain():
-            family, _, rest = key.partition("/")
-            parts = rest.split("/")
-            sender = parts[0] if family == "a" else parts[-1]
-            traffic = {"a": self.counters.actor, "c": self.counters.environment}.get(family, self.counters.event)
-            traffic.messages_in += 1
-            traffic.bytes_in += len(payload)
-            actor = self._actors.get(sender)
-            if actor is None:
-                if sender in self.kin:
-                    continue
-                self.counters.dropped += 1
-                continue
-            try:
-                if family == "a":
-                    self.counters.dropped += not actor.hear(messages.decode_robot(payload, sender), time)
-                elif messages.kind_of(payload) == messages.CLAIMS:
-                    for tree, claim, touching in messages.decode_claims(payload, len(self._said_at)):
-                        self._hear_claim(tree, claim, touching, sender, time, lost)
-                else:
-                    self._hear_trees(messages.decode_trees(payload, self.model.tree_size), sender, time, news, lost)
-            except MessageError as error:
-                self._blame(sender, error)
-        self._forget(time)
-        for tree in sorted(self._theirs):
-            if self.owner(tree) is None or tree in self._mine:
-                self._theirs.discard(tree)
-                if tree not in self._mine:
-                    inbox.released.append(tree)
-        inbox.trees = self._extrapolated(news, now, time)
-        inbox.robots = {n: a.at(time, now) for n, a in self._actors.items() if a.update is not None}
-        self._correct(lost, time)
+            self._hear(key, payload, time, news, inbox)
+        self._own.forget(time)
+        inbox.released = self._own.released()
+        for thing in inbox.released:
+            self._things.forget(thing)
+        inbox.trees = self._trees.extrapolated(news, now, time)
+        inbox.things = self._things.extrapolated(self._own.theirs, now, time)
+        inbox.robots = {n: a.at(time, now) for n, a in actors.known.items() if a.update is not None}
+        for thing in self._own.corrections(time):
+            if self.me.kind != ONLOOKER:
+                self._correct(thing)
         return inbox
 
-    def _roster(self, now: float, inbox: Inbox) -> None:
-        """Notice who came and who went."""
-        alive = self.bus.alive() - self.kin
-        for name in sorted(self._actors.keys() - alive):
-            self._leave(name, now + self.clock.offset)
-            inbox.left.append(name)
-        self._refused &= alive
-        self._elders &= alive
-        for name in sorted(alive - self._actors.keys() - self._refused - {self.me.name}):
-            if now - self._asked.get(name, _LONG_AGO) >= ASK_PERIOD:
-                self._asked[name] = now
-                self.bus.ask(f"hello/{name}")
-        if now - self._pinged >= PING_PERIOD[self._pings >= 2 * WINDOW]:
-            self._pinged, self._pings = now, self._pings + 1
-            self.bus.ask("clock", messages.encode_time(now))
-
-    def _answers(self, now: float, inbox: Inbox) -> None:
-        """Take greetings and the clock's answers."""
-        for key, payload, age in self.bus.answers():
-            self.counters.control.messages_in += 1
-            self.counters.control.bytes_in += len(payload)
-            name = key.partition("/")[2]
-            try:
-                if key == "clock":
-                    asked, server = messages.decode_time(payload)
-                    received = now - age
-                    if asked <= received:
-                        self.clock = self.clock.heard(Ping(asked, server, received))
-                elif name in self.bus.alive() and name not in self._actors and name not in self._refused:
-                    self._greet(name, payload, inbox)
-            except MessageError as error:
-                self._blame(name or "the clock", error)
-
-    def _greet(self, name: str, payload: bytes, inbox: Inbox) -> None:
-        """Let an actor in, unless it lives in another vineyard or speaks another protocol."""
+    def _hear(self, key: str, payload: bytes, time: float, news: dict[int, tuple[Trees, str]], inbox: Inbox) -> None:
+        """One message: whose it is stands in its key, never in the payload."""
+        family, _, rest = key.partition("/")
+        parts = rest.split("/")
+        sender = parts[0] if family == "a" else parts[-1]
+        counters = self.counters
+        traffic = {"a": counters.actor, "c": counters.environment, "fact": counters.fact}.get(family, counters.event)
+        traffic.heard(payload)
+        actor = self._actors.known.get(sender)
+        if actor is None and (family != "fact" or sender not in self.kin):
+            counters.dropped += sender not in self.kin
+            return
         try:
-            hello = messages.decode_hello(payload)
-        except messages.WrongVersion as error:
-            self._refuse(name, f"speaks protocol version {error.theirs}, {self.me.name!r} version {messages.PROTOCOL}")
-            return
-        if hello.name != name:
-            raise MessageError(f"{name!r} introduces itself as {hello.name!r}")
-        if hello.digest != self.me.digest:
-            self._refuse(
-                name,
-                f"has scene {hello.scene!r} with digest {hello.digest!r}, "
-                f"{self.me.name!r} has {self.me.scene!r} with {self.me.digest!r}",
-            )
-            return
-        self._actors[name] = _Actor(hello)
-        inbox.joined.append(hello)
+            if family == "a":
+                assert actor is not None
+                counters.dropped += not actor.hear(messages.decode_robot(payload, sender), time)
+                return
+            cell = int(parts[0]), int(parts[1])
+            kind = messages.kind_of(payload)
+            if family == "fact":
+                for fact in messages.decode_facts(payload, self._counts):
+                    if fact.author != sender:
+                        raise MessageError(f"fact by {fact.author!r} said by {sender!r}")
+                    self._hear_fact(cell, fact, time, inbox, told=sender not in self.kin)
+            elif kind == messages.CLAIMS:
+                for thing, claim, touching in messages.decode_claims(payload, self._counts):
+                    self._own.hear_claim(thing, claim, touching, sender, time)
+            elif kind == messages.THINGS:
+                self._hear_things(messages.decode_things(payload, cell), cell, sender, time)
+            else:
+                self._hear_trees(messages.decode_trees(payload, self.model.tree_size), sender, time, news)
+        except MessageError as error:
+            self._actors.blame(sender, error)
 
-    def _refuse(self, name: str, why: str) -> None:
-        """Whoever was here first is right: the newcomer stops, those who were here ignore it."""
-        text = f"{name!r} {why}: start both with the same scene, seed and release of vinesim"
-        if name in self._elders:
-            raise Mismatch(text)
-        log.warning("ignoring a newcomer: %s", text)
-        self._refused.add(name)
-
-    def _leave(self, name: str, time: float) -> None:
-        """An actor is gone: what it still moved goes to the nearest of those who remain, then the lowest name."""
-        actor = self._actors.pop(name)
-        self._asked.pop(name, None)
-        self._blamed.discard(name)
-        if actor.near is not None:
-            actor.near.close()
-        where = {
-            n: a.update.base_q for n, a in self._actors.items() if a.update is not None and a.hello.kind != ONLOOKER
-        }
-        if self._window is not None and self.me.kind != ONLOOKER:
-            where[self.me.name] = self._position
-        # its claims still hold, should it come back; only its silence counts, or two would never agree again
-        for tree in [tree for tree, claim in sorted(self._claims.items()) if claim.owner == name]:
-            recent = tree not in self._silent and time - self._heard_at[tree] < FORGOTTEN
-            self._silent.add(tree)
-            if recent and authority.successor(self._middle[tree], where) == self.me.name:
-                self._take(tree, authority.touched(self._claims[tree], self.me.name, False))
-
-    def _blame(self, sender: str, error: MessageError) -> None:
-        """Count a message that cannot be believed, and say so once for each sender."""
-        self.counters.malformed += 1
-        if sender not in self._blamed:
-            self._blamed.add(sender)
-            log.warning("dropped a message of %r, further ones only counted: %s", sender, error)
-
-    def _hear_trees(self, trees: Trees, sender: str, time: float, news: dict, lost: list) -> None:
+    def _hear_trees(self, trees: Trees, sender: str, time: float, news: dict[int, tuple[Trees, str]]) -> None:
         """Judge every record by its claim."""
-        near = self._near_me(trees.tree)
-        rows = zip(
-            trees.tree.tolist(), trees.ownership.tolist(), trees.authority.tolist(), trees.flags.tolist(), strict=True
-        )
-        for row, (tree, ownership, seq, flags) in enumerate(rows):
-            resting = bool(flags & messages.RESTING)
-            claim = Claim(ownership, seq, NOBODY if resting else sender)
-            held = self._claims.get(tree, UNTOUCHED)
-            fresh = trees.time > self._said_at[tree]
-            if claim != held and not authority.wins(claim, held):
-                self.counters.dropped += 1
-                if fresh and not resting:
-                    lost.append((tree, claim, True))
-                continue
-            if not fresh and claim == held:
-                self.counters.dropped += 1
-                continue
-            self._adopt(tree, claim, bool(flags & messages.TOUCHED))
-            self._said_at[tree], self._heard_at[tree] = trees.time, time
-            if near[row]:
+        near = self._near_me(self._trees.middle[trees.tree])
+        columns = (trees.tree, trees.ownership, trees.authority, trees.flags)
+        for row, (tree, ownership, seq, flags) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+            claim = Claim(ownership, seq, NOBODY if flags & messages.RESTING else sender)
+            believed = self._own.hear_record(tree, claim, bool(flags & messages.TOUCHED), trees.time, time)
+            if believed and near[row]:
                 news[tree] = (trees, sender)
             else:
                 self.counters.dropped += 1
 
-    def _hear_claim(self, tree: int, claim: Claim, touching: bool, sender: str, time: float, lost: list) -> None:
-        held = self._claims.get(tree, UNTOUCHED)
-        if claim == held:
-            if claim.owner == sender:
-                self._adopt(tree, claim, touching)
-                self._heard_at[tree] = time
-        elif authority.wins(claim, held):
-            self._adopt(tree, claim, touching)
-            self._heard_at[tree] = time
-        elif claim.owner == sender:
-            lost.append((tree, claim, touching))
+    def _hear_things(self, things: Things, cell: Cell, sender: str, time: float) -> None:
+        """Judge every record by its claim."""
+        for update in things.updates(sender):
+            messages.check_thing(update.thing, self._counts)
+        near = self._near_me(things.pose[:, :3])
+        for row, (update, flags) in enumerate(zip(things.updates(sender), things.flags.tolist(), strict=True)):
+            claim = Claim(update.ownership, update.authority, sender)
+            believed = self._own.hear_record(update.thing, claim, bool(flags & messages.TOUCHED), things.time, time)
+            if believed and near[row]:
+                self._things.hear(update, cell)
+            else:
+                self.counters.dropped += 1
 
-    def _adopt(self, tree: int, claim: Claim, touching: bool) -> None:
-        """Hold a claim that somebody else made or reported."""
-        self._claims[tree] = claim
-        self._touching[tree] = touching
-        self._announced.add(tree)
-        self._silent.discard(tree)
-        if claim.owner == self.me.name:
-            self._mine.add(tree)
+    def _hear_fact(self, cell: Cell, fact: Fact, time: float, inbox: Inbox, *, told: bool = True) -> None:
+        """Take a fact over if it is news; the client must be ``told``, unless it is its own."""
+        if not self._telling.hear(cell, fact):
             return
-        self._mine.discard(tree)
-        if claim.owner != NOBODY:
-            self._theirs.add(tree)
+        claim = Claim(fact.ownership, fact.authority, fact.author if fact.moving else NOBODY)
+        holds = self._own.hear_fact(fact.thing, claim, time)
+        if told:
+            inbox.facts.append((self._telling.facts.of(fact.thing) or fact, holds))
 
-    def _forget(self, time: float) -> None:
-        """Owners who fell silent own no more, until they are heard again: their claim still holds."""
-        for tree in self._theirs:
-            if time - self._heard_at[tree] > FORGOTTEN:
-                self._silent.add(tree)
-
-    def _extrapolated(self, news: dict[int, tuple[Trees, str]], now: float, time: float) -> list[TreeUpdate]:
-        """The last record of each tree, now; what was said is remembered for the next prediction."""
-        found: dict[int, TreeUpdate] = {}
-        for trees, sender in {id(batch[0]): batch for batch in news.values()}.values():
-            rate = smooth.spin(trees.joint_q, trees.joint_qd)
-            age = float(smooth.horizon(time - trees.time))
-            here = dataclasses.replace(trees, time=now)
-            if age > 0.0 and not (trees.flags & messages.RESTING).any():
-                here = dataclasses.replace(here, joint_q=smooth.ahead(trees.joint_q, rate, age))
-            first = 0
-            for update in here.updates(sender):
-                last = first + len(update.joint_q)
-                if news.get(update.tree, (None,))[0] is trees:
-                    found[update.tree] = update
-                    bodies = self._bodies[update.tree]
-                    self._said_q[bodies], self._said_rate[bodies] = trees.joint_q[first:last], rate[first:last]
-                first = last
-        return [found[tree] for tree in sorted(found)]
-
-    def _correct(self, lost: list[tuple[int, Claim, bool]], time: float) -> None:
-        """Tell whoever claims from old knowledge what holds: that is how everybody agrees again after a loss."""
-        if self.me.kind == ONLOOKER:
+    def _take_snapshot(self, answer: Answer, time: float, inbox: Inbox) -> None:
+        """What the server knows of a cell."""
+        family, *parts = answer.key.split("/")
+        if family != "snap" or len(parts) != 2:
             return
-        for tree, claim, _ in lost:
-            held = self.claim(tree)
-            if claim == held or authority.wins(claim, held):
-                continue
-            mine_to_say = self.owner(tree) in (self.me.name, None) or authority.outdated(claim, held)
-            if mine_to_say and time - self._answered.get(tree, _LONG_AGO) >= ANSWER_PERIOD:
-                self._answered[tree] = time
-                self._say(tree, held)
+        try:
+            cell = int(parts[0]), int(parts[1])
+            facts = messages.decode_facts(answer.payload, self._counts)
+        except (MessageError, ValueError) as error:
+            self._actors.blame("the server", MessageError(str(error)))
+            return
+        self._telling.answered(cell)
+        for fact in facts:
+            self._hear_fact(cell, fact, time, inbox)
+
+    def _near_me(self, where: np.ndarray) -> np.ndarray:
+        """Which places [k, 3] are near enough for me to see what moves there [k] bool; hysteresis as for cells."""
+        if self._window is None:
+            return np.zeros(len(where), bool)
+        away = where[:, :2] - self._position[:2]
+        return np.einsum("ij,ij->i", away, away) <= (self.near + interest.HYSTERESIS) ** 2
+
+    def _place(self, thing: int) -> np.ndarray:
+        """Where a thing was last [3] m."""
+        return self._trees.middle[thing] if is_tree(thing) else self._things.place(thing)
+
+    def _cell_of(self, thing: int) -> Cell | None:
+        return self._trees.cell[thing] if is_tree(thing) else self._things.cell(thing)
+
+    def _heir(self, thing: int) -> str:
+        """Who takes over what a gone actor moved."""
+        return authority.successor(self._place(thing), self._able())
+
+    def _able(self) -> dict[str, np.ndarray]:
+        """Where those are who can own things: all but onlookers."""
+        known, where = self._actors.known, self._actors.places()
+        where = {name: place for name, place in where.items() if known[name].hello.kind != ONLOOKER}
+        if self._window is not None and self.me.kind != ONLOOKER:
+            where[self.me.name] = self._position
+        return where
+
+    def _correct(self, thing: int) -> None:
+        """Say what holds, to all who listen to the thing's cell."""
+        known, cell = self._own[thing], self._cell_of(thing)
+        if cell is not None and cell in self._spoken_cells:
+            payload = messages.encode_claims([(thing, known.claim, known.touching)])
+            self._put(self._spoken_cells[cell][1], payload, self.counters.event)
 
     # ------------------------------------------------------------ send
 
@@ -465,61 +282,71 @@ class Exchange:
         *,
         touched: Iterable[int] = (),
         moving: Iterable[int] = (),
-        read: Callable[[int], tuple[np.ndarray, np.ndarray]],
+        read: Read,
         grabbed: Iterable[int] = (),
+        parted: Iterable[int] = (),
+        cut: Callable[[int], Roots] = lambda _: NO_ROOTS,
+        lies: Callable[[int], tuple[str, np.ndarray]] | None = None,
+        changed: Callable[[int], bool] = lambda _: False,
     ) -> list[TreeUpdate]:
         """Say what must be said this tick; returns the rest records that left, exactly as all copies hold them.
 
         ``robot`` is my pose (its ``time`` is replaced by ``now``; a spectator passes its viewpoint, without joints).
-        ``touched``: trees I am in contact with now; ``moving``: trees I own that still move by themselves (others are
-        ignored); ``grabbed``: trees of which I grabbed, picked or cut something this tick. ``read(tree)`` gives
-        (joint_q [n, 4], joint_qd [n, 3] rad/s) and is called only for trees that somebody near may have to hear of.
+        ``touched``: things I am in contact with now, boxes and bunches only while they move in their parent's frame;
+        ``moving``: things that still move by themselves (trees and boxes that are others' are ignored); ``grabbed``:
+        things that I grabbed, picked or cut this tick, and ``parted`` those of them that everybody must know of for
+        good. ``read(thing)`` gives joints ([n, 4], [n, 3] rad/s) of a tree, and is called only for trees that somebody
+        near may have to hear of, or pose [7] and velocity [6] of any other thing. ``cut(tree)`` tells what was cut off
+        a tree, ``lies(thing)`` parent and pose [7] in its frame, and whether a tree was ``changed`` for good by picks
+        or cuts: then the shape in which it comes to rest is a fact.
         """
-        time = self._last_sent = max(now + self.clock.offset, self._last_sent + 1e-6)
+        time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         self._position = np.asarray(robot.base_q[:3], float)
-        self._send_pose(robot, now, time)
-
-        touched = {int(tree) for tree in touched}
-        for tree in sorted({int(tree) for tree in grabbed}):
-            self._take(tree, authority.grabbed(self.claim(tree), self.me.name))
-            touched.add(tree)
-        for tree in sorted(touched):
-            held = self.claim(tree)
-            taken = authority.touched(
-                held, self.me.name, self.owner(tree) is not None and self._touching.get(tree, False)
-            )
-            if taken is not held:
-                self._take(tree, taken)
-        self._follow(self._position)
-        if not self._mine:
-            return []
-        active = tuple(sorted(self._mine & (touched | {int(tree) for tree in moving})))
-        left = self._rest(self._mine.difference(active), read, time)
-        if active:
-            self._send_trees(active, touched, read, time)
+        self._actors.say(robot, now, time)
+        touched, moving = {int(thing) for thing in touched}, {int(thing) for thing in moving}
+        for thing in sorted({int(thing) for thing in grabbed}):
+            self._own.grab(thing)
+            touched.add(thing)
+        for thing in sorted(touched):
+            self._own.touch(thing)
+        self._adopt_orphans(moving - touched, now, read)
+        self._follow(now)
+        mine = self._own.mine
+        active = tuple(sorted(mine & (touched | moving)))
+        left: list[TreeUpdate] = []
+        if mine:
+            for thing in sorted(mine.difference(active)):
+                if not is_tree(thing):
+                    self._tell_rest(thing, read, lies)
+                elif (rest := self._rest(thing, read, cut, time, changed(thing))) is not None:
+                    left.append(rest)
+        for thing in sorted({int(thing) for thing in parted} & mine):
+            self._tell_parted(thing, read, cut, time)
+        self._telling.speak()
+        split = sum(map(is_tree, active))
+        for stream, share in ((self._trees, active[:split]), (self._things, active[split:])):
+            if share:
+                self._stream(stream, share, touched, read, cut, time)
         return left
 
-    def _take(self, tree: int, claim: Claim) -> None:
-        """Own a tree from now on."""
-        if tree not in self._mine or tree in self._announced:
-            self._before[tree] = self.claim(tree)
-        self._claims[tree] = claim
-        self._touching[tree] = True
-        self._announced.discard(tree)
-        self._silent.discard(tree)
-        self._mine.add(tree)
-        self._said_to[tree] = 0
+    def _adopt_orphans(self, moving: set[int], now: float, read: Read) -> None:
+        """What moves and has been nobody's for a while becomes mine, if nobody is nearer."""
+        homeless = {thing for thing in moving if not is_tree(thing) and self.owner(thing) is None}
+        self._orphans = {thing: self._orphans.get(thing, now) for thing in homeless}
+        for thing in sorted(thing for thing, since in self._orphans.items() if now - since >= ORPHANED):
+            if authority.successor(read(thing)[0][:3], self._able()) == self.me.name:
+                self._own.inherit(thing)
 
-    def _follow(self, position: np.ndarray) -> None:
+    def _follow(self, now: float) -> None:
         """Move the window of cells and the circle of actors heard at the full rate."""
-        window = interest.moved(self._window, position)
-        owned = {self._cells[tree] for tree in self._mine}
+        window = interest.moved(self._window, self._position)
+        owned = {cell for thing in self._own.mine if (cell := self._cell_of(thing)) is not None}
         if window != self._window or not owned <= self._heard_cells.keys() or len(self._heard_cells) > 9:
             self._window = window
             wanted = interest.window(window) | owned
             for cell in sorted(self._heard_cells.keys() - wanted):
-                for thing in (*self._heard_cells.pop(cell), *self._spoken_cells.pop(cell)):
-                    thing.close()
+                for end in (*self._heard_cells.pop(cell), *self._spoken_cells.pop(cell)):
+                    end.close()
             for cell in sorted(wanted - self._heard_cells.keys()):
                 self._heard_cells[cell] = (
                     self.bus.subscribe(f"c/{cell[0]}/{cell[1]}/*", RECENT),
@@ -529,158 +356,138 @@ class Exchange:
                     self.bus.publisher(f"c/{cell[0]}/{cell[1]}/{self.me.name}"),
                     self.bus.publisher(f"own/{cell[0]}/{cell[1]}/{self.me.name}", reliable=True),
                 )
-        for name, actor in self._actors.items():
-            if actor.update is None:
-                continue
-            away = float(np.hypot(*(actor.update.base_q[:2] - position[:2])))
-            if interest.full_rate(away, actor.near is not None):
-                actor.near = actor.near or self.bus.subscribe(f"a/{name}", NEWEST)
-            elif actor.near is not None:
-                actor.near.close()
-                actor.near = None
+        self._telling.follow(self._heard_cells, now)
+        self._actors.follow(self._position)
 
-    def _send_pose(self, robot: RobotUpdate, now: float, time: float) -> None:
-        """60 Hz to those who are near, 5 Hz to everybody; encoded once, and only if somebody listens."""
-        payload = b""
-        for publisher, period in ((self._pose, ACTOR_PERIOD), (self._far_pose, FAR_PERIOD)):
-            due = self._pose_due.get(publisher, now)
-            if now < due - 1e-9:
-                continue
-            self._pose_due[publisher] = max(due, now - period) + period
-            if publisher.matching:
-                payload = payload or messages.encode_robot(dataclasses.replace(robot, actor=self.me.name, time=time))
-                self._put(publisher, payload, self.counters.actor)
+    def _audience(self, where: np.ndarray) -> np.ndarray:
+        """How many other actors are near each place [k, 3]: [k] int."""
+        others = np.array(list(self._actors.places().values())).reshape(-1, 3)
+        return interest.listeners(where, others, self.near)
 
-    def _near_me(self, trees: np.ndarray) -> np.ndarray:
-        """Which trees [k] are near enough for me to see them moved [k] bool; hysteresis as for cells."""
-        if self._window is None:
-            return np.zeros(len(trees), bool)
-        away = self._middle[trees, :2] - self._position[:2]
-        return np.einsum("ij,ij->i", away, away) <= (self.near + interest.HYSTERESIS) ** 2
-
-    def _audience(self, trees: tuple[int, ...]) -> np.ndarray:
-        """How many other actors are near each tree [k]."""
-        where = [actor.update.base_q[:3] for actor in self._actors.values() if actor.update is not None]
-        return interest.listeners(self._middle[list(trees)], np.array(where).reshape(-1, 3), self.near)
-
-    def _send_trees(self, active: tuple[int, ...], touched: set[int], read: Callable, time: float) -> None:
+    def _stream(
+        self, stream: TreeStream | ThingStream, active: tuple[int, ...], touched: set[int], read: Read,
+        cut: Callable[[int], Roots], time: float,
+    ) -> None:  # fmt: skip
         """One batch per cell of what copies would otherwise have wrong."""
-        audience = self._audience(active)
+        known = [self._own[thing] for thing in active]
+        audience = self._audience(stream.places(active, read))
+        contact = [thing in touched for thing in active]
         if not audience.any():
-            self._said_to[list(active)] = 0
-            for tree in active:
-                self._touching[tree] = tree in touched
+            for one, touching in zip(known, contact, strict=True):
+                one.said_to, one.touching = 0, touching
             return
-        if self._plan is None or self._plan[0] != active:
-            sizes = self.model.tree_size[list(active)].astype(np.int64)
-            order = np.concatenate([np.arange(b.start, b.stop) for b in (self._bodies[tree] for tree in active)])
-            self._plan = (active, sizes, np.cumsum(sizes) - sizes, order)
-        _, sizes, starts, bodies = self._plan
-        ids = np.array(active)
-        state = [read(tree) for tree in active]
-        q = np.concatenate([joint_q for joint_q, _ in state]).astype(np.float64)
-        qd = np.concatenate([joint_qd for _, joint_qd in state]).astype(np.float64)
-
-        silence = time - self._said_at[ids]
-        dt = np.repeat(smooth.horizon(silence), sizes)[:, None]
-        wrong = smooth.angle_between(q, smooth.ahead(self._said_q[bodies], self._said_rate[bodies], dt))
-        due = smooth.due(
-            np.add.reduceat(wrong * self._reach[bodies], starts), np.maximum.reduceat(wrong, starts), silence
-        )
-        # somebody came near, or the claim or the contact changed: copies must know at once
-        due |= audience > self._said_to[ids]
-        for row, tree in enumerate(active):
-            if self._touching[tree] != (tree in touched):
-                self._touching[tree] = tree in touched
-                due[row] = True
-        self._said_to[ids] = np.minimum(self._said_to[ids], audience)
+        silence = time - np.array([one.said_at for one in known])
+        due = smooth.due(*stream.wrong(active, silence, read, cut), silence)
+        for row, (one, touching) in enumerate(zip(known, contact, strict=True)):
+            # somebody came near, or the claim or the contact changed: copies must know at once
+            due[row] |= audience[row] > one.said_to or one.touching != touching
+            one.touching = touching
+            one.said_to = min(one.said_to, int(audience[row]))
         due &= audience > 0
-        if not due.any():
-            return
 
+        cells = stream.cells(active)
         by_cell: dict[Cell, list[int]] = {}
         for row in np.flatnonzero(due).tolist():
-            by_cell.setdefault(self._cells[active[row]], []).append(row)
+            by_cell.setdefault(cells[row], []).append(row)
         for cell, rows in sorted(by_cell.items()):
-            stream, events = self._spoken_cells[cell]
-            if not stream.matching:
+            voice, events = self._spoken_cells.get(cell, (None, None))
+            if voice is None or events is None or not voice.matching:
                 continue
-            here = [active[row] for row in rows]
-            fresh = [(tree, self._claims[tree], self._touching[tree]) for tree in here if tree not in self._announced]
+            here = [(active[row], known[row]) for row in rows]
+            fresh = [(thing, one.claim, one.touching) for thing, one in here if not one.announced]
             if fresh:
                 self._put(events, messages.encode_claims(fresh), self.counters.event)
-            part: slice | np.ndarray = slice(None)
-            if len(rows) < len(active):
-                part = np.concatenate([np.arange(starts[row], starts[row] + sizes[row]) for row in rows])
-            payloads, heard = messages.encode_trees(self._batch(here, sizes[rows], q[part], qd[part], time))
-            for payload in payloads:
-                self._put(stream, payload, self.counters.environment)
-            self._announced.update(here)
-            self._said_at[here], self._said_to[here] = time, audience[rows]
-            self._said_q[bodies[part]] = heard.joint_q
-            self._said_rate[bodies[part]] = smooth.spin(heard.joint_q, heard.joint_qd)
+            said = Said([one.claim for _, one in here], [messages.TOUCHED * one.touching for _, one in here])
+            for payload in stream.encode(rows, said, time, cell):
+                self._put(voice, payload, self.counters.environment)
+            for row in rows:
+                known[row].announced, known[row].said_at, known[row].said_to = True, time, int(audience[row])
 
-    def _batch(self, ids: list[int], sizes: np.ndarray, q: np.ndarray, qd: np.ndarray, time: float) -> Trees:
-        claims = [self._claims[tree] for tree in ids]
-        flags = [messages.TOUCHED * self._touching[tree] for tree in ids]
-        ownership, seq = [claim.ownership for claim in claims], [claim.authority for claim in claims]
-        return Trees(time, np.array(ids), np.array(ownership), np.array(seq), np.array(flags), sizes, q, qd)
+    # ------------------------------------------------------------ rest and facts
 
-    def _rest(self, resting: set[int], read: Callable, time: float) -> list[TreeUpdate]:
-        """What I moved lies still: one reliable record to those who are near, and silence."""
-        left: list[TreeUpdate] = []
-        for tree in sorted(resting):
-            self._mine.discard(tree)
-            held = self._claims[tree]
-            self._claims[tree] = authority.rested(held)
-            self._touching[tree] = False
-            _, events = self._spoken_cells.get(self._cells[tree], (None, None))
-            if self._audience((tree,))[0] and events is not None and events.matching:
-                q, qd = read(tree)
-                batch = Trees(
-                    time, np.array([tree]), np.array([held.ownership]), np.array([held.authority]),
-                    np.array([messages.RESTING]), np.array([len(q)]), np.asarray(q, float), np.zeros_like(qd, float),
-                )  # fmt: skip
-                (payload,), heard = messages.encode_trees(batch)
-                if self._put(events, payload, self.counters.event):
-                    self._announced.add(tree)
-                    self._said_at[tree] = time
-                    left += heard.updates(self.me.name)
-            elif tree not in self._announced:
-                # nobody ever heard of this claim: as if it had not been, so that sequences only count what was said
-                before = self._before[tree]
-                self._claims[tree] = authority.rested(before) if before.owner == self.me.name else before
-                self._silent.add(tree)
-        return left
+    def _rest(
+        self, tree: int, read: Read, cut: Callable[[int], Roots], time: float, changed: bool
+    ) -> TreeUpdate | None:
+        """A tree that I moved lies still: one reliable record to those who are near, and silence.
 
-    def _say(self, tree: int, claim: Claim) -> None:
-        """A correction, to all who listen to the tree's cell."""
-        cell = self._cells[tree]
-        if cell in self._spoken_cells:
-            payload = messages.encode_claims([(tree, claim, self._touching.get(tree, False))])
-            self._put(self._spoken_cells[cell][1], payload, self.counters.event)
+        If it is not the tree that everybody knows from the start, the record is a fact.
+        """
+        if changed:
+            self._own.step(tree)
+        known, held = self._own[tree], self._own.rest(tree)
+        cell = self._trees.cell[tree]
+        _, events = self._spoken_cells.get(cell, (None, None))
+        heard = self._audience(self._trees.middle[[tree]])[0] and events is not None and events.matching
+        if not (heard or changed):
+            if not known.announced:
+                self._own.withdraw(tree)
+            return None
+        payload, update = self._state_of(tree, held, read, cut, time)
+        if changed:
+            self._tell(cell, Fact(tree, held.ownership, held.authority, self.me.name, _NOWHERE, "", (), payload), cut)
+        if heard and events is not None:
+            self._put(events, payload, self.counters.event)
+        known.announced, known.said_at = True, time
+        return update
+
+    def _state_of(
+        self,
+        tree: int,
+        claim: Claim,
+        read: Read,
+        cut: Callable[[int], Roots],
+        time: float,
+        flags: int = messages.RESTING,
+    ) -> tuple[bytes, TreeUpdate]:
+        """A tree's state as a message, and as all who read it have it."""
+        q, qd = read(tree)
+        numbers, x, xd = cut(tree)
+        still = 0.0 if flags & messages.RESTING else 1.0
+        said = Said([claim], [flags])
+        batch = Trees(
+            time, np.array([tree]), *said.columns(), np.array([len(q)]), np.asarray(q, float),
+            still * np.asarray(qd, float),
+        )  # fmt: skip
+        (payload,), heard = messages.encode_trees(with_roots(batch, [(numbers, x, still * xd)]))
+        (update,) = heard.updates(self.me.name)
+        return payload, update
+
+    def _tell_rest(self, thing: int, read: Read, lies: Callable[[int], tuple[str, np.ndarray]] | None) -> None:
+        """A box or a bunch that I moved lies still in its parent's frame: a fact, and silence."""
+        assert lies is not None, f"thing {thing} rests, and nobody can say where"
+        self._own.step(thing)
+        held = self._own.rest(thing)
+        self._things.places((thing,), read)
+        parent, pose = lies(thing)
+        self._own[thing].announced = True
+        self._tell(
+            self._things.cells((thing,))[0],
+            Fact(thing, held.ownership, held.authority, self.me.name, tuple(pose.tolist()), parent),
+        )
+
+    def _tell_parted(self, thing: int, read: Read, cut: Callable[[int], Roots], time: float) -> None:
+        """Something left its vine, and is moving: everybody must know at once, near or not."""
+        claim = self._own.claim(thing)
+        fact = Fact(thing, claim.ownership, claim.authority, self.me.name, moving=True)
+        self._own[thing].announced = True
+        if is_tree(thing):
+            payload, _ = self._state_of(thing, claim, read, cut, time, messages.TOUCHED)
+            self._tell(self._trees.cell[thing], msgspec.structs.replace(fact, trees=payload), cut)
+            return
+        self._things.places((thing,), read)
+        pose, _ = read(thing)
+        fact = msgspec.structs.replace(fact, pose=tuple(np.asarray(pose, float).tolist()))
+        self._tell(self._things.cells((thing,))[0], fact)
+
+    def _tell(self, cell: Cell, fact: Fact, cut: Callable[[int], Roots] | None = None) -> None:
+        """Say a fact; of a tree, with all that was cut off it."""
+        if cut is not None:
+            first = int(self.model.tree_first[fact.thing])
+            fact = msgspec.structs.replace(fact, cut=tuple((first + cut(fact.thing)[0]).tolist()))
+        self._telling.say(cell, fact)
 
     def _put(self, publisher: Publisher, payload: bytes, traffic: Traffic) -> bool:
         if not publisher.put(payload):
             return False
-        traffic.messages_out += 1
-        traffic.bytes_out += len(payload)
+        traffic.said(payload)
         return True
-
-
-def _middles(model: Model) -> np.ndarray:
-    """Where each tree is [tree, 3] m: the mean of its settled bodies."""
-    origins = model.forward(model.joint_settled)[:, :3]
-    middles = np.zeros((len(model.tree_first), 3))
-    np.add.at(middles, model.body_tree, origins)
-    return middles / np.maximum(model.tree_size, 1)[:, None]
-
-
-def _reaches(model: Model) -> np.ndarray:
-    """How far from each body's joint the wood it carries ends, along the longest way [body] m."""
-    reach = model.body_length.astype(float).copy()
-    for body in range(len(reach) - 1, -1, -1):
-        parent = model.body_parent[body]
-        if parent >= 0:
-            reach[parent] = max(reach[parent], float(np.linalg.norm(model.body_offset[body])) + reach[body])
-    return reach

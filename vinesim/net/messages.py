@@ -6,7 +6,8 @@ version, not finite or too large raises :class:`MessageError` in words, and noth
 
 Rotations travel as rotation vectors, three i16 of pi/32767 rad (error 0.003 degrees a component); joint rates of
 a tree as i8 of that tree's own scale (error 0.4 % of its fastest joint). An owner that wants to agree with its copies
-to the bit uses :func:`quantised` of what it sends.
+to the bit uses :func:`quantised` of what it sends. Boxes and loose bunches travel as 26 bytes each, in the cell under
+which they are said: position in steps of 0.1 mm, rotation as the three smallest of four numbers, 10 bits each.
 """
 
 from __future__ import annotations
@@ -20,17 +21,18 @@ import msgspec
 import numpy as np
 
 from vinesim.net.authority import Claim
+from vinesim.net.interest import CELL, Cell
 from vinesim.world.ids import THING_STRIDE, Kind
-from vinesim.world.values import RobotUpdate, TreeUpdate
+from vinesim.world.values import RobotUpdate, ThingUpdate, TreeUpdate
 
 PROTOCOL = 1
 """Version of everything in this file. Others are refused."""
 
 MAGIC = b"VS"
-ROBOT, TREES, CLAIMS, FACTS, HELLO, TIME = 1, 2, 3, 4, 16, 17
+ROBOT, TREES, CLAIMS, FACTS, THINGS, HELLO, TIME = 1, 2, 3, 4, 5, 16, 17
 """Kinds of message."""
 
-TIMED = frozenset((ROBOT, TREES))
+TIMED = frozenset((ROBOT, TREES, THINGS))
 """Kinds that say in their header at which network time they were true."""
 
 SAMPLE = 1100
@@ -49,7 +51,21 @@ VELOCITY = 1e-3
 """Unit of an actor's velocities [m/s, rad/s]: 32.7 at most, faster ones are clipped."""
 
 TOUCHED, RESTING = 1, 2
-"""Flags of a tree: its owner is in contact with it; it lies still and silence follows."""
+"""Flags of a tree or thing: its owner is in contact with it; it lies still and silence follows."""
+
+ROOTS = 4
+"""Flags of a tree count in steps of this how many bodies were cut off it; their places follow all joints."""
+
+MOST_ROOTS = 255 // ROOTS
+
+STEP = 1e-4
+"""Unit of a thing's position in its cell [m]: 3.2 m about :data:`MIDDLE`, farther ones are clipped."""
+
+MIDDLE = np.array([0.5 * CELL, 0.5 * CELL, 2.5])
+"""From a cell's corner on the ground to the point from which positions count [m]."""
+
+SLOWEST = np.array([2.0**-10, 2.0**-8])
+"""Least units of a thing's velocity [m/s] and rate of turn [rad/s]; each record doubles them as often as it must."""
 
 MAX_JOINTS = 256
 MAX_TREES = 4096
@@ -64,6 +80,13 @@ _TREE = np.dtype(
     [("tree", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("bodies", "<u2"), ("scale", "<u2")]
 )
 _BODY = np.dtype([("turn", "<i2", 3), ("rate", "i1", 3)])
+_ROOT = np.dtype([("body", "<u2"), ("position", "<f4", 3), ("velocity", "<i2", 3)])
+_THING = np.dtype(
+    [("thing", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
+     ("position", "<i2", 3), ("turn", "<u4"), ("velocity", "i1", 3), ("spin", "i1", 3)]
+)  # fmt: skip
+_THIRDS = 1023.0 / np.sqrt(2.0)
+"""Steps of the three smallest components of a unit quaternion, which lie between +-1/sqrt(2)."""
 _FURTHEST_TURN = (np.pi + 2.0 * TURN) ** 2
 
 
@@ -123,6 +146,8 @@ class Fact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=T
     """Bodies of the tree that were cut off their parents, in increasing order."""
     trees: bytes = b""
     """The tree's state as a message of one tree, :func:`encode_trees`."""
+    moving: bool = False
+    """It fell or was carried when this was said: its author goes on to tell those who are near."""
 
     @property
     def claim(self) -> Claim:
@@ -150,19 +175,63 @@ class Trees:
     """[sum of bodies, 4] xyzw"""
     joint_qd: np.ndarray
     """[sum of bodies, 3] rad/s"""
+    roots: np.ndarray = dataclasses.field(default_factory=lambda: _NO_ROOTS)
+    """[k] how many bodies were cut off each tree, or nothing at all if none was anywhere. Of these, tree by tree:"""
+    root: np.ndarray = dataclasses.field(default_factory=lambda: _NO_ROOTS)
+    """[sum of roots] number of the body in its tree"""
+    root_x: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """[sum of roots, 3] m, world"""
+    root_xd: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """[sum of roots, 3] m/s"""
 
     def updates(self, owner: str) -> list[TreeUpdate]:
         """One value per tree; their arrays are views of this batch."""
         ends = np.cumsum(self.bodies).tolist()
+        lasts = np.cumsum(self.roots).tolist() if len(self.roots) else [0] * len(ends)
         columns = (self.tree, self.ownership, self.authority, self.flags)
-        rows = zip(*(column.tolist() for column in columns), [0, *ends[:-1]], ends, strict=True)
+        rows = zip(
+            *(column.tolist() for column in columns), [0, *ends[:-1]], ends, [0, *lasts[:-1]], lasts, strict=True
+        )
         return [
             TreeUpdate(
                 tree, owner, ownership, authority, self.time, bool(flags & RESTING),
                 self.joint_q[start:end], self.joint_qd[start:end],
+                self.root[first:last], self.root_x[first:last], self.root_xd[first:last],
             )
-            for tree, ownership, authority, flags, start, end in rows
+            for tree, ownership, authority, flags, start, end, first, last in rows
         ]  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Things:
+    """Records of several boxes and loose bunches of one owner at one instant. Numbers strictly increase."""
+
+    time: float
+    """Network time [s]."""
+    thing: np.ndarray
+    """[k] :func:`vinesim.world.ids.thing`"""
+    ownership: np.ndarray
+    """[k] u16 sequences"""
+    authority: np.ndarray
+    """[k] u16 sequences"""
+    flags: np.ndarray
+    """[k] ``TOUCHED`` or 0"""
+    pose: np.ndarray
+    """[k, 7] m, 1; in the world"""
+    velocity: np.ndarray
+    """[k, 6] m/s and rad/s; of the origin, world axes"""
+
+    def updates(self, owner: str) -> list[ThingUpdate]:
+        """One value per thing; their arrays are views of this batch."""
+        columns = (self.thing, self.ownership, self.authority)
+        rows = zip(*(column.tolist() for column in columns), self.pose, self.velocity, strict=True)
+        return [
+            ThingUpdate(thing, owner, ownership, authority, self.time, pose, velocity)
+            for thing, ownership, authority, pose, velocity in rows
+        ]
+
+
+_NO_ROOTS = np.zeros(0, np.int64)
 
 
 # ---------------------------------------------------------------- rotations
@@ -356,24 +425,39 @@ def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
     for name in ("tree", "ownership", "authority", "flags", "bodies"):
         heads[name] = getattr(trees, name)
     heads["scale"] = scale
+    cuts = [0] * len(sizes)
+    roots = np.empty(len(trees.root), _ROOT)
+    if len(trees.roots):
+        cuts = trees.roots.tolist()
+        if max(cuts) > MOST_ROOTS or sum(cuts) != len(roots) or not np.isfinite(trees.root_x).all():
+            raise MessageError(f"trees with {cuts} bodies cut off (at most {MOST_ROOTS} each) and {len(roots)} places")
+        heads["flags"] += np.array(cuts, np.uint8) * ROOTS
+        roots["body"], roots["position"] = trees.root, trees.root_x
+        roots["velocity"] = np.clip(np.rint(trees.root_xd / VELOCITY), -32767, 32767)
 
-    payloads, start, body = [], 0, 0
-    head_bytes, body_bytes = heads.tobytes(), records.tobytes()
+    payloads, start, body, root = [], 0, 0, 0
+    head_bytes, body_bytes, root_bytes = heads.tobytes(), records.tobytes(), roots.tobytes()
     while start < len(sizes):
-        end, last, room = start, body, SAMPLE - _HEAD.size
+        end, last, end_root, room = start, body, root, SAMPLE - _HEAD.size
         while end < len(sizes):
-            room -= _TREE.itemsize + sizes[end] * _BODY.itemsize
+            room -= _TREE.itemsize + sizes[end] * _BODY.itemsize + cuts[end] * _ROOT.itemsize
             if room < 0 and end > start:
                 break
             last += sizes[end]
+            end_root += cuts[end]
             end += 1
         payloads.append(
             _head(TREES, end - start, trees.time)
             + head_bytes[start * _TREE.itemsize : end * _TREE.itemsize]
             + body_bytes[body * _BODY.itemsize : last * _BODY.itemsize]
+            + root_bytes[root * _ROOT.itemsize : end_root * _ROOT.itemsize]
         )
-        start, body = end, last
-    return payloads, dataclasses.replace(trees, joint_q=quaternion(turn * TURN), joint_qd=rate * unit)
+        start, body, root = end, last, end_root
+    heard = dataclasses.replace(
+        trees, joint_q=quaternion(turn * TURN), joint_qd=rate * unit,
+        root_x=roots["position"].astype(float), root_xd=roots["velocity"] * VELOCITY,
+    )  # fmt: skip
+    return payloads, heard
 
 
 def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
@@ -385,10 +469,13 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
     heads = np.frombuffer(payload, _TREE, count, _HEAD.size)
     tree, bodies = heads["tree"].astype(np.int64), heads["bodies"].astype(np.int64)
     total = int(bodies.sum())
-    if len(payload) != at + total * _BODY.itemsize or bodies.min() < 1 or total > MAX_BODIES:
-        raise MessageError(f"trees of {total} bodies in {len(payload)} B, expected {at + total * _BODY.itemsize} B")
-    if (tree[1:] <= tree[:-1]).any() or (heads["flags"] > (TOUCHED | RESTING)).any():
-        raise MessageError("tree ids that do not increase, or unknown flags")
+    cuts = heads["flags"].astype(np.int64) // ROOTS
+    after = at + total * _BODY.itemsize
+    expected = after + int(cuts.sum()) * _ROOT.itemsize
+    if len(payload) != expected or bodies.min() < 1 or total > MAX_BODIES:
+        raise MessageError(f"trees of {total} bodies in {len(payload)} B, expected {expected} B")
+    if (tree[1:] <= tree[:-1]).any():
+        raise MessageError("tree ids that do not increase")
     if tree_size is not None:
         if tree[-1] >= len(tree_size):
             raise MessageError(f"tree {tree[-1]}, this vineyard has {len(tree_size)}")
@@ -400,7 +487,98 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
     records = np.frombuffer(payload, _BODY, total, at)
     joint_q = quaternion(_checked_turn(records["turn"] * TURN, "tree"))
     joint_qd = records["rate"] * _unit(bodies, heads["scale"])
-    return Trees(time, tree, heads["ownership"], heads["authority"], heads["flags"], bodies, joint_q, joint_qd)
+    known = (time, tree, heads["ownership"], heads["authority"], heads["flags"] % ROOTS, bodies, joint_q, joint_qd)
+    if not cuts.any():
+        return Trees(*known)
+    roots = np.frombuffer(payload, _ROOT, int(cuts.sum()), after)
+    root, root_x = roots["body"].astype(np.int64), roots["position"].astype(float)
+    if (root >= np.repeat(bodies, cuts)).any() or not (np.abs(root_x) < FARTHEST).all():
+        raise MessageError("a body cut off a tree that has not so many, or lying nowhere")
+    if (np.diff(root)[np.diff(np.repeat(tree, cuts)) == 0] <= 0).any():
+        raise MessageError("bodies cut off a tree in an order that does not increase")
+    return Trees(*known, cuts, root, root_x, roots["velocity"] * VELOCITY)
+
+
+# ---------------------------------------------------------------- boxes and loose bunches
+
+
+def _smallest(q: np.ndarray) -> np.ndarray:
+    """Unit quaternions [k, 4] as 32 bits [k]: which component is the largest, and the other three, 10 bits each."""
+    rows = np.arange(len(q))
+    largest = np.argmax(np.abs(q), axis=1)
+    signed = q * np.copysign(1.0, q[rows, largest])[:, None]
+    three = signed[rows[:, None], (largest[:, None] + [1, 2, 3]) % 4]
+    steps = np.clip(np.rint(three * _THIRDS) + 511.0, 0.0, 1022.0).astype(np.uint32)
+    return (largest.astype(np.uint32) << 30) | (steps[:, 0] << 20) | (steps[:, 1] << 10) | steps[:, 2]
+
+
+def _whole(bits: np.ndarray) -> np.ndarray:
+    """Unit quaternions [k, 4] from 32 bits [k]; no other rotation has these bits, and these bits no other."""
+    largest = (bits >> 30).astype(np.int64)
+    three = (np.stack([bits >> 20, bits >> 10, bits], -1) & 1023).astype(float) - 511.0
+    three /= _THIRDS
+    rest = 1.0 - (three * three).sum(1)
+    if (rest < 0.2).any():
+        raise MessageError("a thing with a rotation that cannot be")
+    q = np.empty((len(bits), 4))
+    rows = np.arange(len(bits))
+    q[rows, largest] = np.sqrt(rest)
+    q[rows[:, None], (largest[:, None] + [1, 2, 3]) % 4] = three
+    return q
+
+
+def encode_things(things: Things, cell: Cell) -> tuple[list[bytes], Things]:
+    """Messages of at most 1.1 kB about things said under ``cell``, and what their receivers will decode, together."""
+    ids = things.thing
+    if not len(ids) or (len(ids) > 1 and not (ids[1:] > ids[:-1]).all()):
+        raise MessageError("things of a batch must be at least one, in strictly increasing order")
+    if not (np.isfinite(things.pose).all() and np.isfinite(things.velocity).all()):
+        raise MessageError("state of a thing is not finite")
+    records = np.empty(len(ids), _THING)
+    for name in ("thing", "ownership", "authority", "flags"):
+        records[name] = getattr(things, name)
+    records["position"] = np.clip(np.rint((things.pose[:, :3] - _corner(cell)) / STEP), -32767, 32767)
+    records["turn"] = _smallest(things.pose[:, 3:])
+    velocity = things.velocity.reshape(-1, 2, 3)
+    fastest = np.maximum(np.abs(velocity).max(2) / (127.0 * SLOWEST), 1.0)
+    doubled = np.minimum(np.ceil(np.log2(fastest)), 15.0)
+    steps = np.clip(np.rint(velocity / (SLOWEST * 2.0**doubled)[:, :, None]), -127.0, 127.0)
+    records["velocity"], records["spin"] = steps[:, 0], steps[:, 1]
+    records["scale"] = doubled[:, 0] + 16.0 * doubled[:, 1]
+    count = (SAMPLE - _HEAD.size) // _THING.itemsize
+    parts = [records[first : first + count] for first in range(0, len(records), count)]
+    payloads = [_head(THINGS, len(part), things.time) + part.tobytes() for part in parts]
+    return payloads, _read_things(things.time, records, cell)
+
+
+def decode_things(payload: bytes, cell: Cell) -> Things:
+    """Records of things that were said under ``cell``; of which vineyard is for the reader to check."""
+    count, time = _open(payload, THINGS, "things")
+    if not 1 <= count <= MAX_TREES or len(payload) != _HEAD.size + count * _THING.itemsize:
+        raise MessageError(f"{count} things announced (1 to {MAX_TREES}) in {len(payload)} B")
+    records = np.frombuffer(payload, _THING, count, _HEAD.size)
+    ids = records["thing"].astype(np.int64)
+    if (ids[1:] <= ids[:-1]).any() or ids[0] < THING_STRIDE or ids[-1] >= len(Kind) * THING_STRIDE:
+        raise MessageError("things that are trees, of no kind, or in an order that does not increase")
+    if (records["flags"] > TOUCHED).any():
+        raise MessageError("things with unknown flags")
+    return _read_things(time, records, cell)
+
+
+def _read_things(time: float, records: np.ndarray, cell: Cell) -> Things:
+    pose = np.empty((len(records), 7))
+    pose[:, :3] = records["position"] * STEP + _corner(cell)
+    pose[:, 3:] = _whole(records["turn"])
+    doubled = np.stack([records["scale"] % 16, records["scale"] // 16], -1).astype(float)
+    unit = np.repeat(SLOWEST * 2.0**doubled, 3, axis=1)
+    velocity = np.concatenate([records["velocity"], records["spin"]], -1) * unit
+    ids = records["thing"].astype(np.int64)
+    return Things(time, ids, records["ownership"], records["authority"], records["flags"], pose, velocity)
+
+
+def _corner(cell: Cell) -> np.ndarray:
+    """Where positions of a cell are zero [3] m."""
+    return np.array([cell[0] * CELL, cell[1] * CELL, 0.0]) + MIDDLE
 
 
 # ---------------------------------------------------------------- rare things
@@ -431,21 +609,32 @@ def decode_hello(payload: bytes) -> Hello:
     return hello
 
 
+def check_thing(thing: int, counts: tuple[int, ...] | None = None) -> None:
+    """:class:`MessageError` unless there can be a thing of this number; ``counts``: how many there are of each kind."""
+    kind, index = divmod(thing, THING_STRIDE)
+    if not 0 <= kind < len(Kind):
+        raise MessageError(f"something is said of thing {thing}, which is of no kind")
+    if counts is not None and index >= counts[kind]:
+        raise MessageError(f"{Kind(kind).name.lower()} {index}, this vineyard has {counts[kind]}")
+
+
 def encode_claims(claims: list[tuple[int, Claim, bool]]) -> bytes:
-    """Claims as (tree, claim, whether its owner touches the tree now)."""
+    """Claims as (thing, claim, whether its owner touches the thing now)."""
     return _pack(CLAIMS, [(int(tree), *claim, touching) for tree, claim, touching in claims])
 
 
-def decode_claims(payload: bytes, tree_count: int | None = None) -> list[tuple[int, Claim, bool]]:
-    """Claims, each checked: a tree of this vineyard, u16 sequences, a possible name or nobody's."""
+def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list[tuple[int, Claim, bool]]:
+    """Claims, each checked: a thing of this vineyard, u16 sequences, a possible name or nobody's.
+
+    ``counts``: how many things there are of each kind.
+    """
     rows = _unpack(payload, CLAIMS, "claims", _claims_decoder)
     if len(rows) > MAX_TREES:
         raise MessageError(f"{len(rows)} claims in one message, at most {MAX_TREES}")
     for tree, ownership, authority, owner, _ in rows:
-        if not 0 <= tree < (1 << 32 if tree_count is None else tree_count):
-            raise MessageError(f"claim on tree {tree}, this vineyard has {tree_count}")
+        check_thing(tree, counts)
         if not (0 <= ownership < 1 << 16 and 0 <= authority < 1 << 16) or (owner and not valid_name(owner)):
-            raise MessageError(f"claim ({ownership}, {authority}, {owner[:60]!r}) on tree {tree} is impossible")
+            raise MessageError(f"claim ({ownership}, {authority}, {owner[:60]!r}) on thing {tree} is impossible")
     return [
         (tree, Claim(ownership, authority, owner), touching) for tree, ownership, authority, owner, touching in rows
     ]
@@ -456,14 +645,16 @@ def encode_facts(facts: list[Fact]) -> bytes:
     return _pack(FACTS, facts)
 
 
-def decode_facts(payload: bytes) -> list[Fact]:
-    """Facts, each checked as far as that is possible without the vineyard: numbers, names, poses, sizes."""
+def decode_facts(payload: bytes, counts: tuple[int, ...] | None = None) -> list[Fact]:
+    """Facts, each checked as far as that is possible without the vineyard: numbers, names, poses, sizes.
+
+    ``counts``: how many things there are of each kind, if that is known.
+    """
     facts = _unpack(payload, FACTS, "facts", _facts_decoder)
     if len(facts) > MAX_FACTS:
         raise MessageError(f"{len(facts)} facts in one message, at most {MAX_FACTS}")
     for fact in facts:
-        if not 0 <= fact.thing < len(Kind) * THING_STRIDE:
-            raise MessageError(f"fact about thing {fact.thing}, which is of no kind")
+        check_thing(fact.thing, counts)
         if not (0 <= fact.ownership < 1 << 16 and 0 <= fact.authority < 1 << 16 and valid_name(fact.author)):
             raise MessageError(f"fact by {fact.author[:60]!r} with claim ({fact.ownership}, {fact.authority})")
         if not all(-FARTHEST < number < FARTHEST for number in fact.pose):

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 from mcap.exceptions import EndOfFile, InvalidMagic
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
@@ -28,7 +29,7 @@ from mcap.writer import Writer
 from vinesim import __version__
 from vinesim.net import messages
 from vinesim.net.messages import MessageError
-from vinesim.world.ids import unthing
+from vinesim.world.ids import Kind, unthing
 
 FLUSH = 0.5
 """What was recorded is in the hands of the operating system after this time [s], and on the disk: a recorder that is
@@ -68,13 +69,22 @@ def _stamp(seconds: float) -> dict[str, int]:
     return {"sec": nanoseconds // 1_000_000_000, "nsec": nanoseconds % 1_000_000_000}
 
 
-def _say_pose(payload: bytes, sender: str) -> dict[str, Any]:
-    update = messages.decode_robot(payload, sender)
-    x, y, z, qx, qy, qz, qw = update.base_q.tolist()
+def _pose(pose: np.ndarray) -> dict[str, dict[str, float]]:
+    x, y, z, qx, qy, qz, qw = pose.tolist()
+    return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
+
+
+def _named(thing: int) -> dict[str, Any]:
+    kind, index = unthing(thing)
+    return {"kind": kind.name.lower(), "index": index}
+
+
+def _say_pose(payload: bytes, key: str) -> dict[str, Any]:
+    update = messages.decode_robot(payload, sender_of(key))
     return {
         "timestamp": _stamp(update.time),
         "frame_id": "map",
-        "pose": {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}},
+        "pose": _pose(update.base_q),
         "velocity": update.base_qd.tolist(),
         "joint_position": update.position.tolist(),
         "joint_velocity": update.velocity.tolist(),
@@ -97,29 +107,45 @@ def _say_trees(payload: bytes, _: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _say_things(payload: bytes, key: str) -> dict[str, Any]:
+    _, x, y, _ = key.split("/")
+    things = messages.decode_things(payload, (int(x), int(y)))
+    return {
+        "timestamp": _stamp(things.time),
+        "things": [
+            {
+                **_named(update.thing), "ownership": update.ownership, "authority": update.authority,
+                "touched": bool(flags & messages.TOUCHED), "pose": _pose(update.pose),
+                "velocity": update.velocity.tolist(),
+            }
+            for update, flags in zip(things.updates(sender_of(key)), things.flags.tolist(), strict=True)
+        ],
+    }  # fmt: skip
+
+
 def _say_claims(payload: bytes, _: str) -> dict[str, Any]:
     return {
         "claims": [
             {
-                "tree": tree, "ownership": claim.ownership, "authority": claim.authority, "owner": claim.owner,
+                **_named(thing), "ownership": claim.ownership, "authority": claim.authority, "owner": claim.owner,
                 "touched": touching,
             }
-            for tree, claim, touching in messages.decode_claims(payload)
+            for thing, claim, touching in messages.decode_claims(payload)
         ]
     }  # fmt: skip
 
 
 def _say_facts(payload: bytes, _: str) -> dict[str, Any]:
-    told = []
-    for fact in messages.decode_facts(payload):
-        kind, index = unthing(fact.thing)
-        told.append(
+    return {
+        "facts": [
             {
-                "kind": kind.name.lower(), "index": index, "ownership": fact.ownership, "authority": fact.authority,
-                "author": fact.author, "pose": list(fact.pose), "parent": fact.parent, "cut": list(fact.cut),
+                **_named(fact.thing), "ownership": fact.ownership, "authority": fact.authority, "author": fact.author,
+                "moving": fact.moving, "pose": _pose(np.array(fact.pose)), "parent": fact.parent,
+                "cut": list(fact.cut),
             }
-        )  # fmt: skip
-    return {"facts": told}
+            for fact in messages.decode_facts(payload)
+        ]
+    }  # fmt: skip
 
 
 def _say_hello(payload: bytes, _: str) -> dict[str, Any]:
@@ -131,6 +157,7 @@ _SAYS: dict[int, Callable[[bytes, str], dict[str, Any]]] = {
     messages.TREES: _say_trees,
     messages.CLAIMS: _say_claims,
     messages.FACTS: _say_facts,
+    messages.THINGS: _say_things,
     messages.HELLO: _say_hello,
 }
 
@@ -148,8 +175,8 @@ def said(key: str, payload: bytes) -> dict[str, Any]:
         return {"actor": sender_of(key), "live": bool(payload), "raw": raw}
     try:
         say = _SAYS.get(messages.kind_of(payload))
-        return {"actor": sender_of(key), **(say(payload, sender_of(key)) if say is not None else {}), "raw": raw}
-    except MessageError as error:
+        return {"actor": sender_of(key), **(say(payload, key) if say is not None else {}), "raw": raw}
+    except ValueError as error:  # a key that names no cell among them
         return {"actor": sender_of(key), "error": str(error), "raw": raw}
 
 
@@ -166,6 +193,8 @@ def _list(items: Any) -> dict[str, Any]:
 
 _NUMBER, _COUNT, _TEXT, _YES = ({"type": kind} for kind in ("number", "integer", "string", "boolean"))
 _TIME = _object("time", "network time", sec=_COUNT, nsec=_COUNT)
+_CLAIM = {"ownership": _COUNT, "authority": _COUNT}
+_THING = {"kind": {"type": "string", "enum": [kind.name.lower() for kind in Kind]}, "index": _COUNT, **_CLAIM}
 _XYZ = _object("position", "m, world axes", x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _XYZW = _object("orientation", "unit quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 _COMMON = {
@@ -173,13 +202,13 @@ _COMMON = {
     "raw": {"type": "string", "contentEncoding": "base64", "description": "the message as it crossed the network"},
     "error": {"type": "string", "description": "why raw is no message"},
 }
-_CLAIM = {"ownership": _COUNT, "authority": _COUNT}
+_POSE = _object("pose", "in the world, of a fact in its parent's frame", position=_XYZ, orientation=_XYZW)
 _TREES = _list(_object("tree", "one record", tree=_COUNT, bodies=_COUNT, touched=_YES, resting=_YES, **_CLAIM))
-_CLAIMS = _list(_object("claim", "who says to own a tree", tree=_COUNT, owner=_TEXT, touched=_YES, **_CLAIM))
+_THINGS = _list(_object("thing", "a box or a loose bunch", touched=_YES, pose=_POSE, velocity=_list(_NUMBER), **_THING))
+_CLAIMS = _list(_object("claim", "who says to own a thing", owner=_TEXT, touched=_YES, **_THING))
 _FACTS = _list(
     _object(
-        "fact", "what stays true", kind=_TEXT, index=_COUNT, author=_TEXT, parent=_TEXT, pose=_list(_NUMBER),
-        cut=_list(_COUNT), **_CLAIM,
+        "fact", "what stays true", author=_TEXT, parent=_TEXT, moving=_YES, pose=_POSE, cut=_list(_COUNT), **_THING,
     )
 )  # fmt: skip
 
@@ -188,7 +217,7 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         "foxglove.PoseInFrame",
         _object(
             "foxglove.PoseInFrame", "Where an actor is, and its joints.", timestamp=_TIME, frame_id=_TEXT,
-            pose=_object("pose", "of its base", position=_XYZ, orientation=_XYZW),
+            pose=_POSE,
             velocity={**_list(_NUMBER), "description": "of its base: m/s, rad/s, world axes"},
             joint_position={**_list(_NUMBER), "description": "rad or m"},
             joint_velocity={**_list(_NUMBER), "description": "rad/s or m/s"}, **_COMMON,
@@ -196,7 +225,9 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "c": (
         "vinesim.Moving",
-        _object("vinesim.Moving", "What an actor moves in a cell.", timestamp=_TIME, trees=_TREES, **_COMMON),
+        _object(
+            "vinesim.Moving", "What an actor moves in a cell.", timestamp=_TIME, trees=_TREES, things=_THINGS, **_COMMON
+        ),
     ),
     "own": (
         "vinesim.Event",

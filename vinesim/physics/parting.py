@@ -74,11 +74,13 @@ class Partings:
         return told
 
     def _pull(self) -> None:
-        """Part the bunches whose peduncles have been strained for long enough."""
+        """Part the bunches whose peduncles have been strained for long enough, where that is ours to judge."""
+        model = self.plants.model
         bunches = self._hanging()
+        if self.touching.told.any():
+            bunches = bunches[~self.touching.told[model.body_tree[model.bunch_body[bunches]]]]
         if len(bunches) == 0:
             return
-        model = self.plants.model
         carried = self.plants.joint_wrench(model.bunch_body[bunches])
         square = carried * carried
         pulled = square[:, :3].sum(1) / np.square(model.bunch_pull[bunches])
@@ -201,6 +203,21 @@ class Partings:
         plants.kinematics(np.array([tree]))
         plants.cut(body)
         self._tell(body, -1, cause, actor, carried)
+
+    def told_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Take one bunch off its vine because somebody else has, and put it where they say: ``pose`` [7], ``velocity``
+        [6]. It is no parting of ours: nobody is told of it.
+        """
+        self._pick(bunch, "told", "", np.zeros(6))
+        self._told.pop()
+        self.rigid.place_bunch(bunch, pose, velocity)
+
+    def told_cut(self, body: int) -> None:
+        """Cut a body off its parent because somebody else has."""
+        if not self.plants.state.body_cut[body]:
+            tree = int(self.plants.model.body_tree[body])
+            self.plants.wake(tree)
+            self.plants.cut(body)
 
     def _tell(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
         tree = int(self.plants.model.body_tree[body])

@@ -62,6 +62,8 @@ class Rigid:
         self.complaint = ""
         self.generation = 0
         """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
+        self.owners: dict[int, tuple[str, str]] = {}
+        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`geoms.Geoms` names them."""
         self._compile()
 
     # ------------------------------------------------------------------ who is here
@@ -608,7 +610,8 @@ class Rigid:
         self._links, self._link_body = self._list_links()
         self._link_row = np.zeros(self.world.nbody, int)
         self._link_row[self._link_body] = np.arange(len(self._link_body))
-        self.geoms = geoms.listed(self.world, self._owners())
+        self.owners = self._owners()
+        self.geoms = geoms.listed(self.world, self.owners)
 
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []

@@ -11,6 +11,7 @@ from vinesim.physics.guard import Guard
 from vinesim.physics.holding import Holding
 from vinesim.physics.parting import Blade, Partings
 from vinesim.physics.plants import Plants
+from vinesim.physics.riding import Riding
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.sleep import Sleep
 from vinesim.physics.touching import Touching
@@ -40,6 +41,7 @@ class Physics:
         self.touching = Touching(model, self.plants, self.rigid)
         self.parting = Partings(self.plants, self.rigid, self.touching)
         self.holding = Holding(self.plants, self.rigid, self.touching)
+        self.riding = Riding(self.rigid)
         self._picking = picking
         self.detail = Detail(self.plants)
         self.sleep = Sleep(self.plants)
@@ -155,6 +157,16 @@ class Physics:
     def cut(self, body: int) -> None:
         """Cut a piece of wood off its vine, between ticks; see :meth:`Partings.cut`."""
         self.parting.cut(body)
+        self._body_q = None
+
+    def told_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Another client has picked a bunch; see :meth:`Partings.told_pick`."""
+        self.parting.told_pick(bunch, pose, velocity)
+        self._body_q = None
+
+    def told_cut(self, body: int) -> None:
+        """Another client has cut a piece of wood off; see :meth:`Partings.told_cut`."""
+        self.parting.told_cut(body)
         self._body_q = None
 
     def watch(self, points: np.ndarray, radius: float) -> None:

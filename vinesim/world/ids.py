@@ -50,6 +50,24 @@ def unthing(value: int) -> tuple[Kind, int]:
     return Kind(value // THING_STRIDE), value % THING_STRIDE
 
 
+def is_tree(value: int) -> bool:
+    """Whether a thing is a tree; all others are rigid."""
+    return value < THING_STRIDE
+
+
+def thing_name(value: int) -> str:
+    """A box or a loose bunch as links are named: ``box/3``."""
+    kind, index = unthing(value)
+    return f"{kind.name.lower()}/{index}"
+
+
+def thing_named(name: str) -> int | None:
+    """The box or the loose bunch of a name like ``box/3``; None if it is no such name."""
+    kind, _, index = name.partition("/")
+    rigid = {"bunch": Kind.BUNCH, "box": Kind.BOX}
+    return thing(rigid[kind], int(index)) if kind in rigid and index.isdecimal() else None
+
+
 LABEL_STRIDE = 1 << 20
 """Label images hold ``organ * LABEL_STRIDE + index``: organ and instance in one int32."""
 

@@ -385,6 +385,28 @@ class TreeUpdate:
     """[body of the tree, 4]"""
     joint_qd: np.ndarray
     """[body of the tree, 3] rad/s"""
+    root: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+    """[k] numbers in the tree of the bodies that were cut off their parents, in increasing order."""
+    root_x: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """[k, 3] m, where their origins are in the world."""
+    root_xd: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """[k, 3] m/s"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ThingUpdate:
+    """State of one box or loose bunch that moves, as it crosses the network."""
+
+    thing: int
+    """:func:`vinesim.world.ids.thing`"""
+    owner: str
+    ownership: int
+    authority: int
+    time: float
+    pose: np.ndarray
+    """[7] in the world"""
+    velocity: np.ndarray
+    """[6] m/s and rad/s, of its origin, world axes."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

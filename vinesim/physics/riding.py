@@ -1,0 +1,308 @@
+"""What boxes and loose bunches ride on, and whether they move against it.
+
+Everything loose has a *parent*: the ground, the box it lies in, or the link of a robot that carries or grips it. What
+has been still in its parent's frame for half a second is at rest, wherever the parent goes: a bunch in a box, a box on
+a robot. It stays at rest until it has moved by more than a band; then its parent is looked for anew, among what it
+touches: the ground before all others, for what is pushed along it does not ride on whoever pushes. People's hands
+are no parents: their copies elsewhere are not exact enough.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.people import rouse
+from vinesim.physics.rigid import Rigid
+from vinesim.world.ids import Kind, thing, thing_named
+
+STILL = 0.005, float(np.radians(1.0))
+"""[m] and [rad] What moves and turns less than this in its parent's frame is still."""
+CARRIED = 0.015, float(np.radians(5.0))
+"""The same on a robot's link: what it carries is shaken, and need not be told of while it stays about there."""
+SHAKEN = 0.05, float(np.radians(30.0))
+"""The same in a box that moves, where bunches rock and roll; when the box has come to rest, :data:`STILL` counts."""
+PATIENCE = 50
+"""[tick] So long must a thing be still to be at rest."""
+FAR = 0.5
+"""[m] A copy that is farther than this from where it should be is put there at once."""
+
+GROUND = ""
+"""Name of the ground as a parent; boxes are ``box/3``, links ``actor/link``."""
+
+_STANDS, _BOX, _LINK, _BUNCH, _PERSON = range(5)
+_NONE = -1
+
+
+class Riding:
+    """Boxes and loose bunches as the network sees them: poses, velocities, parents and rest."""
+
+    def __init__(self, rigid: Rigid) -> None:
+        self.rigid = rigid
+        self.things = np.zeros(0, np.int64)
+        """[n] :func:`vinesim.world.ids.thing`: boxes, then loose bunches."""
+        self._generation = -1
+        self._parent = np.zeros(0, np.int64)
+        self._anchor = np.zeros((0, 7))
+        self._still = np.zeros(0, np.int64)
+        self._at: dict[int, int] = {}
+        self._pairs = np.zeros((0, 2), np.int64)
+        self._bands_before = np.zeros((0, 2))
+        self._renew()
+
+    # ------------------------------------------------------------------ the tick
+
+    def update(self) -> None:
+        """After a tick: who is still, who is not, and on what."""
+        if self._generation != self.rigid.generation:
+            self._renew()
+        d = self.rigid.data
+        self._still += 1
+        self._pairs = self._touching()
+        bands, before = self._bands(), self._bands_before
+        self._bands_before = bands
+        # what fell asleep in a box that moved is judged when the box has come to rest
+        awake = np.flatnonzero((d.tree_asleep[self._tree] < 0) | (bands[:, 0] < before[:, 0]))
+        if len(awake) == 0:
+            return
+        if (self._kind[self._parent[awake]] == _LINK).any():
+            self.rigid.refresh()
+        pose = self._poses(awake)
+        relative = self._relative(pose, self._parent[awake])
+        out = _apart(relative, self._anchor[awake], bands[awake])
+        loose = awake[out | (self._still[awake] < PATIENCE)]
+        if len(loose) == 0:
+            return
+        parent = self._parent[loose].copy()
+        inside = np.zeros(len(self.things), bool)
+        inside[awake] = ~out
+        self._parent[loose] = self._supports(loose, inside)
+        changed = loose[self._parent[loose] != parent]
+        anew = np.union1d(awake[out], changed)
+        if len(anew):
+            self.rigid.refresh()
+            self._anchor[anew] = self._relative(self._poses(anew), self._parent[anew])
+            self._still[anew] = 0
+
+    @property
+    def moving(self) -> list[int]:
+        """Things that are not at rest in their parent's frame."""
+        return self.things[self._still < PATIENCE].tolist()
+
+    @property
+    def touched(self) -> list[tuple[int, str]]:
+        """(thing, actor) for everything that moves and is touched: by robots, people, boxes (``box/3``) or bunches."""
+        found = set()
+        for row, body in self._pairs[self._still[self._pairs[:, 0]] < PATIENCE].tolist():
+            owner = self.rigid.owners.get(body)
+            if owner is not None:
+                found.add((int(self.things[row]), owner[0]))
+        for name in self.rigid.people:
+            for hand in self.rigid.person(name).hands:
+                held = None if hand.holds is None else thing_named(hand.holds[0])
+                if held in self._at and self._still[self._at[held]] < PATIENCE:
+                    found.add((held, name))
+        return sorted(found)
+
+    # ------------------------------------------------------------------ one thing
+
+    def __contains__(self, thing: int) -> bool:
+        return thing in self._at
+
+    def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pose [7] and velocity [6] (of its origin, angular; world axes)."""
+        row, d = self._row_of(thing), self.rigid.data
+        pose = self._poses(np.array([row]))[0]
+        v = d.qvel[self._v[row] : self._v[row] + 6]
+        return pose, np.concatenate([v[:3], frames.rotate(pose[3:], v[3:])])
+
+    def lies(self, thing: int) -> tuple[str, np.ndarray]:
+        """Its parent, and its pose [7] in that frame."""
+        row = self._row_of(thing)
+        self.rigid.refresh()
+        at = np.array([row])
+        return self._name(int(self._parent[row])), self._relative(self._poses(at), self._parent[at])[0]
+
+    def frame(self, parent: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Pose [7] and velocity [6] of a parent; None if it is not here."""
+        if parent == GROUND:
+            return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
+        box = thing_named(parent)
+        if box is not None:
+            return self.read(box) if box in self._at else None
+        body = self._body_named.get(parent)
+        if body is None:
+            return None
+        m, d = self.rigid.world, self.rigid.data
+        self.rigid.refresh()
+        twist = np.zeros(6)
+        mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
+        pose = np.concatenate([d.xpos[body], frames.from_wxyz(d.xquat[body])])
+        return pose, np.concatenate([twist[3:], twist[:3]])
+
+    def where(self, parent: str, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """World pose [7] and velocity [6] of what is still at a pose [7] in a parent's frame; None without parent."""
+        frame = self.frame(parent)
+        if frame is None:
+            return None
+        pose, velocity = frames.compose(frame[0], relative), frame[1].copy()
+        velocity[:3] += frames.cross(velocity[3:], pose[:3] - frame[0][:3])
+        return pose, velocity
+
+    def place(self, thing: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Put it somewhere: pose [7], velocity [6] in world axes."""
+        row, d = self._row_of(thing), self.rigid.data
+        turn = frames.normalize(np.asarray(pose[3:], float))
+        q, v = self._q[row], self._v[row]
+        d.qpos[q : q + 3], d.qpos[q + 3 : q + 7] = pose[:3], frames.to_wxyz(turn)
+        d.qvel[v : v + 3] = velocity[:3]
+        d.qvel[v + 3 : v + 6] = frames.rotate(frames.conjugate(turn), np.asarray(velocity[3:], float))
+        rouse(self.rigid.world, d, int(self._body[row]))
+        self.rigid.stale()
+
+    def pull(self, thing: int, pose: np.ndarray, velocity: np.ndarray, blend: float) -> None:
+        """Move it by ``blend`` of the way towards a pose [7], and as fast as ``velocity`` [6] at once."""
+        here, _ = self.read(thing)
+        if np.linalg.norm(pose[:3] - here[:3]) > FAR:
+            blend = 1.0
+        turn = np.where(here[3:] @ pose[3:] < 0.0, -1.0, 1.0) * pose[3:]
+        self.place(thing, here + blend * (np.concatenate([pose[:3], turn]) - here), velocity)
+
+    def settle(self, thing: int, parent: str, relative: np.ndarray) -> None:
+        """Take it for at rest in a parent's frame, as others say it is."""
+        row = self._row_of(thing)
+        self._parent[row] = self._body_of(parent)
+        self._anchor[row], self._still[row] = relative, PATIENCE
+
+    def unsettle(self, thing: int) -> None:
+        """Take it for moving, as others say it does."""
+        self._still[self._row_of(thing)] = 0
+
+    # ------------------------------------------------------------------ inside
+
+    def _row_of(self, thing: int) -> int:
+        if self._generation != self.rigid.generation:
+            self._renew()
+        return self._at[thing]
+
+    def _poses(self, rows: np.ndarray) -> np.ndarray:
+        pose = self.rigid.data.qpos[self._q[rows][:, None] + np.arange(7)]
+        pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
+        return pose
+
+    def _relative(self, pose: np.ndarray, parent: np.ndarray) -> np.ndarray:
+        """Poses [k, 7] in the frames of MuJoCo bodies [k]."""
+        moves = np.flatnonzero(parent)
+        if len(moves) == 0:
+            return pose
+        d, relative = self.rigid.data, pose.copy()
+        frame = np.concatenate([d.xpos[parent[moves]], frames.from_wxyz(d.xquat[parent[moves]])], -1)
+        row = self._row[parent[moves]]
+        free = np.flatnonzero(row >= 0)  # boxes know where they are without being asked anew
+        frame[free] = self._poses(row[free])
+        relative[moves] = frames.compose(frames.inverse(frame), pose[moves])
+        return relative
+
+    def _bands(self) -> np.ndarray:
+        """How far each thing may move and turn and still be still [n, 2] m, rad."""
+        on = self._row[self._parent]
+        carried = self._kind[self._parent] == _LINK
+        shaken = (on >= 0) & ((self._still[on] < PATIENCE) | carried[on])
+        return np.where(shaken[:, None], SHAKEN, np.where(carried[:, None], CARRIED, STILL))
+
+    def _touching(self) -> np.ndarray:
+        """(row, MuJoCo body) of all contacts of the last tick [k, 2], each seen from both sides."""
+        m, d = self.rigid.world, self.rigid.data
+        if d.ncon == 0:
+            return np.zeros((0, 2), np.int64)
+        pairs = m.geom_bodyid[d.contact.geom[d.contact.efc_address >= 0]].astype(np.int64)
+        pairs = np.concatenate([pairs, pairs[:, ::-1]])
+        row = self._row[pairs[:, 0]]
+        here = row >= 0
+        return np.unique(np.stack([row[here], pairs[here, 1]], -1), axis=0)
+
+    def _supports(self, rows: np.ndarray, inside: np.ndarray) -> np.ndarray:
+        """On what these rows [k] ride now: MuJoCo bodies [k]; ``inside`` [n] are those still within their band."""
+        count = len(self.things)
+        row, other = self._pairs.T
+        kind = self._kind[other]
+        best = np.full((3, count), np.iinfo(np.int64).max)
+        for place, wanted in enumerate((_STANDS, _BOX, _LINK)):
+            these = kind == wanted
+            np.minimum.at(best[place], row[these], other[these])
+        stands, box, link = np.where(best == np.iinfo(np.int64).max, _NONE, best)
+        bunch = self._kind[self._body] == _BUNCH
+        first, second = np.where(bunch, box, link), np.where(bunch, link, box)
+        second[~bunch & (second >= 0) & (self._parent[self._row[np.maximum(second, 0)]] == self._body)] = _NONE
+        found = np.where(stands >= 0, 0, np.where(first >= 0, first, second))
+        stands_on = self._kind[other] == _BUNCH
+        leaning, on = row[stands_on], self._row[other[stands_on]]
+        for _ in range(count):  # what lies on bunches rides on what they ride on
+            helped = (found[leaning] == _NONE) & (found[on] != _NONE) & bunch[leaning]
+            if not helped.any():
+                break
+            found[leaning[helped]] = found[on[helped]]
+        touches = np.zeros(count, bool)
+        touches[row[np.where(self._kind[other] == _STANDS, 0, other) == self._parent[row]]] = True
+        keep = inside & (touches | (found == _NONE))
+        return np.where(keep, self._parent, np.where(found == _NONE, 0, found))[rows]
+
+    def _renew(self) -> None:
+        """The world was compiled or listed anew: find everything in it again."""
+        rigid = self.rigid
+        m = rigid.world
+        rigid.refresh()
+        names = self._parent_names() if self._at else []
+        known = {number: (names[row], self._anchor[row], self._still[row]) for number, row in self._at.items()}
+        self._generation = rigid.generation
+        boxes = [thing(Kind.BOX, i) for i in range(len(rigid.model.box_mass))]
+        bunches = [thing(Kind.BUNCH, i) for i in rigid.loose]
+        self.things = np.array(sorted(boxes + bunches), np.int64)
+        self._at = {number: row for row, number in enumerate(self.things.tolist())}
+        self._kind = np.full(m.nbody, _STANDS)
+        self._row = np.full(m.nbody, -1)
+        self._body = np.zeros(len(self.things), np.int64)
+        self._body_named: dict[str, int] = {GROUND: 0}
+        for body, (actor, link) in rigid.owners.items():
+            number = thing_named(actor)
+            if number is not None:
+                self._kind[body] = _BOX if number >= thing(Kind.BOX, 0) else _BUNCH
+                self._row[body] = self._at[number]
+                self._body[self._at[number]] = body
+                self._body_named[actor] = body
+            else:
+                self._kind[body] = _LINK if actor in rigid.robots else _PERSON
+                self._body_named[f"{actor}/{link}"] = body
+        joint = m.body_jntadr[self._body]
+        self._q, self._v = m.jnt_qposadr[joint], m.jnt_dofadr[joint]
+        self._tree = m.body_treeid[self._body]
+        self._parent = np.zeros(len(self.things), np.int64)
+        self._anchor = self._poses(np.arange(len(self.things)))
+        self._still = np.where(self.things >= thing(Kind.BOX, 0), PATIENCE, 0)
+        self._pairs = np.zeros((0, 2), np.int64)
+        self._bands_before = np.tile(STILL, (len(self.things), 1))
+        for number, (parent, anchor, still) in known.items():
+            if number in self._at:
+                row = self._at[number]
+                self._parent[row] = self._body_of(parent)
+                if parent == GROUND or self._parent[row]:
+                    self._anchor[row], self._still[row] = anchor, still
+
+    def _parent_names(self) -> list[str]:
+        names = {body: name for name, body in self._body_named.items()}
+        return [names.get(body, GROUND) for body in self._parent.tolist()]
+
+    def _name(self, body: int) -> str:
+        return next(name for name, other in self._body_named.items() if other == body)
+
+    def _body_of(self, parent: str) -> int:
+        """The MuJoCo body of a parent; the ground if it is gone."""
+        return self._body_named.get(parent, 0)
+
+
+def _apart(a: np.ndarray, b: np.ndarray, band: np.ndarray) -> np.ndarray:
+    """Which poses [k, 7] differ by more than a ``band`` [k, 2] m, rad: [k] bool."""
+    off = a[:, :3] - b[:, :3]
+    chord = np.minimum(np.square(a[:, 3:] - b[:, 3:]).sum(1), np.square(a[:, 3:] + b[:, 3:]).sum(1))
+    return (np.square(off).sum(1) > np.square(band[:, 0])) | (chord > np.square(0.5 * band[:, 1]))
