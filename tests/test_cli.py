@@ -1,13 +1,19 @@
 """Wrong use: one clear line on standard error, the right exit code, no traceback, nothing half-written."""
 
+import contextlib
+import json
+import signal
 import socket
 import subprocess
 import sys
 
 import pytest
 
+from vinesim.net import messages
+from vinesim.net.agreement import Plan
 from vinesim.net.recording import Recording
 from vinesim.net.server import Server
+from vinesim.net.zenoh_bus import ZenohBus
 
 
 def vinesim(*arguments, cwd=None):
@@ -33,13 +39,10 @@ def free_port():
 
 def test_help_shows_every_command_with_examples():
     top = vinesim("--help").stdout
-    for command in ("demo", "server", "client", "record", "replay", "scene", "bench", "ros"):
+    for command in ("demo", "server", "client", "record", "replay", "scene", "bench", "ros", "certs"):
         assert command in top
-    commands = (
-        ["demo"], ["server"], ["client"], ["record"], ["replay"], ["scene", "show"], ["bench"],
-        ["ros", "build-interfaces"],
-    )  # fmt: skip
-    for command in commands:
+    commands = (["demo"], ["server"], ["client"], ["scene", "show"], ["bench"], ["ros", "build-interfaces"])
+    for command in (*commands, ["certs", "new"], ["record"], ["replay"]):
         assert "Examples:" in vinesim(*command, "--help").stdout, command
 
 
@@ -119,12 +122,97 @@ def test_two_actors_with_one_name():
         assert first.returncode == 0
 
 
+@contextlib.contextmanager
+def serving(*arguments):
+    """A server process and its first line."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "vinesim.cli", "server", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    try:
+        yield process, process.stdout.readline()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_server_says_who_is_there_and_ends_cleanly(tmp_path):
+    with serving("--listen", "tcp/127.0.0.1:0", "--status", "json", "--keep", str(tmp_path / "kept")) as (
+        process,
+        line,
+    ):
+        figures = json.loads(line)
+        assert figures["actors"] == []
+        (endpoint,) = figures["endpoints"]
+        with ZenohBus("ada", connect=endpoint) as ada:
+            ada.join(messages.encode_hello(messages.Hello("ada", digest="D1")))
+            while (figures := json.loads(process.stdout.readline()))["actors"] != ["vineyard/ada"]:
+                assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) == 0
+        assert process.stderr.read() == ""
+    with serving("--listen", "tcp/127.0.0.1:0", "--listen", "udp/127.0.0.1:0", "--status", "text") as (process, line):
+        assert line.startswith("listening on tcp/127.0.0.1:")
+        assert "udp/127.0.0.1:" in line
+        assert process.stdout.readline().startswith("nobody: 0 links")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+
+
+def test_a_journal_that_is_none_is_left_alone(tmp_path):
+    (tmp_path / "vineyard.facts").write_text("notes on grapes")
+    refused(vinesim("server", "--listen", "tcp/127.0.0.1:0", "--keep", str(tmp_path)), 4, "vineyard.facts", "--keep")
+    assert (tmp_path / "vineyard.facts").read_text() == "notes on grapes"
+
+
+def test_a_client_of_another_scene_is_refused_by_both_digests():
+    with Server("tcp/127.0.0.1:0", plan=Plan("vsp", "0123456789abcdef")) as server:
+        arguments = ["client", "--connect", server.endpoint, "--name", "ada", "--no-ros", "--seconds", "1"]
+        refused(vinesim(*arguments), 4, "'ada'", "'demo'", "'vsp'", "0123456789abcdef", "scene and seed")
+
+
+def test_secured_from_certificate_to_client(tmp_path):
+    certs = tmp_path / "certs"
+    done = vinesim("certs", "new", "ada", "--dir", str(certs))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[-2:] == [str(certs / "ada.key"), str(certs / "ada.pem")]
+    refused(vinesim("certs", "new", "ada", "--dir", str(certs)), 4, "ada.pem", "there already")
+    with serving("--listen", "tls/127.0.0.1:0", "--tls", str(certs), "--status", "text") as (_, line):
+        endpoint = line.split()[-1]
+        common = [
+            "client",
+            "--connect",
+            endpoint,
+            "--tls",
+            str(certs),
+            "--no-ros",
+            "--seconds",
+            "0.5",
+            "--status",
+            "none",
+        ]
+        done = vinesim(*common, "--name", "ada")
+        assert (done.returncode, done.stderr) == (0, "")
+        refused(vinesim(*common, "--name", "eve"), 4, "eve.pem", "vinesim certs new eve")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["client", "--role", "human"], ["human", "not built yet"]),
         (["client", "--role", "tractor"], ["tractor", "robot"]),
         (["client", "--push", "99999", "--no-ros"], ["99999"]),
+        (["client", "--tls", "certs", "--no-ros"], ["--tls certs", "--connect tls/HOST:7447"]),
+        (["server", "--listen", "7447"], ["'7447'", "tcp/HOST:PORT"]),
+        (["server", "--listen", "tls/0.0.0.0:7447"], ["tls/0.0.0.0:7447", "--tls DIR"]),
+        (["server", "--connect", "tcp/127.0.0.1:1", "--keep", "kept"], ["only carries", "--keep"]),
+        (["server", "--status", "xml"], ["xml", "json"]),
+        (["server", "--quota", "0", "1"], ["--quota", "above zero"]),
+        (["server", "--seed", "3"], ["--seed 3", "--scene"]),
+        (["server", "--scene", "nowhere"], ["nowhere"]),
+        (["certs", "new", "a/b"], ["a/b", "letters"]),
+        (["certs", "new", "ada", "--role", "king"], ["king", "robot, human, spectator"]),
+        (["certs", "new", "ada", "--host", "h"], ["only the server's"]),
         (["client", "--spawn", "99", "--no-ros"], ["99"]),
         (["client", "--status", "xml"], ["xml", "json"]),
         (["bench", "nothing"], ["nothing", "plants", "camera"]),

@@ -29,6 +29,8 @@ scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Viney
 ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: set-up and state.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
+certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certificates for secured links.")
+app.add_typer(certs_app, name="certs")
 
 Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
 Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, harvest, tendone, vsp.")]
@@ -83,18 +85,53 @@ def demo(
 
 @app.command()
 def server(
-    listen: Annotated[str, typer.Option(help="Where to listen; port 0 takes a free one.")] = "tcp/0.0.0.0:7447",
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where to listen, several times if need be; port 0 takes a free one. tcp/0.0.0.0:7447 for everything "
+            "and udp/0.0.0.0:7447 for poses, unless given; with --tls tls/ and quic/."
+        ),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Link to the server at this endpoint and only carry: that one answers and keeps."),
+    ] = None,
+    keep: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Folder in which picked bunches, boxes and cuts are kept; in memory unless given."),
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="Let in this scene only; unless given, the first actor decides.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of that scene, instead of its own.")] = None,
+    max_clients: Annotated[
+        int | None, typer.Option(min=1, help="So many actors at a time; no bound unless given.")
+    ] = None,
+    quota: Annotated[
+        tuple[float, float],
+        typer.Option(help="MESSAGES/s and BYTES/s that one actor may say for good (cuts, where things lie)."),
+    ] = (50.0, 200_000.0),
+    tls: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): nobody else gets in.")
+    ] = None,
+    status: Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")] = "none",
 ) -> None:
-    """Carry messages between clients. The server simulates nothing.
+    """Carry messages between clients, and keep what stays true. The server simulates nothing.
+
+    Facts are kept in memory unless --keep is given: a demonstration begins with an unpicked vineyard every time.
 
     \b
     Examples:
       vinesim server
-      vinesim server --listen tcp/127.0.0.1:0
+      vinesim server --listen tcp/127.0.0.1:0 --status text
+      vinesim server --scene vsp --max-clients 12 --keep harvest/
+      vinesim server --tls certs/
+      vinesim server --connect tcp/192.168.1.5:7447
     """
+    options = dict(locals())
     from vinesim.cli.serve import run
 
-    raise typer.Exit(run(listen))
+    raise typer.Exit(run(**options))
 
 
 @app.command()
@@ -102,6 +139,10 @@ def client(
     role: Annotated[str, typer.Option(help="robot, or spectator. (human is not built yet.)")] = "robot",
     name: Annotated[str | None, typer.Option(help="The actor's name, one of a kind; robot-PID unless given.")] = None,
     connect: Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")] = None,
+    tls: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Folder with ca.pem, NAME.pem and NAME.key; the server is then tls/HOST:7447."),
+    ] = None,
     scene: Scene = "demo",
     seed: Seed = None,
     robot: Annotated[
@@ -154,6 +195,10 @@ def record(
     file: Annotated[pathlib.Path, typer.Argument(help="The MCAP file to write; if there is one, FILE-2 and so on.")],
     connect: Annotated[str, typer.Option(help="Server.")] = "tcp/127.0.0.1:7447",
     world: Annotated[str, typer.Option(help="Which of the server's worlds.")] = "vineyard",
+    tls: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder with ca.pem, NAME.pem and NAME.key, of a spectator; see --name.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name on its certificate; NAME-1 ... stand in an area.")] = None,
     scene: Annotated[
         str | None, typer.Option(help="Refuse to record any other scene. Whatever is there unless given.")
     ] = None,
@@ -175,13 +220,10 @@ def record(
       vinesim record run.mcap --connect tcp/192.168.1.5:7447 --seconds 60
       vinesim record run.mcap --area -5 -5 5 5 --only poses,trees
     """
+    options = dict(locals())
     from vinesim.cli.record import run
 
-    raise typer.Exit(
-        run(
-            file, connect=connect, world=world, scene=scene, seed=seed, area=area, only=only, seconds=seconds
-        )
-    )  # fmt: skip
+    raise typer.Exit(run(**options))
 
 
 @app.command()
@@ -265,6 +307,33 @@ def ros_build(
     from vinesim.cli.ros import build
 
     raise typer.Exit(build(quiet))
+
+
+@certs_app.command("new")
+def certs_new(
+    actor: Annotated[str, typer.Argument(help="The actor's name, or server.")],
+    dir: Annotated[pathlib.Path, typer.Option(help="Folder of the authority; made at first use.")] = pathlib.Path(
+        "certs"
+    ),
+    role: Annotated[str, typer.Option(help="robot, human or spectator, who only reads.")] = "robot",
+    host: Annotated[
+        list[str] | None, typer.Option(help="For server: name or address by which clients reach it; repeatable.")
+    ] = None,
+) -> None:
+    """Make the certificate and key of an actor; at first use the authority's and the server's as well.
+
+    An actor needs ca.pem, NAME.pem and NAME.key; ca.key stays where it is made. The server reads its folder when it
+    starts: an actor made later is let in after a restart, one whose .pem is removed is not.
+
+    \b
+    Examples:
+      vinesim certs new server --host 192.168.1.5
+      vinesim certs new picker
+      vinesim certs new visitor --role spectator --dir certs
+    """
+    from vinesim.cli.certs import new
+
+    raise typer.Exit(new(actor, dir, role, host or []))
 
 
 @app.callback()

@@ -28,7 +28,8 @@ class WrongUse(ValueError):
 
 
 def run(
-    *, role: str, name: str | None, connect: str | None, scene: str, seed: int | None, robot: list[str] | None,
+    *, role: str, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None,
+    robot: list[str] | None,
     spawn: int, place: tuple[float, float, float] | None, back: float, namespace: str, ros: bool, push: int | None,
     job: str | None, watch: int | None, near: float, device: str,
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
@@ -39,12 +40,14 @@ def run(
         raise WrongUse(f"role {role!r} {built}; give --role robot or spectator")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
+    if tls is not None and connect is None:
+        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
     if role == "spectator":
         from vinesim.cli.spectate import run as spectate
 
         return spectate(
-            name=name, connect=connect, scene=scene, seed=seed, spawn=spawn, place=place, near=near, device=device,
-            threads=threads, seconds=seconds, out=out, status=status, hz=sensor_hz,
+            name=name, connect=connect, tls=tls, scene=scene, seed=seed, spawn=spawn, place=place, near=near,
+            device=device, threads=threads, seconds=seconds, out=out, status=status, hz=sensor_hz,
         )  # fmt: skip
 
     from vinesim.physics.memory import device_of
@@ -97,7 +100,7 @@ def run(
                 return stack.enter_context(hub.bus(name))
             from vinesim.net.zenoh_bus import ZenohBus
 
-            return stack.enter_context(ZenohBus(name, connect=connect))
+            return stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
 
         perceptions = [
             stack.enter_context(

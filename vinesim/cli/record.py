@@ -24,7 +24,8 @@ class WrongUse(ValueError):
 
 
 def run(
-    file: pathlib.Path, *, connect: str, world: str, scene: str | None, seed: int | None,
+    *, file: pathlib.Path, connect: str, world: str, name: str | None, tls: pathlib.Path | None,
+    scene: str | None, seed: int | None,
     area: tuple[float, float, float, float] | None, only: str | None, seconds: float | None,
 ) -> int:  # fmt: skip
     """Record until told to stop; 0 if the file is complete."""
@@ -40,8 +41,8 @@ def run(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with contextlib.ExitStack() as stack:
-        name = f"recorder-{os.getpid()}"
-        bus = stack.enter_context(ZenohBus(name, connect=connect, world=world, live=False))
+        name = name or f"recorder-{os.getpid()}"
+        bus = stack.enter_context(ZenohBus(name, connect=connect, world=world, certificates=tls, live=False))
         path = free_path(file)
         recording = stack.enter_context(Recording(path, about))
         recorder = Recorder(
@@ -58,7 +59,7 @@ def run(
             if recorder.digest and len(standing) < len(stands):
                 own = f"{name}-{len(standing) + 1}"
                 recorder.own.add(own)
-                there = stack.enter_context(ZenohBus(own, connect=connect, world=world))
+                there = stack.enter_context(ZenohBus(own, connect=connect, world=world, certificates=tls))
                 scene_name = recording.about.get("scene", "")
                 standing.append(Stand(there, stands[len(standing)], scene_name, recorder.digest, now))
             recorder.step()

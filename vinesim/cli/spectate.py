@@ -9,6 +9,7 @@ import pathlib
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ STATUS_PERIOD = 1.0
 
 
 def run(
-    *, name: str | None, connect: str | None, scene: str, seed: int | None, spawn: int,
+    *, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None, spawn: int,
     place: tuple[float, float, float] | None, near: float, device: str, threads: int, seconds: float | None,
     out: pathlib.Path | None, status: str, hz: float | None,
 ) -> int:  # fmt: skip
@@ -40,7 +41,9 @@ def run(
         out.mkdir(parents=True, exist_ok=True)
     name = name or f"spectator-{os.getpid()}"
     with contextlib.ExitStack() as stack:
-        bus = MemoryHub().bus(name) if connect is None else stack.enter_context(ZenohBus(name, connect=connect))
+        bus: Any = MemoryHub().bus(name)
+        if connect is not None:
+            bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
         spectator = Spectator(
             plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads,
             executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),

@@ -292,6 +292,7 @@ class Stand:
         """At ``place`` [m], through a live bus of its own, from own time ``now`` on."""
         self.bus = bus
         hello = messages.encode_hello(Hello(bus.name, kind="spectator", scene=scene, digest=digest, joints=0))
+        bus.join(hello)
         bus.serve(f"hello/{bus.name}", lambda _: hello)
         self._place = frames.pose([*place, 1.6])
         self._pose = bus.publisher(f"a/{bus.name}/far")

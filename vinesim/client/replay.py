@@ -159,6 +159,9 @@ class ReplayBus:
     def lost(self) -> int:
         return self._store.overflowed
 
+    def join(self, greeting: bytes) -> None:
+        pass
+
     def publisher(self, key: str, reliable: bool = False) -> Publisher:
         return _Unheard()
 
@@ -281,10 +284,10 @@ class Replay:
             return
         if self._begun is None:
             self._begun, self._begun_at = now, self._keeper.time
-        # what was true before is said once somebody listens; without a server that keeps it, never
-        self._before = [(key, payload) for key, payload in self._before if not self._say(key, payload)]
         entries = self.cursor.play(self._start + (now - self._begun) * self._speed)
         self._follow()
+        if self._buses:  # what was true before is said once there is a world and somebody who keeps it
+            self._before = [(key, payload) for key, payload in self._before if not self._say(key, payload)]
         for entry in entries:
             if entry.key.partition("/")[0] not in _ANSWERED:
                 # as old as it was when the recorder had it
@@ -306,6 +309,7 @@ class Replay:
             greeting = self.cursor.greetings.get(name)
             if greeting is not None:
                 bus = self._buses[name] = self._live_bus(name)
+                bus.join(greeting)
                 bus.serve(f"hello/{name}", lambda _, greeting=greeting: greeting)
                 for key in self._keys.get(name, ()):
                     self._publishers[key] = bus.publisher(key, key.partition("/")[0] in RELIABLE)

@@ -104,6 +104,7 @@ class Actors:
         self.clock = Clock()
         self.known: dict[str, Actor] = {}
         greeting = messages.encode_hello(me)
+        bus.join(greeting)
         bus.serve(f"hello/{me.name}", lambda _: greeting)
         self._elders = bus.alive() - {me.name}
         self._asked: dict[str, float] = {}

@@ -30,6 +30,10 @@ class BusError(RuntimeError):
     exit_code = 4
 
 
+class WrongUse(ValueError):
+    """What was asked for cannot be meant: a name, an endpoint, a combination; the text says what would be right."""
+
+
 class NameTaken(BusError):
     """Another live actor has this name."""
 
@@ -37,6 +41,10 @@ class NameTaken(BusError):
         super().__init__(
             f"an actor named {name!r} is already live in world {world!r}: choose another name or stop that one"
         )
+
+
+class Refused(BusError):
+    """The server does not let this actor in; the text is the server's."""
 
 
 class Answer(NamedTuple):
@@ -84,11 +92,20 @@ class Bus(Protocol):
     def trouble(self) -> str:
         """Empty, or in words why nobody can be reached now."""
 
+    def join(self, greeting: bytes) -> None:
+        """Ask the server to be let in with this :class:`messages.Hello`, once, before anything else is sent.
+
+        :class:`Refused` if it says no. Where no server keeps the world, those who are there judge each other.
+        """
+
     def publisher(self, key: str, reliable: bool = False) -> Publisher:
         """For one exact key. Reliable: nothing is lost or reordered while the connection lives."""
 
     def subscribe(self, pattern: str, depth: int = NEWEST) -> Subscription:
-        """Hear what others send: the last ``depth`` samples of each key until they are drained."""
+        """Hear what others send: the last ``depth`` samples of each key until they are drained.
+
+        What is sent reliably is heard with ``EVERY``: it travels apart from poses.
+        """
 
     def drain(self) -> list[tuple[str, bytes]]:
         """All (key, payload) that arrived since, in order of arrival."""
@@ -173,6 +190,8 @@ class MemoryHub:
         self.delay, self.jitter, self.loss = delay, jitter, loss
         self.down = False
         """True: the server is gone, nothing passes and nobody sees anybody."""
+        self.refuses: Callable[[bytes], str] = lambda greeting: ""
+        """Why the server of this network lets nobody in with such a greeting; empty: it does."""
         self._random = random.Random(seed)
         self._order = 0
         self._pending: list[tuple[float, int, Callable[[], None]]] = []
@@ -314,6 +333,10 @@ class MemoryBus:
     @property
     def trouble(self) -> str:
         return "the hub is down" if self.hub.down else ""
+
+    def join(self, greeting: bytes) -> None:
+        if why := self.hub.refuses(greeting):
+            raise Refused(why)
 
     def publisher(self, key: str, reliable: bool = False) -> MemoryPublisher:
         if "*" in key:

@@ -29,7 +29,7 @@ PROTOCOL = 1
 """Version of everything in this file. Others are refused."""
 
 MAGIC = b"VS"
-ROBOT, TREES, CLAIMS, FACTS, THINGS, HELLO, TIME = 1, 2, 3, 4, 5, 16, 17
+ROBOT, TREES, CLAIMS, FACTS, THINGS, HELLO, TIME, WELCOME = 1, 2, 3, 4, 5, 16, 17, 18
 """Kinds of message."""
 
 TIMED = frozenset((ROBOT, TREES, THINGS))
@@ -124,6 +124,18 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many joints its updates carry; -1 leaves it open until the first one."""
     seed: int = -1
     """Seed of its vineyard, for whoever wants to grow the same; -1 keeps it to itself."""
+
+
+class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The server's answer to who asks to be let into a world."""
+
+    refused: str = ""
+    """Empty, or in words why not and what to do."""
+    scene: str = ""
+    """Name of the world's scene."""
+    digest: str = ""
+    """``Model.digest()`` of its vineyard."""
+    protocol: int = PROTOCOL
 
 
 class Fact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -318,6 +330,7 @@ def _unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decod
 
 _encoder = msgspec.msgpack.Encoder()
 _hello_decoder = msgspec.msgpack.Decoder(Hello)
+_welcome_decoder = msgspec.msgpack.Decoder(Welcome)
 _claims_decoder = msgspec.msgpack.Decoder(list[tuple[int, int, int, str, bool]])
 _facts_decoder = msgspec.msgpack.Decoder(list[Fact])
 _time_decoder = msgspec.msgpack.Decoder(tuple[float, float])
@@ -616,6 +629,16 @@ def check_thing(thing: int, counts: tuple[int, ...] | None = None) -> None:
         raise MessageError(f"something is said of thing {thing}, which is of no kind")
     if counts is not None and index >= counts[kind]:
         raise MessageError(f"{Kind(kind).name.lower()} {index}, this vineyard has {counts[kind]}")
+
+
+def encode_welcome(welcome: Welcome) -> bytes:
+    """The answer to a greeting."""
+    return _pack(WELCOME, welcome)
+
+
+def decode_welcome(payload: bytes) -> Welcome:
+    """The answer to a greeting; a server of another protocol version raises :class:`WrongVersion`."""
+    return _unpack(payload, WELCOME, "welcome", _welcome_decoder)
 
 
 def encode_claims(claims: list[tuple[int, Claim, bool]]) -> bytes:

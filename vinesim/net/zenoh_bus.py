@@ -1,8 +1,12 @@
-"""The bus over Zenoh (eclipse-zenoh 1.10): a client session to one router, nothing else listens or scouts.
+"""The bus over Zenoh (eclipse-zenoh 1.10): client sessions to one router, nothing else listens or scouts.
 
-What the design's measurements ask for: publishers on exact keys (without a subscriber not one byte leaves), callbacks
-that only store, poses as best effort that may be dropped, events reliable and sent by a thread outside the tick because
-they may block, a lease of two seconds, shared memory off so that counted bytes are true.
+What measurements ask for: publishers on exact keys (without a subscriber not one byte leaves), callbacks that only
+store, poses as best effort that may be dropped, events reliable and sent by a thread outside the tick because they may
+block, a lease of two seconds, shared memory off so that counted bytes are true.
+
+Poses and motion have a session of their own, over datagrams, wherever the server is on another machine: so neither
+a lost packet nor a large snapshot holds them up. Everything else goes over a stream, and they do so as well where no
+datagrams pass.
 """
 
 from __future__ import annotations
@@ -10,17 +14,20 @@ from __future__ import annotations
 import collections
 import json
 import logging
+import pathlib
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
 import zenoh
 
 from vinesim.net import messages
-from vinesim.net.bus import NEWEST, Answer, BusError, NameTaken, Store
+from vinesim.net.access import secured
+from vinesim.net.bus import EVERY, NEWEST, Answer, BusError, NameTaken, Refused, Store, WrongUse
+from vinesim.net.endpoints import Endpoint, ways
 
 log = logging.getLogger(__name__)
 
@@ -40,13 +47,17 @@ PATIENCE = 2.0
 """How long connecting may take [s]."""
 
 
+RETRY = 0.05
+"""Between two attempts to be let in again [s]."""
+
+
 class ServerUnreachable(BusError):
     """No server answers at the endpoint."""
 
     def __init__(self, endpoint: str, reason: str) -> None:
         super().__init__(
             f"no vinesim server answers at {endpoint} within {PATIENCE:g} s ({reason}): "
-            f"start one with 'vinesim server', or give its endpoint, e.g. tcp/HOST:7447"
+            f"start one with 'vinesim server', or give its endpoint, e.g. {endpoint.partition('/')[0]}/HOST:7447"
         )
 
 
@@ -110,6 +121,21 @@ def _meant_for_the_user(endpoint: str) -> Iterator[None]:
         raise ServerUnreachable(endpoint, str(error).split(" at /")[0].rstrip(".")) from error
 
 
+def _opened(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Session:
+    """A client session over one endpoint; :class:`ServerUnreachable` if nobody is there."""
+    with _meant_for_the_user(str(endpoint)):
+        return open_session(
+            config(
+                "client",
+                connect__endpoints=[endpoint.locator],
+                connect__timeout_ms=int(1000 * PATIENCE),
+                connect__exit_on_failure=True,
+                connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
+                **credentials,
+            )
+        )
+
+
 class _Publisher:
     """See :class:`vinesim.net.bus.Publisher`."""
 
@@ -148,16 +174,24 @@ class _Subscription:
 class ZenohBus:
     """See :class:`vinesim.net.bus.Bus`. A context manager: a session left open hangs at exit."""
 
-    def __init__(self, name: str, *, connect: str = CONNECT, world: str = WORLD, live: bool = True) -> None:
-        """Join ``world`` as ``name`` through the server at ``connect``; not ``live``: nobody sees that one is there.
+    def __init__(
+        self, name: str, *, connect: str = CONNECT, world: str = WORLD, certificates: pathlib.Path | None = None,
+        live: bool = True,
+    ) -> None:  # fmt: skip
+        """Come into ``world`` as ``name`` through the server at ``connect``, see :func:`endpoints.ways`.
 
-        :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the name is live,
-        :class:`ValueError` if name or world cannot be part of a key.
+        Not ``live``: nobody sees that one is there.
+
+        ``certificates``: folder with ``ca.pem`` and this actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then
+        ``tls/`` or ``quic/``. :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the
+        name is live, :class:`WrongUse` if name or world cannot be part of a key or the endpoint is none.
         """
         for what, text in (("actor name", name), ("world", world)):
             if not messages.valid_name(text):
-                raise ValueError(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
-        self.name, self.world, self.endpoint = name, world, connect
+                raise WrongUse(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
+        way = ways(connect, secured=certificates is not None)
+        self._credentials = {} if certificates is None else secured(certificates, name)
+        self.name, self.world, self.endpoint = name, world, str(way.bulk)
         self.bytes_in = self.bytes_out = self._huge = 0
         self._prefix = f"{ROOT}/{world}/"
         self._store = Store()
@@ -166,33 +200,57 @@ class ZenohBus:
         self._me = frozenset((name,)) if live else frozenset()
         self._alive = self._me
         self._lock = threading.Lock()
-        self._connected = True
-        with _meant_for_the_user(connect):
-            self._session = open_session(
-                config(
-                    "client",
-                    connect__endpoints=[connect],
-                    connect__timeout_ms=int(1000 * PATIENCE),
-                    connect__exit_on_failure=True,
-                    connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
-                )
-            )
+        self._gone: set[str] = set()
+        """Endpoints that do not answer now."""
+        self._refusal = ""
+        self._session = self._poses = _opened(way.bulk, self._credentials)
         try:
             liveliness = self._session.liveliness()
             self._declared: list[object] = [
-                self._session.info.declare_transport_events_listener(self._transport),
+                self._listen_for_loss(self._session, self.endpoint),
                 *([self._claim_name()] if live else []),
             ]
             for reply in liveliness.get(f"{self._prefix}live/*/*", timeout=PATIENCE):
                 if reply.ok is not None:
                     self._living(str(reply.ok.key_expr), True)
             self._declared.append(liveliness.declare_subscriber(f"{self._prefix}live/*/*", self._notice, history=True))
+            if way.live is not None:
+                self._poses = self._datagrams(way.live)
         except BaseException:
             self.close()
             raise
         self._work: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._worker = threading.Thread(target=_run, args=(self._work,), name=f"bus of {name}", daemon=True)
         self._worker.start()
+
+    def _datagrams(self, endpoint: Endpoint) -> zenoh.Session:
+        """A session for poses, or the one there is if no datagrams pass."""
+        try:
+            session = _opened(endpoint, self._credentials)
+        except ServerUnreachable:
+            log.warning(
+                "%s: no datagrams pass to %s: poses go over %s as well, where one lost packet delays all that follow",
+                self.name, endpoint, self.endpoint,
+            )  # fmt: skip
+            return self._session
+        self._declared.append(self._listen_for_loss(session, str(endpoint)))
+        if zenoh.Reliability.BEST_EFFORT not in [link.reliability for link in session.info.links()]:
+            log.warning(
+                "%s: the router at %s offers no datagrams on that link: poses go in line there; "
+                "it is older than Zenoh 1.10, or listens without mixed_rel", self.name, endpoint,
+            )  # fmt: skip
+        return session
+
+    @property
+    def links(self) -> list[str]:
+        """Where this actor is connected now, one line a link: its endpoint and how much may be lost there."""
+        sessions = dict.fromkeys((self._session, self._poses))
+        links = [link for session in sessions for link in session.info.links()]
+        return sorted(
+            f"{str(link.dst).partition('?')[0]} "
+            f"{'best effort' if link.reliability == zenoh.Reliability.BEST_EFFORT else 'reliable'}"
+            for link in links
+        )
 
     def _claim_name(self) -> zenoh.LivelinessToken:
         """Declare the token of this name, unless another session has it.
@@ -214,12 +272,16 @@ class ZenohBus:
 
     # ------------------------------------------------------------ called by Zenoh's threads
 
-    def _transport(self, event: zenoh.TransportEvent) -> None:
-        self._connected = event.kind == zenoh.SampleKind.PUT
-        if self._connected:
-            log.info("%s: connected to %s again", self.name, self.endpoint)
-        else:
-            log.warning("%s: lost the server at %s; goes on alone and tries to come back", self.name, self.endpoint)
+    def _listen_for_loss(self, session: zenoh.Session, endpoint: str) -> object:
+        def notice(event: zenoh.TransportEvent) -> None:
+            if event.kind == zenoh.SampleKind.PUT:
+                self._gone.discard(endpoint)
+                log.info("%s: connected to %s again", self.name, endpoint)
+            else:
+                self._gone.add(endpoint)
+                log.warning("%s: lost the server at %s; goes on alone and tries to come back", self.name, endpoint)
+
+        return session.info.declare_transport_events_listener(notice)
 
     def _notice(self, sample: zenoh.Sample) -> None:
         self._living(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
@@ -239,14 +301,69 @@ class ZenohBus:
 
     @property
     def trouble(self) -> str:
-        if self._connected:
+        if self._refusal:
+            return self._refusal
+        gone = sorted(self._gone)
+        if not gone:
             return ""
-        return f"the server at {self.endpoint} is gone; the local simulation goes on and reconnects by itself"
+        return f"the server at {gone[0]} is gone; the local simulation goes on and reconnects by itself"
+
+    def join(self, greeting: bytes) -> None:
+        key = f"{self._prefix}join/{self.name}/{self._session.zid()}"
+        welcomes = self._ask_in(key, greeting)
+        if any(welcome.refused for welcome in welcomes):
+            raise Refused(next(welcome.refused for welcome in welcomes if welcome.refused))
+        if not welcomes and self._credentials:
+            raise Refused(
+                f"the server at {self.endpoint} lets nobody named {self.name!r} in: its folder of certificates must "
+                f"hold {self.name}.pem, and it reads them when it starts"
+            )
+        if not welcomes:
+            log.info("%s: no vinesim server keeps world %r; actors judge each other", self.name, self.world)
+        elif len(welcomes) > 1:
+            log.warning("%s: %d servers keep world %r; link all but one to it with --connect", self.name, len(welcomes),
+                        self.world)  # fmt: skip
+
+        # a server that was started anew, or later, does not know who is there: whoever is says so again
+        doorkeeper = self._session.declare_querier(key)
+
+        def ask_again() -> None:
+            answers, end = self._ask_in(key, greeting), time.monotonic() + PATIENCE
+            # between linked routers a server is announced before questions find the way to it
+            while not answers and doorkeeper.matching_status.matching and time.monotonic() < end:
+                time.sleep(RETRY)
+                answers = self._ask_in(key, greeting)
+            refused = [welcome.refused for welcome in answers if welcome.refused]
+            self._refusal = refused[0] if refused else ""
+            if refused:
+                log.error("%s: the server that came back lets this actor in no more: %s", self.name, self._refusal)
+
+        self._declared += [
+            doorkeeper,
+            doorkeeper.declare_matching_listener(lambda status: status.matching and self.outside(ask_again)),
+        ]
+        if not welcomes and doorkeeper.matching_status.matching:
+            self.outside(ask_again)
+
+    def _ask_in(self, key: str, greeting: bytes) -> list[messages.Welcome]:
+        replies = self._session.get(key, payload=greeting, timeout=PATIENCE, consolidation=zenoh.ConsolidationMode.NONE)
+        answers: Iterable[bytes] = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+        try:
+            return [messages.decode_welcome(answer) for answer in answers]
+        except messages.WrongVersion as error:
+            return [
+                messages.Welcome(
+                    f"the server at {self.endpoint} speaks protocol version {error.theirs}, {self.name!r} version "
+                    f"{messages.PROTOCOL}: use the same release of vinesim"
+                )
+            ]
+        except messages.MessageError as error:
+            return [messages.Welcome(f"what the server at {self.endpoint} answers cannot be read: {error}")]
 
     def publisher(self, key: str, reliable: bool = False) -> _Publisher:
         if "*" in key:
-            raise ValueError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
-        declared = self._session.declare_publisher(
+            raise WrongUse(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
+        declared = (self._session if reliable else self._poses).declare_publisher(
             self._prefix + key,
             congestion_control=zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH if reliable else zenoh.Priority.REAL_TIME,
@@ -268,8 +385,10 @@ class ZenohBus:
             else:
                 self._store.put(depth, str(sample.key_expr)[skip:], sample.payload.to_bytes())
 
+        session = self._session if depth >= EVERY else self._poses
+
         def declare() -> None:
-            subscription.declared = self._session.declare_subscriber(
+            subscription.declared = session.declare_subscriber(
                 self._prefix + pattern, store, allowed_origin=zenoh.Locality.REMOTE
             )
 
@@ -287,7 +406,11 @@ class ZenohBus:
                 arrived = time.monotonic()
                 self._answers.append((str(reply.ok.key_expr)[skip:], reply.ok.payload.to_bytes(), arrived))
 
-        self.outside(lambda: self._session.get(self._prefix + key, hear, payload=payload, timeout=PATIENCE))
+        # Zenoh's own choice would keep one reply of a key: a snapshot comes in several
+        every = zenoh.ConsolidationMode.NONE
+        self.outside(
+            lambda: self._session.get(self._prefix + key, hear, payload=payload, timeout=PATIENCE, consolidation=every)
+        )
 
     def answers(self) -> list[Answer]:
         now, found = time.monotonic(), []
@@ -316,7 +439,8 @@ class ZenohBus:
         if work is not None:
             work.put(None)
             self._worker.join(timeout=PATIENCE)
-        close_session(self._session)
+        for session in (self._poses, self._session):
+            close_session(session)
 
     def __enter__(self) -> Self:
         return self
