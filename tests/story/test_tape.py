@@ -19,6 +19,8 @@ from recorded import TICK, Light
 
 from vinesim.client.record import Recorder
 from vinesim.net import messages
+from vinesim.net.access import Role
+from vinesim.net.certificates import new as new_certificate
 from vinesim.net.recording import NotARecording, Recording, Tape, read
 from vinesim.net.server import Server
 from vinesim.net.zenoh_bus import ZenohBus
@@ -263,3 +265,25 @@ def test_a_disk_that_is_full_ends_a_recording_in_one_line(tmp_path):
     tape = read(path)
     assert len(tape.entries) > 0
     assert tape.about["scene"] == "rows"
+
+
+def test_a_spectators_certificate_is_enough_to_record(tmp_path):
+    certs = tmp_path / "certs"
+    for name, role in (("ada", Role.ROBOT), ("bob", Role.ROBOT), ("recorder", Role.SPECTATOR)):
+        new_certificate(certs, name, role)
+    with Server("tls/127.0.0.1:0", certificates=certs) as server, contextlib.ExitStack() as stack:
+
+        def bus(name: str, **more: bool) -> ZenohBus:
+            return stack.enter_context(ZenohBus(name, connect=server.endpoint, certificates=certs, **more))
+
+        ada, bob = Light(bus("ada"), 0.5), Light(bus("bob"), 2.0)
+        recording = stack.enter_context(Recording(tmp_path / "run.mcap"))
+        recorder = Recorder(bus("recorder", live=False), recording)
+        company = Company(ada, bob)
+
+        def each() -> None:
+            ada.bend(0, 0.5 * np.sin(0.1 * company.number))
+            recorder.step()
+
+        wanted = {"hello/ada", "hello/bob", "a/ada", "a/bob", "a/ada/far", "c/0/0/ada", "own/0/0/ada"}
+        company.until(lambda: wanted <= keys(recording.path), "everything on the tape", each)
