@@ -13,7 +13,7 @@ import time
 import pytest
 import zenoh
 
-from vinesim.net import messages
+from vinesim.net import archive, messages
 from vinesim.net.agreement import Plan
 from vinesim.net.archive import Quota
 from vinesim.net.bus import EVERY, NameTaken, Refused
@@ -136,11 +136,9 @@ def test_an_answer_of_another_protocol_is_refused_by_both_numbers():
         newer[2] = 9
         for answer, words in ((bytes(newer), "protocol version 9"), (b"junk", "cannot be read")):
             # what answers is another program
-            server._declared.pop().undeclare()
-            server._declared.append(
-                server._session.declare_queryable(
-                    "vs/1/*/join/*/*", lambda query, answer=answer: query.reply(str(query.key_expr), answer)
-                )
+            server._declared[1].undeclare()
+            server._declared[1] = server._session.declare_queryable(
+                "vs/1/*/join/*/*", lambda query, answer=answer: query.reply(str(query.key_expr), answer)
             )
             with pytest.raises(Refused, match=words):
                 ada.join(hello("ada"))
@@ -281,11 +279,15 @@ def test_who_says_too_much_is_cut_off_and_nobody_else(caplog):
         assert len([line for line in caplog.messages if "quota" in line]) == 1
 
 
-def test_facts_of_a_world_nobody_was_let_into_are_not_kept():
+def test_facts_wait_until_somebody_is_let_into_their_world(monkeypatch):
+    monkeypatch.setattr(archive, "EARLY", 2)
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
-        say(ada, (0, 0), box())
-        wait(lambda: server.archive.counters.strange == 1, "it to be dropped")
+        for number in range(3):
+            say(ada, (0, 0), box(number))
+        wait(lambda: server.archive.counters.strange == 1, "the oldest to be given up")
         assert server.archive.count() == 0
+        ada.join(hello("ada"))
+        assert snapshot(ada, (0, 0), 2) == [box(1), box(2)]
 
 
 SERVE = """

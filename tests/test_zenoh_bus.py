@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import socket
 import subprocess
 import sys
@@ -16,6 +17,8 @@ import pytest
 from vinesim import frames
 from vinesim.net import messages
 from vinesim.net.bus import EVERY, NameTaken
+from vinesim.net.certificates import new
+from vinesim.net.endpoints import chosen
 from vinesim.net.exchange import Exchange
 from vinesim.net.messages import Hello
 from vinesim.net.server import Server
@@ -338,6 +341,137 @@ def test_a_router_that_is_killed_and_restarted_resumes():
             router = start()
             wait(ticking(lambda: bob.exchange.owner(1) == "ada" and "ada" in bob.robots), "the stream again")
             assert a.trouble == b.trouble == ""
+    finally:
+        router.kill()
+        router.wait()
+
+
+# ---------------------------------------------------------------- links
+
+
+class Pump:
+    """Sends a pose and an event each time it is asked whether both have arrived by now."""
+
+    def __init__(self, sender: ZenohBus, receiver: ZenohBus) -> None:
+        receiver.subscribe(f"a/{sender.name}")
+        receiver.subscribe(f"own/0/0/{sender.name}", EVERY)
+        self._pose = sender.publisher(f"a/{sender.name}")
+        self._event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
+        self._receiver = receiver
+        self._heard: set[str] = set()
+
+    def again(self) -> None:
+        self._receiver.drain()
+        self._heard.clear()
+
+    def __call__(self) -> bool:
+        self._pose.put(bytes(1000))
+        self._event.put(b"event")
+        time.sleep(0.002)
+        self._heard.update(key for key, _ in self._receiver.drain())
+        return len(self._heard) == 2
+
+
+def test_poses_are_datagrams_beside_the_stream_of_events(server):
+    with Wire(server.endpoint) as wire:
+        port = wire.endpoint.rpartition(":")[2]
+        # datagrams at the relay's port number, past the relay
+        with (
+            Server(f"udp/127.0.0.1:{port}", connect=[server.endpoint]),
+            ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada,
+            ZenohBus("bob", connect=server.endpoint) as bob,
+        ):
+            assert [link.partition(" ")[2] for link in ada.links] == ["reliable", "best effort", "reliable"]
+            assert len(bob.links) == 1
+            bob.subscribe("a/ada", EVERY)
+            bob.subscribe("own/0/0/ada", EVERY)
+            pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
+            wait(lambda: pose.matching and event.matching, "bob's subscriptions")
+            before = wire.up
+            for _ in range(100):
+                pose.put(bytes(1000))
+                time.sleep(0.001)
+            wait(lambda: bob.bytes_in >= 90_000, "nearly all poses")
+            assert wire.up - before < 5_000
+            for _ in range(20):
+                event.put(bytes(1000))
+            heard: list = []
+            wait(lambda: heard.extend(bob.drain()) or sum(k[0] == "o" for k, _ in heard) == 20, "all events")
+            assert wire.up - before > 20_000
+
+
+def test_where_no_datagrams_pass_poses_take_the_stream_and_the_log_says_so(server, caplog):
+    port = server.endpoint.rpartition(":")[2]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:  # takes every handshake and answers none
+        silent.bind(("127.0.0.1", int(port)))
+        with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+            assert len([line for line in caplog.messages if "no datagrams pass" in line]) == 1
+            assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
+            wait(Pump(ada, bob), "a pose and an event")
+
+
+JOIN = """
+import pathlib, sys
+from vinesim.net.zenoh_bus import ZenohBus
+with ZenohBus("ada", connect=sys.argv[1]):
+    print("in", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("way", [0, 1], ids=["tcp", "udp"])
+def test_a_frozen_client_is_missed(way):
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, ZenohBus("bob", connect=server.endpoint) as bob:
+        process = subprocess.Popen(
+            [sys.executable, "-c", JOIN, str(server.endpoints[way])], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"in\n"
+            wait(lambda: "ada" in bob.alive() and "vineyard/ada" in server.actors, "ada")
+            process.send_signal(signal.SIGSTOP)
+            wait(lambda: "ada" not in bob.alive() and "vineyard/ada" not in server.actors, "ada to be missed")
+        finally:
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.parametrize("protocols", ["tcp udp", "tls quic"])
+def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
+    stream, datagrams = protocols.split()
+    secure = stream == "tls"
+    for name in ("ada", "bob") if secure else ():
+        new(tmp_path, name)
+    wanted = chosen([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
+    code = (
+        "import pathlib, sys\nfrom vinesim.net.server import Server\n"
+        f"with Server(sys.argv[1:], certificates={f'pathlib.Path({str(tmp_path)!r})' if secure else None}) as server:\n"
+        "    print('up', flush=True)\n    server.run()"
+    )
+
+    def start() -> subprocess.Popen:
+        process = subprocess.Popen([sys.executable, "-c", code, *map(str, wanted)], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        return process
+
+    router = start()
+    certificates = tmp_path if secure else None
+    try:
+        with (
+            ZenohBus("ada", connect=str(wanted[1]), certificates=certificates) as ada,
+            ZenohBus("bob", connect=str(wanted[1]), certificates=certificates) as bob,
+        ):
+            assert len(ada.links) == len(bob.links) == 3
+            both = Pump(ada, bob)
+            wait(both, "a pose and an event")
+            router.kill()
+            router.wait()
+            wait(lambda: ada.trouble and bob.trouble, "both to notice")
+            router = start()
+            both.again()
+            wait(both, "both streams again")
+            wait(lambda: not ada.trouble and not bob.trouble and len(ada.links) == 3, "both to be well")
     finally:
         router.kill()
         router.wait()

@@ -110,7 +110,7 @@ def server(
     quota: Annotated[
         tuple[float, float],
         typer.Option(help="MESSAGES/s and BYTES/s that one actor may say for good (cuts, where things lie)."),
-    ] = (50.0, 200_000.0),
+    ] = (200.0, 200_000.0),
     tls: Annotated[
         pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): nobody else gets in.")
     ] = None,
@@ -279,19 +279,25 @@ def scene_show(
 
 @app.command()
 def bench(
-    names: Annotated[list[str], typer.Argument(help="plants, camera; several are run one after the other.")],
+    names: Annotated[list[str], typer.Argument(help="plants, camera, sync; several are run one after the other.")],
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
+    plot: Annotated[pathlib.Path | None, typer.Option(help="Where sync draws what it measured (.png).")] = None,
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
+
+    Of physics and sensors: plants, contact, tick, asleep, camera. Of the network: sync (what delay does, in simulated
+    time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
+    fuzz (broken messages).
 
     \b
     Examples:
       vinesim bench plants --json
       vinesim bench plants camera
+      vinesim bench sync --json --plot docs/pictures/network-sync.png
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json))
+    raise typer.Exit(run(names, json, plot))
 
 
 @ros_app.command("build-interfaces")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import pathlib
 from collections.abc import Callable, Iterator
 
 from vinesim.world.values import Measurement
@@ -45,6 +46,36 @@ def _camera() -> Iterator[Measurement]:
     return camera()
 
 
+def _sync(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
+    from vinesim.client.bench_sync import sync
+
+    return sync(plot=plot)
+
+
+def _traffic() -> Iterator[Measurement]:
+    from vinesim.net.bench_traffic import traffic
+
+    return traffic()
+
+
+def _load() -> Iterator[Measurement]:
+    from vinesim.net.bench_load import load
+
+    return load()
+
+
+def _fuzz() -> Iterator[Measurement]:
+    from vinesim.net.bench_fuzz import fuzz
+
+    return fuzz()
+
+
+def _link() -> Iterator[Measurement]:
+    from vinesim.client.bench_link import link
+
+    return link()
+
+
 RAISED = {
     "torso_lift_joint": 0.45,
     **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
@@ -57,6 +88,11 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "tick": _tick,
     "asleep": _asleep,
     "camera": _camera,
+    "sync": _sync,
+    "link": _link,
+    "traffic": _traffic,
+    "load": _load,
+    "fuzz": _fuzz,
 }
 
 
@@ -64,13 +100,13 @@ class NoSuchBench(ValueError):
     """The text says which there are."""
 
 
-def run(names: list[str], as_json: bool) -> int:
-    """Run the named benches in order and print their measurements as they come."""
+def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None) -> int:
+    """Run the named benches in order and print their measurements as they come; ``plot``: where sync draws its own."""
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in BENCHES[name]():
+        for m in _sync(plot) if name == "sync" else BENCHES[name]():
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

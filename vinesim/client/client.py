@@ -46,6 +46,9 @@ def label_index(name: str) -> int:
 class Client:
     """The robot role. ``clock`` is any steady clock in seconds; tests pass their own."""
 
+    picking = True
+    """Whether bunches part here when they are pulled too hard."""
+
     def __init__(
         self,
         scene: Scene,
@@ -63,7 +66,7 @@ class Client:
     ) -> None:
         """``executor`` prepares robots that join, so that no tick has to; without one they are there at once."""
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, device=device, threads=threads, picking=description is not None)
+        self.physics = Physics(model, device=device, threads=threads, picking=self.picking)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)

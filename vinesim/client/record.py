@@ -222,7 +222,7 @@ class Recorder:
         kind = -1
         try:
             kind = messages.kind_of(payload)
-            if family == "a":
+            if kind == messages.ROBOT:
                 name = rest.partition("/")[0]
                 self._place[name] = messages.decode_robot(payload, name).base_q[:3]
         except MessageError:

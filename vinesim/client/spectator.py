@@ -47,6 +47,8 @@ def looking_at(base: np.ndarray) -> np.ndarray:
 class Spectator(Client):
     """A client that only looks. ``pose`` [7] are its eyes: x forward, z up; change :attr:`pose` to walk."""
 
+    picking = False  # it is told what parts
+
     def _enter(self, description: Description | None, pose: np.ndarray, bus: Bus) -> None:
         self.pose = np.asarray(pose, float)
         hello = Hello(

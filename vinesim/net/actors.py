@@ -57,6 +57,8 @@ class Actor:
 
     def hear(self, update: RobotUpdate, time: float) -> bool:
         """Take a newer pose at network ``time``; False if it is not newer."""
+        if update.time > time + smooth.FUTURE:
+            update = dataclasses.replace(update, time=time + smooth.FUTURE)
         if self.update is not None and update.time <= self.update.time:
             return False
         if self.joints < 0:

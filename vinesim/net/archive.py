@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import logging
 import pathlib
 import threading
@@ -32,6 +33,9 @@ MOST = 100_000
 SETTLE = 0.5
 """Between two moments at which facts are made safe against the end of the machine [s]."""
 
+RECOVER = 5.0
+"""Between two attempts to write again, after a disk did not take something [s]."""
+
 SHELF = 10_000
 """Facts that may wait to be believed; what comes beyond is dropped."""
 
@@ -39,11 +43,14 @@ SHELF = 10_000
 class Quota(NamedTuple):
     """How much one actor may say for good, sustained over time; five seconds' worth may come at once."""
 
-    messages: float = 50.0
-    """[1/s]"""
+    messages: float = 200.0
+    """[1/s]: an actor says all its facts again to a server that was gone, one message a tick and cell."""
     payload: float = 200_000.0
     """[B/s]"""
 
+
+EARLY = 1000
+"""Messages that wait for their author to be let in: it says its facts again at once when a server is back."""
 
 BURST = 5.0
 """Seconds of its quota that an actor may spend at once."""
@@ -79,7 +86,7 @@ class Counters:
     over_quota: int = 0
     """... of actors that said too much."""
     strange: int = 0
-    """... of worlds nobody was let into, of too many things, or that came faster than they could be kept."""
+    """... of worlds nobody is let into, of too many things, or that came faster than they could be kept."""
     snapshots: int = 0
     """Questions for a cell's facts."""
 
@@ -96,13 +103,14 @@ class Archive:
         self._facts: dict[str, Facts] = {world: journal.facts for world, journal in self._journals.items()}
         self._plans: dict[str, Plan] = {world: journal.plan for world, journal in self._journals.items()}
         self._shelf: collections.deque[tuple[str, bytes]] = collections.deque()
+        self._early: collections.deque[tuple[str, bytes]] = collections.deque()
         self._purses: dict[tuple[str, str], _Purse] = {}
         self._blamed: set[tuple[str, str]] = set()
         self._lock = threading.Lock()
         self._news = threading.Event()
         self._closing = False
         self.trouble = ""
-        """Empty, or in words why nothing is written any more; facts are then kept in memory."""
+        """Empty, or in words why nothing is written now; facts are then kept in memory until it is mended."""
         self._thread = threading.Thread(target=self._run, name="archive")
         self._thread.start()
 
@@ -122,6 +130,9 @@ class Archive:
             if not self._facts.get(world):
                 self._plans[world] = plan
                 self._facts.setdefault(world, Facts())
+            early, self._early = self._early, collections.deque()
+            self._shelf.extend(early)
+        self._news.set()
 
     def hear(self, key: str, payload: bytes) -> None:
         """Facts that arrived under ``<world>/fact/<cx>/<cy>/<actor>``; returns at once."""
@@ -162,25 +173,41 @@ class Archive:
         settled = time.monotonic()
         unsettled: set[str] = set()
         while True:
-            self._news.wait(SETTLE if unsettled else None)
+            self._news.wait(SETTLE if unsettled else RECOVER if self.trouble else None)
             self._news.clear()
             closing = self._closing
             while self._shelf:
-                world = self._believe(*self._shelf.popleft())
-                if world in self._journals:
+                if world := self._believe(*self._shelf.popleft()):
                     unsettled.add(world)
                 if time.monotonic() - settled >= SETTLE:
                     break
-            if closing and not self._shelf:
-                break
+            now = time.monotonic()
+            if self.trouble and now - settled >= RECOVER:
+                self._recover()
+                settled = now
+            elif now - settled >= SETTLE and not self.trouble:
+                self._written(lambda: [self._journals[world].settle() for world in sorted(unsettled)])
+                unsettled.clear()
+                settled = now
             if self._shelf:
                 self._news.set()
-            if time.monotonic() - settled >= SETTLE:
-                self._guarded(lambda: [self._journals[world].settle() for world in sorted(unsettled)])
-                unsettled.clear()
-                settled = time.monotonic()
+            elif closing:
+                break
         for journal in self._journals.values():
-            self._guarded(journal.close)
+            self._written(journal.close)
+
+    def _recover(self) -> None:
+        """The disk did not take something: try to write everything anew."""
+        trouble, self.trouble = self.trouble, ""
+        for world, facts in list(self._facts.items()):
+            if (journal := self._journals.get(world)) is not None:
+                self._written(journal.rewrite)
+            elif len(facts):
+                self._written(functools.partial(self._begin, world))
+        if self.trouble:
+            self.trouble = trouble
+        else:
+            log.warning("facts are written again")
 
     def _believe(self, key: str, payload: bytes) -> str:
         """Keep what a message says; the world that has changed, or nothing."""
@@ -192,6 +219,14 @@ class Archive:
         except ValueError:
             self._blame(world, actor, f"{key!r} names no cell")
             return ""
+        with self._lock:
+            kept = self._facts.get(world)
+            if kept is None:
+                self._early.append((key, payload))
+                if len(self._early) > EARLY:
+                    self._early.popleft()
+                    self.counters.strange += 1
+                return ""
         now = time.monotonic()
         if len(self._purses) >= SHELF:
             self._purses.clear()  # so many actors are a flood of names: let all begin anew
@@ -207,11 +242,6 @@ class Archive:
         except MessageError as error:
             self._blame(world, actor, str(error))
             return ""
-        kept = self._facts.get(world)
-        if kept is None:
-            self.counters.strange += 1
-            self._say(world, actor, "states facts of a world that nobody was let into; dropped")
-            return ""
         changed = False
         for fact in facts:
             if len(kept) >= MOST and kept.of(fact.thing) is None:
@@ -222,32 +252,37 @@ class Archive:
         return world if changed else ""
 
     def _keep(self, world: str, cell: Cell, fact: Fact) -> bool:
-        if self._folder is not None and world not in self._journals and not self.trouble:
-            path = self._folder / f"{world}{SUFFIX}"
-            self._guarded(
-                lambda: self._journals.update({world: Journal(path, world, self._plans[world], self._facts[world])})
-            )
-        journal = self._journals.get(world)
+        """Take a fact in and write it down; whether it was news and there is a journal of its world."""
+        facts = self._facts[world]
         with self._lock:
-            if journal is None or self.trouble:
-                return self._facts[world].add(cell, fact)
-            changed = False
-            try:
-                changed = journal.add(cell, fact)
-            except NotKept as error:
-                self._give_up(error)
-            return changed
+            if not facts.add(cell, fact):
+                return False
+        if self._folder is None:
+            return False
+        # no lock here: who asks for a snapshot does not wait for a disk
+        journal = self._journals.get(world)
+        if self.trouble:
+            pass  # written with everything else when the disk takes it again
+        elif journal is not None:
+            self._written(lambda: journal.append(cell, fact))
+        else:
+            self._written(lambda: self._begin(world))
+        return world in self._journals
 
-    def _guarded(self, write: Callable[[], object]) -> None:
+    def _begin(self, world: str) -> None:
+        """Begin a journal with all that is known of a world."""
+        assert self._folder is not None
+        path = self._folder / f"{world}{SUFFIX}"
+        self._journals[world] = Journal(path, world, self._plans[world], self._facts[world])
+
+    def _written(self, write: Callable[[], object]) -> None:
+        """Write; if that fails, facts are kept in memory until it does not."""
         try:
             write()
         except NotKept as error:
-            self._give_up(error)
-
-    def _give_up(self, error: NotKept) -> None:
-        if not self.trouble:
+            if not self.trouble:
+                log.error("facts are kept in memory only until this is mended: %s", error)
             self.trouble = str(error)
-            log.error("facts are kept in memory only from now on: %s", error)
 
     def _blame(self, world: str, actor: str, why: str) -> None:
         self.counters.malformed += 1

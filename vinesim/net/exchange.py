@@ -119,6 +119,11 @@ class Exchange:
         return frozenset(self._own.mine)
 
     @property
+    def known(self) -> frozenset[int]:
+        """All things on which any claim was made or heard."""
+        return frozenset(self._own.known)
+
+    @property
     def actors(self) -> dict[str, Hello]:
         """The greetings of all others who are in this world now."""
         return {name: actor.hello for name, actor in self._actors.known.items()}

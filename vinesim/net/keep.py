@@ -56,7 +56,7 @@ class Journal:
         self.path, self.world, self.plan, self.facts = path, world, plan, facts
         self._file: BinaryIO | None = None
         self._records = 0
-        self._rewrite()
+        self.rewrite()
 
     @classmethod
     def load(cls, path: pathlib.Path) -> Self:
@@ -106,10 +106,8 @@ class Journal:
             )  # fmt: skip
         return cls(path, head.world, Plan(head.scene, head.digest), facts)
 
-    def add(self, cell: Cell, fact: Fact) -> bool:
-        """Hear a fact; if it says anything new, append it. Safe against the end of this process at once."""
-        if not self.facts.add(cell, fact):
-            return False
+    def append(self, cell: Cell, fact: Fact) -> None:
+        """Write a fact down that :attr:`facts` has taken in. Safe against the end of this process at once."""
         assert self._file is not None
         try:
             self._file.write(_packed(_CELL.pack(*cell) + messages.encode_facts([fact])))
@@ -117,19 +115,19 @@ class Journal:
         except OSError as error:
             raise _cannot_write(self.path, error) from error
         self._records += 1
-        return True
 
     def settle(self) -> None:
-        """Make what was added safe against the end of the machine; leave out what holds no more."""
+        """Make what was appended safe against the end of the machine; leave out what holds no more."""
         try:
             if self._records > SLACK + 4 * len(self.facts):
-                self._rewrite()
+                self.rewrite()
             elif self._file is not None:
                 os.fsync(self._file.fileno())
         except OSError as error:
             raise _cannot_write(self.path, error) from error
 
-    def _rewrite(self) -> None:
+    def rewrite(self) -> None:
+        """Write all anew, beside the old file, then put it in its place."""
         head = _encoder.encode(_Head(self.world, *self.plan))
         parts = [MAGIC + bytes((VERSION,)), _packed(head)]
         parts += [_packed(_CELL.pack(*cell) + messages.encode_facts([fact])) for cell, fact in self.facts]
@@ -145,9 +143,11 @@ class Journal:
     def close(self) -> None:
         """Settle and give the file up."""
         if self._file is not None:
-            self.settle()
-            self._file.close()
-            self._file = None
+            try:
+                self.settle()
+            finally:
+                self._file.close()
+                self._file = None
 
     def __enter__(self) -> Self:
         return self

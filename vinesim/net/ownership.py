@@ -10,7 +10,7 @@ import collections
 import dataclasses
 from collections.abc import Callable, Container
 
-from vinesim.net import authority
+from vinesim.net import authority, smooth
 from vinesim.net.authority import NOBODY, UNTOUCHED, Claim
 
 ANSWER_PERIOD = 0.2
@@ -56,6 +56,11 @@ class Ownership:
         self._lost: list[tuple[int, Claim]] = []
 
     # ------------------------------------------------------------ questions
+
+    @property
+    def known(self) -> list[int]:
+        """All things that anybody ever touched."""
+        return list(self._known)
 
     def __getitem__(self, thing: int) -> Known:
         return self._known[thing]
@@ -122,6 +127,7 @@ class Ownership:
     def hear_record(self, thing: int, claim: Claim, touching: bool, said_at: float, time: float) -> bool:
         """Judge a record by its claim; whether its state is to be believed. The name of a thing at rest is nobody's."""
         known = self._known[thing]
+        said_at = min(said_at, time + smooth.FUTURE)
         fresh = said_at > known.said_at
         if claim != known.claim and not authority.wins(claim, known.claim):
             if fresh and claim.owner != NOBODY:

@@ -122,10 +122,10 @@ class Server:
         ]
         if self.archive is not None:
             self._declared += [
-                session.declare_subscriber(f"{where}/fact/**", self._fact),
+                session.declare_queryable(f"{where}/join/*/*", self._join),  # first: who is back joins, then tells
                 session.declare_queryable(f"{where}/clock", self._clock),
                 session.declare_queryable(f"{where}/snap/*/*", self._snapshot),
-                session.declare_queryable(f"{where}/join/*/*", self._join),
+                session.declare_subscriber(f"{where}/fact/**", self._fact),
             ]
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
 

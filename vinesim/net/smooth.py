@@ -20,6 +20,9 @@ ANGLE_ERROR = float(np.radians(1.0))
 HEARTBEAT = 1.0
 """... or when nothing was said for this long [s] while awake."""
 
+FUTURE = 1.0
+"""Records from further ahead than this [s] count as made then: else a single one would be newer than all to come."""
+
 BLEND = 0.100
 """A correction is spread over this time [s] in what is shown (95 % of it); velocities are taken at once."""
 

@@ -1,0 +1,162 @@
+"""Broken messages: nothing stops, everything is counted, and afterwards all agree as before."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+import time
+
+import numpy as np
+from ends import Served, wait
+
+from vinesim.client.client import Client
+from vinesim.client.places import spawn_pose
+from vinesim.net import bench_fuzz, messages, smooth
+from vinesim.net.bench_fuzz import EVIL, storm
+from vinesim.net.bus import MemoryHub
+from vinesim.net.puppet import Puppet, Stage, row
+from vinesim.net.zenoh_bus import ZenohBus
+from vinesim.robot.description import load as load_robot
+from vinesim.world.generate import generate
+from vinesim.world.scene import load
+
+
+def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
+    """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
+    ada, bob, _, arrived = bench_fuzz.play(3_000, seed=11)
+    said = [record.message for record in caplog.records if EVIL in record.message and "dropped" in record.message]
+    assert len(said) == 2, "once by each of the two who hear it"
+    counters = ada.exchange.counters
+    assert arrived > 1_500
+    assert counters.malformed > 0.3 * arrived
+    assert counters.malformed + counters.dropped <= 2 * arrived
+    for puppet in (ada, bob):
+        for tree in (1, 2):
+            assert puppet.exchange.owner(tree) == "ada"
+        for update in puppet.robots.values():
+            assert np.isfinite(np.concatenate([update.base_q, update.base_qd, update.position, update.velocity])).all()
+    assert bob.heard[2] > 0.0
+
+
+def test_one_record_from_the_far_future_does_not_silence_its_author_for_ever():
+    """Found by the storm: a time of 1e300 made every later record of that tree, or pose of that actor, an old one."""
+    hub = MemoryHub()
+    model = row()
+    ada, bob = (Puppet(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0)))
+
+    def run(seconds: float) -> None:
+        for _ in range(round(100 * seconds)):
+            hub.advance(0.01)
+            ada.tick(hub.time)
+            bob.tick(hub.time)
+
+    run(0.5)
+    ada.touching = {0}
+    run(0.5)
+    far = ada.exchange.bus
+    pose = ada.pose(hub.time)
+    far.publisher("a/ada").put(messages.encode_robot(type(pose)(**_fields(pose) | {"time": 1e300})))
+    q, qd = ada.read(0)
+    claim = ada.exchange.claim(0)
+    one = np.array([0]), np.array([claim.ownership]), np.array([claim.authority]), np.array([messages.TOUCHED])
+    poison = messages.Trees(1e300, *one, np.array([len(q)]), q, qd)
+    far.publisher("c/0/0/ada").put(messages.encode_trees(poison)[0][0])
+    hub.advance(0.01)
+    bob.tick(hub.time)
+    ada.place[0] = 1.5
+    run(smooth.FUTURE + 0.5)
+    assert bob.robots["ada"].base_q[0] > 1.49
+    before = bob.heard[0]
+    run(0.3)
+    assert bob.heard[0] > before
+
+
+def _fields(value: object) -> dict:
+    return {name: getattr(value, name) for name in value.__slots__}  # type: ignore[attr-defined]
+
+
+def test_a_client_with_its_physics_lives_through_a_storm():
+    """What passes every check may still be nonsense: trees turned inside out, boxes in the sky. Nothing infinite."""
+    scene = load("demo")
+    model = generate(scene)
+    hub = MemoryHub()
+    now = [10.0]
+    pose = spawn_pose(scene, 0)
+    client = Client(
+        scene, model, load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
+    )  # fmt: skip
+    evil = Puppet(hub.bus(EVIL), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
+
+    def tick() -> None:
+        hub.advance(0.01)
+        now[0] += 0.01
+        client.tick()
+
+    for _ in range(60):
+        tick()
+        evil.tick(now[0])
+    assert EVIL in client.exchange.actors
+    wild = storm(model, evil, 3, now[0])
+    publishers: dict = {}
+    for _ in range(60):
+        for key, payload in itertools.islice(wild, 20):
+            publishers.setdefault(key, evil.bus.publisher(key, reliable=True)).put(payload)
+        tick()
+    evil.bus.close()
+    for _ in range(40):
+        tick()
+    state = client.physics.state
+    assert np.isfinite(state.joint_q).all()
+    assert np.isfinite(state.joint_qd).all()
+    base, _ = client.physics.rigid.base("ada")
+    assert np.linalg.norm(base[:3] - pose[:3]) < 0.5
+    assert client.exchange.counters.malformed > 100
+    assert client.exchange.actors == {}
+
+
+def test_real_sessions_and_the_server_live_through_a_storm():
+    with Served("tcp/127.0.0.1:0") as server, Stage(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
+        model = row()
+        with ZenohBus(EVIL, connect=server.endpoint) as bus:
+            evil = Puppet(bus, model, (2.0, 0.0))
+
+            def met() -> bool:
+                evil.tick(time.monotonic())
+                return EVIL in ada.tell()["others"] and "ada" in evil.robots
+
+            wait(met, "the two to meet")
+            before, ticks = ada.tell()["counters"], ada.tell()["ticks"]
+            publishers: dict = {}
+            for number, (key, payload) in enumerate(itertools.islice(storm(model, evil, 7), 1_500)):
+                publisher = publishers.get(key) or publishers.setdefault(key, bus.publisher(key, reliable=True))
+                publisher.put(payload)
+                if number % 20 == 0:
+                    bus.ask("clock", payload)
+                    time.sleep(0.005)
+            wait(lambda: ada.tell()["counters"]["malformed"] > before["malformed"] + 100, "the broken ones to count")
+            assert ada.tell()["ticks"] > ticks
+        wait(lambda: EVIL in ada.tell()["went"], "the storm to be over")
+        with Stage(server.endpoint, [{"name": "bob", "place": [2.0, 0.0]}]) as bob:
+            wait(lambda: "ada" in bob.tell()["poses"], "another to be let in as ever")
+            ada.tell(touch=[3])
+            wait(lambda: bob.tell()["owner"].get("3") == "ada", "the stream to go on")
+        assert server.process.poll() is None
+
+
+def test_noise_that_speaks_no_protocol_does_not_stop_the_server():
+    """What a port scanner or a web browser says."""
+    code = """
+import os, socket, sys
+for say in (b"GET / HTTP/1.1\\r\\n\\r\\n", os.urandom(4000), b"", b"\\xff" * 70000):
+    with socket.create_connection((sys.argv[1], int(sys.argv[2])), timeout=2.0) as s:
+        try:
+            s.sendall(say)
+        except OSError:
+            pass
+"""
+    with Served("tcp/127.0.0.1:0") as server:
+        host, port = server.endpoint.removeprefix("tcp/").split(":")
+        subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=20)
+        with Stage(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
+            assert ada.tell()["trouble"] == ""

@@ -1,0 +1,102 @@
+"""``vinesim bench link``: a touch seen from far away, by whole clients over Zenoh and emulated links, in real time.
+
+Server and clients are processes, each in a network namespace of its own. The picker pushes a bunch again and again,
+the visitor watches the same bunch in its own world; both note it by the host's clock.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim.client.places import bunch_in_reach, spawn_pose
+from vinesim.client.trace import Rows, remote_error
+from vinesim.net.emulator import Emulator, Line, Way
+from vinesim.world.generate import generate
+from vinesim.world.scene import load
+from vinesim.world.values import Measurement
+
+LINES = {
+    "LAN, 0.2 ms one way": Line(Way(0.0002)),
+    "20 +- 4 ms one way, 1 % lost": Line(Way(0.010, 0.002, 0.005)),
+    "50 +- 10 ms one way, 1 % lost": Line(Way(0.025, 0.005, 0.005)),
+}
+"""Of each client to the server: from client to client it is twice that."""
+
+SECONDS = 26.0
+"""How long the clients run: some four pushes."""
+
+START = 150.0
+"""How long a client may take to start and to write what it saw [s]."""
+
+SEEN = 0.0005
+"""A bunch visibly moves when its centre is so far from where it was at the touch [m]."""
+
+APART = 1.0
+"""Touches are new when nothing touched for so long [s]."""
+
+
+def touches(rows: Rows) -> list[int]:
+    """Rows in which a force begins after a pause."""
+    pressed = np.flatnonzero(np.linalg.norm(rows.force, axis=1) > 0.0)
+    if not len(pressed):
+        return []
+    new = np.diff(rows.clock[pressed], prepend=-np.inf) > APART
+    return pressed[new].tolist()
+
+
+def moves(rows: Rows, since: float) -> float:
+    """How long after ``since`` [s, host's clock] the bunch visibly moves [s]; infinite if it does not in a second."""
+    first = int(np.searchsorted(rows.clock, since))
+    here = slice(first, int(np.searchsorted(rows.clock, since + 1.0)))
+    if first == 0 or here.stop <= first:
+        return np.inf
+    away = np.linalg.norm(rows.displacement[here] - rows.displacement[first - 1], axis=1)
+    return float(rows.clock[first + int(np.argmax(away > SEEN))] - since) if (away > SEEN).any() else np.inf
+
+
+def watched(line: Line) -> tuple[Rows, Rows]:
+    """What the picker and the visitor saw of the same bunch."""
+    scene = load("demo")
+    bunch = str(bunch_in_reach(generate(scene), spawn_pose(scene, 0)))
+    client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
+    roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
+    with tempfile.TemporaryDirectory() as folder, Emulator(dict.fromkeys(roles, line)) as net:
+        server = net.start(
+            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--listen", "tcp/0.0.0.0:7447"],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert server.stdout is not None
+        server.stdout.readline()
+        processes = []
+        for name, role in roles.items():
+            place = ["--connect", f"tcp/{net.hub(name)}:7447", "--name", name, "--out", f"{folder}/{name}"]
+            processes.append(net.start(name, [*client, *role, *place, "--seconds", str(SECONDS)]))
+        end = time.monotonic() + SECONDS + START
+        for process in processes:
+            if process.wait(max(end - time.monotonic(), 0.0)) != 0:
+                raise RuntimeError(f"a client ended with {process.returncode}")
+        picker, visitor = (Rows.load(pathlib.Path(folder) / name / "trace.npz") for name in roles)
+    return picker, visitor
+
+
+def link() -> Iterator[Measurement]:
+    """Rows for each line."""
+    for case, line in LINES.items():
+        picker, visitor = watched(line)
+        known = [picker.clock[row] for row in touches(picker) if visitor.told.any()]
+        seen = [moves(visitor, start) - moves(picker, start) for start in known]
+        seen = [1e3 * one for one in seen if np.isfinite(one)]
+        yield Measurement("link", f"{case}: touches", float(len(seen)), "")
+        if seen:
+            yield Measurement("link", f"{case}: moves there after it moves here, p50", float(np.median(seen)), "ms")
+            yield Measurement("link", f"{case}: moves there after it moves here, max", float(np.max(seen)), "ms")
+        if (error := remote_error(picker, visitor)) is not None:
+            yield Measurement("link", f"{case}: copy of the pushed bunch, p50", error["p50"], "mm")
+            yield Measurement("link", f"{case}: copy of the pushed bunch, p95", error["p95"], "mm")
