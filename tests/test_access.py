@@ -245,6 +245,38 @@ def test_over_quic_poses_are_datagrams_and_events_a_stream(server, certs):
         assert heard[0] == ("a/ada", b"pose")
 
 
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_linked_servers_know_each_other_and_each_its_own_actors(certs, protocol):
+    with (
+        Server(("tls/127.0.0.1:0", "quic/127.0.0.1:0"), certificates=certs) as hub,
+        Server(
+            "tls/127.0.0.1:0", connect=[f"{protocol}/{hub.endpoint.partition('/')[2]}"], certificates=certs
+        ) as relay,
+        bus("ada", relay, certs) as ada,
+        bus("bob", hub, certs) as bob,
+        session("ada", relay, certs) as thief,
+    ):
+        wait(lambda: ada.alive() == bob.alive() == {"ada", "bob"}, "both to see each other")
+
+        def let_in():
+            try:
+                ada.join(hello("ada"))
+            except Refused:  # not yet linked well enough to ask
+                return False
+            return True
+
+        wait(let_in, "the server that keeps to answer over the one that carries")
+        bob.subscribe("own/0/0/*", EVERY)
+        event = ada.publisher("own/0/0/ada", reliable=True)
+        wait(lambda: event.matching, "bob's ear")
+        thief.put("vs/1/vineyard/own/0/0/bob", b"stolen", congestion_control=zenoh.CongestionControl.BLOCK)
+        list(thief.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
+        event.put(b"event")
+        heard: list = []
+        wait(lambda: heard.extend(bob.drain()) or heard, "the event")
+        assert heard == [("own/0/0/ada", b"event")]
+
+
 # ---------------------------------------------------------------- the folder
 
 
@@ -292,6 +324,10 @@ def test_what_is_wrong_in_the_folder_is_one_line_with_a_remedy(tmp_path, certs):
         roles(tmp_path)
     (tmp_path / "bob.pem").write_bytes((tmp_path / "ada.pem").read_bytes())
     with pytest.raises(NoCertificate, match=r"rename it to ada\.pem"):
+        roles(tmp_path)
+    (tmp_path / "bob.pem").unlink()
+    new(tmp_path, "server", Role.SERVER, days=-1)
+    with pytest.raises(NoCertificate, match=r"server\.pem: not valid.*vinesim certs new server"):
         roles(tmp_path)
     with pytest.raises(BusError, match=r"no .*eve\.pem.*vinesim certs new eve"):
         ZenohBus("eve", connect="tls/127.0.0.1:1", certificates=tmp_path)

@@ -177,7 +177,8 @@ def test_secured_from_certificate_to_client(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[-2:] == [str(certs / "ada.key"), str(certs / "ada.pem")]
     refused(vinesim("certs", "new", "ada", "--dir", str(certs)), 4, "ada.pem", "there already")
-    with serving("--listen", "tls/127.0.0.1:0", "--tls", str(certs), "--status", "text") as (_, line):
+    arguments = ["--listen", "tls/127.0.0.1:0", "--tls", str(certs), "--status", "text", "--scene", "demo"]
+    with serving(*arguments) as (_, line):
         endpoint = line.split()[-1]
         common = [
             "client",
@@ -199,7 +200,7 @@ def test_secured_from_certificate_to_client(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["client", "--role", "human"], ["human", "not built yet"]),
+        (["client", "--role", "spectator", "--status", "xml"], ["xml", "json"]),
         (["client", "--role", "tractor"], ["tractor", "robot"]),
         (["client", "--push", "99999", "--no-ros"], ["99999"]),
         (["client", "--tls", "certs", "--no-ros"], ["--tls certs", "--connect tls/HOST:7447"]),

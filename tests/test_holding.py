@@ -10,12 +10,12 @@ from test_people import eva, put
 from touch_scenes import bunch_scene, cane, gripper, probe
 
 from vinesim import frames
-from vinesim.physics.people import THICK, TRACKED
+from vinesim.physics.people import THICK
 from vinesim.physics.plants import HANDS, HELD, Plants
 from vinesim.physics.step import Physics
 from vinesim.world.grow import assemble
 from vinesim.world.state import State
-from vinesim.world.values import Drive, HumanPose, HumanSpec
+from vinesim.world.values import POINTS, Drive, HumanPose, HumanSpec
 
 FORWARD = frames.multiply(frames.yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
 """Fingers up, palm along +y."""
@@ -78,7 +78,7 @@ def test_a_body_that_walks_takes_canes_along():
     furthest = 0.0
     for tick in range(60):
         walk = np.array([0.0, 0.014 * tick, 0, 0, 0, 0, 0])
-        moved = {name: getattr(spec.pose, name) + walk for name in TRACKED}
+        moved = {name: getattr(spec.pose, name) + walk for name in POINTS}
         physics.move_human("eva", dataclasses.replace(spec.pose, **moved))
         physics.step()
         furthest = max(furthest, *(-contact.distance for contact in physics.contacts), 0.0)

@@ -11,12 +11,12 @@ from test_rigid import arm, step, yard
 from touch_scenes import probe
 
 from vinesim import frames
-from vinesim.physics.people import PARTS, THICK, TRACKED, HumanError, posture, standing
+from vinesim.physics.people import PARTS, THICK, HumanError, posture, standing
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.yard import FRICTION
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
-from vinesim.world.values import Drive, HumanPose, HumanSpec
+from vinesim.world.values import POINTS, Drive, HumanPose, HumanSpec
 
 POLE = 3.0 - 0.05
 """The yard's pole stands at x = 3, y = 0 and is 5 cm thick."""
@@ -312,7 +312,7 @@ def test_legs_that_walk_push_a_sleeping_box_along(speed):
     assert rigid.data.body_awake[rigid.world.body("box/0").id] == 0
     deep = 0.0
     for x in np.arange(0.0, 1.0, 0.01 * speed):
-        moved = {name: getattr(spec.pose, name) + np.array([x, 0, 0, 0, 0, 0, 0]) for name in TRACKED}
+        moved = {name: getattr(spec.pose, name) + np.array([x, 0, 0, 0, 0, 0, 0]) for name in POINTS}
         rigid.move_human("eva", dataclasses.replace(spec.pose, **moved))
         step(rigid)
         deep = max(deep, deepest(rigid, "box/0"))

@@ -18,8 +18,11 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
 from vinesim.net import messages, recording
+from vinesim.net.poses import Push, encode_human, encode_push
 from vinesim.net.recording import NotARecording, Recording, RecordingStopped, free_path, read
+from vinesim.physics.people import standing
 from vinesim.world.ids import Kind, thing
+from vinesim.world.values import POINTS, HumanUpdate
 
 
 def write(path: pathlib.Path, entries: list[tuple[int, str, bytes]], **about: str) -> pathlib.Path:
@@ -78,6 +81,15 @@ def test_what_a_message_says():
     assert (told["kind"], told["index"], told["parent"], told["moving"]) == ("box", 2, "bob/arm", True)
     assert told["pose"]["position"]["x"] == 13.0
     assert messages.time_of(messages.encode_facts([fact])) is None
+
+    person = standing(pose, 1.8)
+    said = recording.said("a/eva", encode_human(HumanUpdate("eva", 5.0, person, np.zeros((7, 6)))))
+    assert said["points"].keys() == set(POINTS)
+    assert list(said["points"]["head"]["position"].values()) == pytest.approx(person.head[:3], abs=2e-4)
+    assert said["pose"] == said["points"]["hips"]
+    pushed = encode_push(Push(6.0, {"hand": np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.5])}))
+    assert recording.said("force/bob/eva", pushed)["links"] == [{"link": "hand", "wrench": [1, 2, 3, 0, 0, 0.5]}]
+    assert messages.time_of(messages.restamped(pushed, 1.5)) == 7.5
 
     assert recording.said("live/ada", b"\x01")["live"] is True
     assert recording.said("live/ada", b"")["live"] is False

@@ -17,9 +17,11 @@ from vinesim.net import archive, messages
 from vinesim.net.agreement import Plan
 from vinesim.net.archive import Quota
 from vinesim.net.bus import EVERY, NameTaken, Refused
+from vinesim.net.counters import Counters
 from vinesim.net.endpoints import chosen
 from vinesim.net.messages import Fact, Hello, Welcome
 from vinesim.net.server import PortTaken, Server
+from vinesim.net.telling import Telling
 from vinesim.net.zenoh_bus import ZenohBus, close_session, config, open_session
 from vinesim.world.ids import Kind, thing
 
@@ -330,6 +332,42 @@ def test_a_server_killed_in_full_flight_has_lost_nothing_it_told(tmp_path):
             assert again == [box(number) for number in range(len(again))]  # and of the rest the first that came
 
 
+def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
+    """Those who are there are its memory."""
+    with (
+        serving("tcp/127.0.0.1:0", tmp_path / "one") as (first, endpoint),
+        ZenohBus("ada", connect=endpoint) as ada,
+        ZenohBus("late", connect=endpoint) as late,
+    ):
+        ada.join(hello("ada"))
+        telling = Telling(ada, Counters())
+        told: list = []
+
+        def ticking(condition):
+            def check():
+                telling.follow([(0, 0)], time.monotonic())
+                telling.speak()
+                time.sleep(0.005)
+                return condition()
+
+            return check
+
+        def known():
+            late.ask("snap/0/0")
+            told[:] = [fact for answer in late.answers() for fact in messages.decode_facts(answer.payload)] or told
+            return told == [box(number) for number in range(30)]
+
+        for number in range(30):
+            telling.say((0, 0), box(number))
+        wait(ticking(known), "thirty facts")
+        first.kill()
+        first.wait()
+        wait(ticking(lambda: ada.trouble), "ada to miss the server")
+        with serving(endpoint, tmp_path / "another"):  # a folder with nothing in it
+            told.clear()
+            wait(ticking(known), "the same facts again")
+
+
 def test_the_scene_is_kept_with_the_facts(tmp_path):
     with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.join(hello("ada"))
@@ -404,8 +442,12 @@ def test_a_server_that_carries_waits_for_the_one_that_keeps():
     (endpoint,) = chosen(["tcp/127.0.0.1:0"])
     with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as relay, ZenohBus("ada", connect=relay.endpoint) as ada:
         ada.join(hello("ada"))  # nobody decides yet
+        assert not ada.trouble
         with Server(str(endpoint)) as hub:
             wait(lambda: hub._agreement.plan("vineyard") == Plan("vsp", "D1"), "ada to say who she is")
+        wait(lambda: "the server that keeps world 'vineyard' is gone" in ada.trouble, "ada to miss the one that keeps")
+        with Server(str(endpoint)) as hub:
+            wait(lambda: not ada.trouble and hub.actors == ["vineyard/ada"], "ada to be well")
 
 
 def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):

@@ -221,3 +221,74 @@ def test_a_story_is_the_same_twice():
         return b"".join(client.physics.rigid.data.qpos.tobytes() for client in (ada, bob))
 
     assert story() == story()
+
+
+# ---------------------------------------------------------------- who comes late
+
+
+def test_whoever_comes_late_finds_everything_as_it_was_left():
+    """F09: picked, boxed, cut and pushed, then everybody goes, and one comes."""
+    world, ada, bob = near_worlds((-2.75, 0.0), (-2.0, -2.0))
+    fill(ada)
+    bob.physics.cut(int(ada.model.tree_first[1]) + 8)
+    world.until(lambda: at_rest(world), 12.0)
+    drive(ada, 0.3)
+    world.run(0.6)
+    drive(ada, -0.3)
+    world.until(lambda: at_rest(world), 4.0)
+    world.run(0.3)
+    for name in ("ada", "bob"):
+        world.leave(name)
+    cy = world.join("cy", -2.0, 1.5)
+    world.until(lambda: not cy.physics.state.bunch_attached.any(), 0.2)
+    assert len(cy.physics.lying) == 2, "no body is made at once"
+    world.run(0.5)
+    assert sorted(cy.physics.rigid.loose) == [0, 1], "but who is near gets one"
+    np.testing.assert_allclose(pose_of(cy, BOX(0)), pose_of(ada, BOX(0)), atol=1e-3)
+    for bunch in range(2):
+        np.testing.assert_allclose(pose_of(cy, BUNCH(bunch)), pose_of(ada, BUNCH(bunch)), atol=5e-3)
+        assert cy.physics.riding.lies(BUNCH(bunch))[0] == "box/0"
+    assert cy.physics.state.body_cut.tolist() == ada.physics.state.body_cut.tolist()
+    ada.physics.refresh()
+    cy.physics.refresh()
+    off = cy.physics.state.body_q[:, :3] - ada.physics.state.body_q[:, :3]
+    assert np.linalg.norm(off, axis=1).max() < 0.01
+    assert sent(cy) == 0, "it had nothing to add"
+
+
+def test_a_restarted_server_is_told_again():
+    world, ada, bob = near_worlds()
+    ada.physics.pick(0)
+    world.until(lambda: at_rest(world), 5.0)
+    world.run(0.2)
+    known = list(world.server.facts)
+    assert [fact.thing for _, fact in known] == [0, BUNCH(0)]
+    world.hub.down = True
+    world.run(0.3)
+    world.server.facts = type(world.server.facts)()
+    world.hub.down = False
+    world.run(0.3)
+    assert list(world.server.facts) == known
+    assert not bob.physics.state.bunch_attached[0]
+    before = sent(ada), sent(bob)
+    world.run(1.0)
+    assert (sent(ada), sent(bob)) == before
+
+
+def test_while_the_server_is_away_everybody_works_on_and_all_agree_afterwards():
+    world, ada, bob = near_worlds()
+    world.hub.down = True
+    world.run(0.1)
+    ada.physics.pick(0)
+    bob.physics.pick(0)
+    bob.physics.pick(1)
+    world.run(0.3)
+    assert ada.physics.state.bunch_attached.tolist() == [False, True]
+    world.hub.down = False
+    world.run(0.5)
+    assert not ada.physics.state.bunch_attached.any()
+    world.until(lambda: at_rest(world), 6.0)
+    world.run(0.3)
+    for number in (BUNCH(0), BUNCH(1)):
+        assert apart(ada, bob, number) < 5e-3
+        assert ada.exchange.fact(number) == bob.exchange.fact(number) == world.server.facts.of(number)

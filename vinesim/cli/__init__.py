@@ -136,7 +136,7 @@ def server(
 
 @app.command()
 def client(
-    role: Annotated[str, typer.Option(help="robot, or spectator. (human is not built yet.)")] = "robot",
+    role: Annotated[str, typer.Option(help="robot, human or spectator.")] = "robot",
     name: Annotated[str | None, typer.Option(help="The actor's name, one of a kind; robot-PID unless given.")] = None,
     connect: Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")] = None,
     tls: Annotated[
@@ -159,6 +159,11 @@ def client(
     ros: Annotated[bool, typer.Option(help="Talk ROS 2, if it is installed.")] = True,
     push: Annotated[int | None, typer.Option(help="Reach for this bunch and push it, again and again.")] = None,
     job: Annotated[str | None, typer.Option(help="Do a job and stop: pick or exchange.")] = None,
+    walk: Annotated[tuple[float, float] | None, typer.Option(help="A human: walk to this place, x y [m].")] = None,
+    reach: Annotated[
+        int | None, typer.Option(help="A human: walk to this bunch, hold it, pull at it, let go, again and again.")
+    ] = None,
+    height: Annotated[float, typer.Option(min=1.0, max=2.5, help="Of a human [m].")] = 1.75,
     watch: Annotated[int | None, typer.Option(help="Record force and displacement of this bunch.")] = None,
     near: Annotated[
         float, typer.Option(min=0.1, max=5.0, help="Others nearer than this to a thing hear of it [m].")
@@ -183,11 +188,20 @@ def client(
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
       vinesim client --role spectator --connect tcp/127.0.0.1:7447 --place 2 0 1.57 --out pictures
+      vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva --reach 12
     """
     options = dict(locals())
+    if role == "human":
+        from vinesim.cli.human import run as visit
+
+        raise typer.Exit(visit(**options))
+    if role == "spectator":
+        from vinesim.cli.spectate import run as look
+
+        raise typer.Exit(look(**options))
     from vinesim.cli.join import run
 
-    raise typer.Exit(run(**options))
+    raise typer.Exit(run(**{name: value for name, value in options.items() if name not in ("walk", "reach", "height")}))
 
 
 @app.command()

@@ -12,6 +12,7 @@ import re
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -35,20 +36,12 @@ def run(
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
-    if role not in ("robot", "spectator"):
-        built = "is not built yet" if role == "human" else "is none of robot, human, spectator"
-        raise WrongUse(f"role {role!r} {built}; give --role robot or spectator")
+    if role != "robot":
+        raise WrongUse(f"role {role!r} is none of robot, human, spectator; give one of them")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
         raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
-    if role == "spectator":
-        from vinesim.cli.spectate import run as spectate
-
-        return spectate(
-            name=name, connect=connect, tls=tls, scene=scene, seed=seed, spawn=spawn, place=place, near=near,
-            device=device, threads=threads, seconds=seconds, out=out, status=status, hz=sensor_hz,
-        )  # fmt: skip
 
     from vinesim.physics.memory import device_of
 
@@ -143,7 +136,7 @@ def run(
         elif client.trace is not None:
             client.jobs.append(LookAt(client.robot, client.trace.centre))
         reporter = Status(client, pace, senses.sent, script)
-        speaker = threading.Thread(target=_speak, args=(reporter, senses, status, stop), name="status")
+        speaker = threading.Thread(target=speak, args=(reporter, senses.diagnose, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
@@ -175,12 +168,12 @@ def ros_name(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def _speak(reporter: Any, senses: Any, status: str, stop: threading.Event) -> None:
-    """Once a second, say how it goes: to the terminal and to ROS."""
+def speak(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
+    """Once a second, say how it goes: to the terminal, and to whoever wants to ``diagnose``."""
     try:
         while not stop.wait(STATUS_PERIOD):
             figures = reporter.now()
-            senses.diagnose(figures)
+            diagnose(figures)
             if status == "json":
                 print(json.dumps(figures), flush=True)
             elif status == "text":

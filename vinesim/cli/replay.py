@@ -13,6 +13,7 @@ import time
 import numpy as np
 
 from vinesim.net import messages
+from vinesim.net.poses import decode_pose
 from vinesim.net.recording import NotARecording, Tape, read, sender_of
 
 POLL = 0.004
@@ -102,29 +103,30 @@ def _look(
             f"{tape.path} is of scene {tape.about.get('scene', '?')!r} with digest {digest}, "
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
-    eyes = viewpoint(*place) if place is not None else looking_at(_first_robot(tape))
+    eyes = viewpoint(*place) if place is not None else looking_at(_first_pose(tape))
     out.mkdir(parents=True, exist_ok=True)
     bus = ReplayBus(tape, "spectator", start=start, end=end)
     spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
     pictures = Pictures(spectator, out, 1.0)
     while not (bus.ended or stop.is_set()):
         bus.play(spectator.physics.dt * speed)
-        if place is None and spectator.others:
-            spectator.pose = looking_at(spectator.physics.rigid.base(min(spectator.others))[0])
+        if place is None and spectator.physics.rigid.robots:
+            spectator.pose = looking_at(spectator.physics.rigid.base(min(spectator.physics.rigid.robots))[0])
         spectator.tick()
     pictures.save(spectator)
     print(f"{pictures.count} pictures are in {out}/", file=sys.stderr)
     return 0
 
 
-def _first_robot(tape: Tape) -> np.ndarray:
-    """Where the first robot stood [7] when it was first heard of."""
-    robots = {
-        sender_of(entry.key)
-        for entry in tape.entries
-        if entry.key.startswith("hello/") and messages.decode_hello(entry.payload).kind == "robot"
-    }
-    for entry in tape.entries:
-        if entry.key.startswith("a/") and sender_of(entry.key) in robots:
-            return messages.decode_robot(entry.payload, "").base_q
-    raise WrongUse(f"{tape.path} has no pose of a robot to look at: give --place X Y YAW")
+def _first_pose(tape: Tape) -> np.ndarray:
+    """Where the first robot stood [7] when it was first heard of, or if there is none, the first person."""
+    for kind in ("robot", "human"):
+        such = {
+            sender_of(entry.key)
+            for entry in tape.entries
+            if entry.key.startswith("hello/") and messages.decode_hello(entry.payload).kind == kind
+        }
+        for entry in tape.entries:
+            if entry.key.startswith("a/") and sender_of(entry.key) in such:
+                return decode_pose(entry.payload, "").base_q
+    raise WrongUse(f"{tape.path} has no pose of anybody to look at: give --place X Y YAW")

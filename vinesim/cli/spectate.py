@@ -20,9 +20,10 @@ STATUS_PERIOD = 1.0
 def run(
     *, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None, spawn: int,
     place: tuple[float, float, float] | None, near: float, device: str, threads: int, seconds: float | None,
-    out: pathlib.Path | None, status: str, hz: float | None,
+    out: pathlib.Path | None, status: str, sensor_hz: float | None, **_: Any,
 ) -> int:  # fmt: skip
     """Look until told to stop; pictures go to ``out``."""
+    from vinesim.cli.join import WrongUse
     from vinesim.client.pace import Pace
     from vinesim.client.places import spawn_pose
     from vinesim.client.spectator import Pictures, Spectator, viewpoint
@@ -32,6 +33,10 @@ def run(
     from vinesim.world.generate import generate
     from vinesim.world.scene import load, reseeded
 
+    if status not in ("text", "json", "none"):
+        raise WrongUse(f"--status {status!r}: give text, json or none")
+    if tls is not None and connect is None:
+        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
     plan = reseeded(load(scene), seed)
     if place is None:
         start = spawn_pose(plan, spawn)
@@ -48,7 +53,7 @@ def run(
             plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads,
             executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
-        pictures = None if out is None else Pictures(spectator, out, 1.0 / (hz or 1.0))
+        pictures = None if out is None else Pictures(spectator, out, 1.0 / (sensor_hz or 1.0))
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())

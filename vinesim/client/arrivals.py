@@ -1,4 +1,4 @@
-"""Robots of other clients on their way in: a thread of its own reads and compiles them, and no tick waits for it."""
+"""Robots and people of other clients on their way in: a thread reads and compiles them, and no tick waits for it."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
+from vinesim.client.person import RemotePerson, spec_of
 from vinesim.net.messages import Hello, valid_name
 from vinesim.physics.rigid import Draft, Rigid
 from vinesim.robot import description as descriptions
 from vinesim.robot.description import Description, DescriptionError
 from vinesim.robot.drives import RemoteRobot
-from vinesim.world.values import RobotUpdate
+from vinesim.world.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
 
-Prepared = tuple[Description, Draft]
+Prepared = tuple[Description | None, Draft]
+"""A robot's description, or None for a person, and the world with it."""
 
 
 class Arrivals:
@@ -38,7 +38,7 @@ class Arrivals:
         return name in self._expected
 
     def expect(self, hello: Hello) -> None:
-        """A robot has introduced itself; where it is will be known with its first pose."""
+        """Somebody has introduced itself; where it is will be known with its first pose."""
         self._expected[hello.name] = hello
 
     def forget(self, name: str) -> None:
@@ -46,25 +46,27 @@ class Arrivals:
         self._expected.pop(name, None)
         self._coming.pop(name, None)
 
-    def embody(self, name: str, update: RobotUpdate) -> RemoteRobot | None:
-        """The copy of an expected robot, standing where ``update`` says; None as long as it is not ready.
+    def embody(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemotePerson | None:
+        """The copy of whoever is expected, standing where ``update`` says; None as long as it is not ready.
 
-        A robot that cannot be shown is named in the log and no more expected.
+        Who cannot be shown is named in the log and no more expected.
         """
         hello = self._expected[name]
         if name not in self._coming:
-            self._coming[name] = self._start(lambda: self._prepare(hello, update.base_q))
+            self._coming[name] = self._start(lambda: self._prepare(hello, update))
         if not self._coming[name].done():
             return None
         try:
             description, draft = self._coming.pop(name).result()
         except ValueError as error:
-            log.warning("the robot of %s cannot be shown: %s", name, error)
+            log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
             self.forget(name)
             return None
         if not self.rigid.admit(draft):
             return None  # somebody else came or went meanwhile: once more, from the next tick on
         self.forget(name)
+        if description is None or not isinstance(update, RobotUpdate):
+            return RemotePerson(self.rigid, name)
         other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, here=True)
         self.rigid.place(name, update.base_q, update.position)
         return other
@@ -79,11 +81,13 @@ class Arrivals:
             done.set_exception(error)
         return done
 
-    def _prepare(self, hello: Hello, pose: np.ndarray) -> Prepared:
+    def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
+        if isinstance(update, HumanUpdate):
+            return None, self.rigid.prepare(spec_of(hello, update), copy=True)
         description = described(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
-        return description, self.rigid.prepare(description.spec(hello.name, hello.index, pose))
+        return description, self.rigid.prepare(description.spec(hello.name, hello.index, update.base_q))
 
 
 def described(hello: Hello, own: Description | None) -> Description:

@@ -6,7 +6,8 @@
 
 A tick is five steps: receive, control, step, sense, send. Nothing in it waits: not for the network, not for a picture.
 
-One client moves one robot, or several (D6.4 section 4.1): then each is an actor of its own on the network.
+One client moves one robot, or several (D6.4 section 4.1): then each is an actor of its own on the network. Or it moves
+a person.
 """
 
 from __future__ import annotations
@@ -21,19 +22,22 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.arrivals import Arrivals
+from vinesim.client.person import Person, RemotePerson
 from vinesim.client.things import PULL, Things
 from vinesim.client.trace import Trace
 from vinesim.net import interest
 from vinesim.net.bus import Bus
 from vinesim.net.exchange import Exchange, Inbox
 from vinesim.net.messages import Hello
+from vinesim.physics.people import standing
 from vinesim.physics.step import Physics
+from vinesim.physics.urdf import RobotError
 from vinesim.physics.wind import Wind
 from vinesim.robot.description import Description
 from vinesim.robot.drives import RemoteRobot, Robot
 from vinesim.world.model import Model
 from vinesim.world.scene import Scene
-from vinesim.world.values import RobotUpdate, TreeUpdate
+from vinesim.world.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +48,7 @@ def label_index(name: str) -> int:
 
 
 class Client:
-    """The robot role. ``clock`` is any steady clock in seconds; tests pass their own."""
+    """One actor's share of a world. ``clock`` is any steady clock in seconds; tests pass their own."""
 
     picking = True
     """Whether bunches part here when they are pulled too hard."""
@@ -58,27 +62,34 @@ class Client:
         *,
         name: str,
         pose: np.ndarray,
+        source: Callable[[float], HumanPose] | None = None,
+        height: float = 1.75,
         near: float = interest.NEAR,
         device: str = "cpu",
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
         executor: Executor | None = None,
     ) -> None:
-        """``executor`` prepares robots that join, so that no tick has to; without one they are there at once."""
+        """A robot of this ``description``; None: a person of ``height`` [m], still or where ``source`` says.
+
+        ``executor`` prepares others who join, so that no tick has to; without one they are there at once.
+        """
         self.name, self.model, self.scene = name, model, scene
         self.physics = Physics(model, device=device, threads=threads, picking=self.picking)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robots: dict[str, Robot] = {}
-        """All that this client moves, by name; the first is :attr:`robot`."""
-        self.things = Things(self.physics, self.robots)
+        """All robots that this client moves, by name; the first is :attr:`robot`."""
+        self.people: dict[str, Person] = {}
+        """All people that this client moves, by name."""
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
+        self.things = Things(self.physics, self.exchanges)
         self._near = near
-        self._enter(description, pose, bus)
+        self._enter(description, pose, source, height, bus)
         self.exchange = self.exchanges[name]
-        self.others: dict[str, RemoteRobot] = {}
+        self.others: dict[str, RemoteRobot | RemotePerson] = {}
         self.jobs: list[Callable[[float], None]] = []
         """Called every tick with the simulation time, before the drives: what the robot is to do."""
         self.senses: list[Callable[[Client], None]] = []
@@ -92,9 +103,16 @@ class Client:
         self._copies: dict[int, TreeUpdate] = {}
         self.arrivals = Arrivals(self.physics.rigid, description, executor)
 
-    def _enter(self, description: Description | None, pose: np.ndarray, bus: Bus) -> None:
-        assert description is not None
-        self.robot = self.add_robot(description, self.name, pose, bus)
+    def _enter(
+        self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
+        height: float, bus: Bus,
+    ) -> None:  # fmt: skip
+        """Come into the world as what this client is to be."""
+        if description is None:
+            spec = HumanSpec(self.name, label_index(self.name), standing(pose, height), height)
+            self.add_human(spec, source, bus)
+        else:
+            self.robot = self.add_robot(description, self.name, pose, bus)
 
     def add_robot(self, description: Description, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Move one more robot, standing at ``pose`` [7]; ``bus`` is opened in its name."""
@@ -106,10 +124,24 @@ class Client:
         exchange = Exchange(bus, hello, self.model, near=self._near)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
+        self._share(name, exchange)
+        return robot
+
+    def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> Person:
+        """Move one more person as ``source`` says (see :class:`Person`; None: still); ``bus`` is opened in its name."""
+        hello = Hello(
+            name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
+            height=spec.height, seed=self.scene.seed,
+        )  # fmt: skip
+        exchange = Exchange(bus, hello, self.model, near=self._near)
+        self.people[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
+        self._share(spec.name, exchange)
+        return person
+
+    def _share(self, name: str, exchange: Exchange) -> None:
         self.exchanges[name] = exchange
         for own, share in self.exchanges.items():
             share.kin = self.exchanges.keys() - {own}
-        return robot
 
     def tick(self) -> None:
         """Ten milliseconds of the vineyard."""
@@ -127,7 +159,7 @@ class Client:
         inbox = self._inbox(now)
         for hello in inbox.joined:
             log.info("%s joined as %s", hello.name, hello.kind)
-            if hello.kind == "robot":
+            if hello.kind in ("robot", "human"):
                 self.arrivals.expect(hello)
         for name in inbox.left:
             self.arrivals.forget(name)
@@ -135,7 +167,7 @@ class Client:
                 other.leave()
                 self.physics.touching.copies.discard(name)
                 log.info("%s left", name)
-        for name, update in inbox.robots.items():
+        for name, update in (*inbox.robots.items(), *inbox.people.items()):
             if name in self.arrivals and (other := self.arrivals.embody(name, update)) is not None:
                 self.others[name] = other
                 self.physics.touching.copies.add(name)
@@ -144,11 +176,13 @@ class Client:
         self._pull(inbox)
 
     def control(self) -> None:
-        """Do the jobs, then hand set-points to the drives."""
+        """Do the jobs, then hand set-points to the drives; people go where they are told."""
         for job in self.jobs:
             job(self.physics.time)
         for robot in self.robots.values():
             robot.control(self.physics.time)
+        for person in self.people.values():
+            person.control(self.physics.time)
 
     def sense(self) -> None:
         """Note the watched bunch, and tell everybody who listens."""
@@ -165,20 +199,20 @@ class Client:
             sense(self)
 
     def send(self, now: float) -> None:
-        """Say where the robot is, and what it touches to those who are near."""
+        """Say where robots and people are, and what they touch to those who are near."""
         things = self.things
         things.look()
         moving, touching = things.moving, False
         mine = frozenset().union(*(exchange.mine for exchange in self.exchanges.values()))
-        for name, robot in self.robots.items():
-            exchange = self.exchanges[name]
+        for name, actor in (*self.robots.items(), *self.people.items()):
+            exchange, pose = self.exchanges[name], actor.update(now)
             parted = things.parted(name, all_others=name == self.name)
             touched = things.touched(name, exchange.mine)
             touching |= bool(touched)
             settled = exchange.send(
-                now, robot.update(now), touched=touched, moving=moving, read=things.read,
+                now, pose, touched=touched, moving=moving, read=things.read,
                 grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, changed=things.changed,
-                lies=self.physics.riding.lies,
+                lies=self.physics.riding.lies, pushed=actor.pushed(self.others) if isinstance(actor, Person) else None,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too
@@ -198,15 +232,17 @@ class Client:
     def _inbox(self, now: float) -> Inbox:
         """What all exchanges brought: of another actor, what is heard where it is nearest."""
         inboxes = {name: exchange.receive(now) for name, exchange in self.exchanges.items()}
+        for name in self.robots:
+            self._bear(name, inboxes[name].pushes)
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
-        here = {name: self.physics.rigid.base(name)[0][:2] for name in inboxes}
+        here = {name: self.physics.rigid.stands(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
         loose = {update.thing: update for update in inbox.things}
-        nearest: dict[str, tuple[float, RobotUpdate]] = {}
+        nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
         for name, heard in inboxes.items():
-            for other, update in heard.robots.items():
+            for other, update in (*heard.robots.items(), *heard.people.items()):
                 away = float(np.hypot(*(update.base_q[:2] - here[name])))
                 if other not in nearest or away < nearest[other][0]:
                     nearest[other] = away, update
@@ -214,15 +250,24 @@ class Client:
             loose.update((update.thing, update) for update in heard.things)
             if heard is not inbox:
                 inbox.facts += heard.facts
-        inbox.robots = {other: update for other, (_, update) in sorted(nearest.items())}
+        shown = [update for _, (_, update) in sorted(nearest.items())]
+        inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
+        inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
         inbox.trees = [trees[tree] for tree in sorted(trees)]
         inbox.things = [loose[number] for number in sorted(loose) if self._told_by_others(number)]
         return inbox
 
     def _told_by_others(self, thing: int) -> bool:
-        """Whether another client owns a thing: none of one's own robots does, and somebody is known to."""
+        """Whether another client owns a thing: nobody of one's own does, and somebody is known to."""
         owners = {exchange.owner(thing) for exchange in self.exchanges.values()} - {None}
-        return bool(owners) and not owners & self.robots.keys()
+        return bool(owners) and not owners & self.exchanges.keys()
+
+    def _bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
+        """Let a robot feel what other clients' people do to it."""
+        try:
+            self.physics.rigid.bear(name, pushes)
+        except RobotError as error:
+            log.debug("a push on nothing: %s", error)
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
@@ -261,8 +306,8 @@ class Faraway:
         """Judge one tick by where the others' copies stand."""
         sent = sum(exchange.counters.environment.bytes_out for exchange in client.exchanges.values())
         rigid = client.physics.rigid
-        here = [rigid.base(name)[0][:2] for name in client.robots]
-        there = [rigid.base(name)[0][:2] for name in client.others]
+        here = [rigid.stands(name)[:2] for name in client.exchanges]
+        there = [rigid.stands(name)[:2] for name in client.others]
         distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
         if distance > client.exchange.near + self.MARGIN:
             self.bytes += sent - self._seen

@@ -20,6 +20,7 @@ from vinesim.net.actors import ASK_PERIOD, FAR_PERIOD, PING_PERIOD, Mismatch
 from vinesim.net.bus import EVERY, Bus, Publisher, Subscription
 from vinesim.net.clock import WINDOW, Clock, Ping
 from vinesim.net.messages import Hello, MessageError
+from vinesim.net.poses import decode_pose
 from vinesim.net.recording import Recording, sender_of
 from vinesim.world.values import RobotUpdate
 
@@ -222,9 +223,9 @@ class Recorder:
         kind = -1
         try:
             kind = messages.kind_of(payload)
-            if kind == messages.ROBOT:
+            if family == "a":
                 name = rest.partition("/")[0]
-                self._place[name] = messages.decode_robot(payload, name).base_q[:3]
+                self._place[name] = decode_pose(payload, name).base_q[:3]
         except MessageError:
             self.malformed += 1
         if family == "a" and "poses" not in self._only:

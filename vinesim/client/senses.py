@@ -109,7 +109,7 @@ class Senses:
     def _every_tick(self, client: Client) -> None:
         self._listen()
         physics = client.physics
-        self._moved[physics.plants.awake] = True
+        self._moved[physics.plants.awake] = self._moved[physics.stirred] = True
         looks = self._figures["eyes"] and physics.tick % VIEW_TICKS == 0
         truth = self._figures.get("truth", False) and physics.tick % 10 == 0
         trees = bodies = body_q = link_q = poses = links = None
@@ -119,10 +119,10 @@ class Senses:
             bodies = physics.plants.bodies_of(trees)
             body_q = physics.state.body_q[bodies]
         if looks:
-            link_q = physics.rigid.link_q()
+            link_q = physics.link_q()
             poses = {name: self.robot.frame_pose(frame) for name, frame in self._sensors.items()}
-            if physics.rigid.links() is not self._links:
-                links = physics.rigid.links()
+            if physics.links() is not self._links:
+                links = physics.links()
         letter = Letter(
             number=self._letters + 1, tick=physics.tick, time=physics.time,
             sample=self.robot.sample(physics.time, physics.contacts),
@@ -155,7 +155,7 @@ class Senses:
     def _read(self, number: int, links_seen: bool) -> None:
         """A letter with a view was read: what moved until then, and rests since, needs no telling again."""
         if links_seen:
-            self._links = self.client.physics.rigid.links()
+            self._links = self.client.physics.links()
         told = [trees for n, trees in self._asked if n == number]
         self._asked = [(n, trees) for n, trees in self._asked if n > number]
         if told:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from vinesim.sensors import picture
 from vinesim.sensors.camera import Camera, CameraSpec
 from vinesim.sensors.eyes import load_kernels
 from vinesim.sensors.primitives import Primitives
-from vinesim.world.values import CameraFrame, CameraInfo, RobotUpdate
+from vinesim.world.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
 
 EYES = 1.6
 """Height of a standing person's eyes above the ground [m]."""
@@ -49,7 +50,10 @@ class Spectator(Client):
 
     picking = False  # it is told what parts
 
-    def _enter(self, description: Description | None, pose: np.ndarray, bus: Bus) -> None:
+    def _enter(
+        self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
+        height: float, bus: Bus,
+    ) -> None:  # fmt: skip
         self.pose = np.asarray(pose, float)
         hello = Hello(
             name=self.name, kind=ONLOOKER, scene=self.scene.name, digest=self.model.digest(),

@@ -21,6 +21,8 @@ from vinesim.world.values import Parting, ThingUpdate, TreeUpdate
 
 PULL = 0.2
 """Share of the way to where its owner says it is by which a copy moves in one tick."""
+EMBODY_TICKS, EMBODIED = 20, 4
+"""So many bunches get their bodies at once, and so many ticks pass between two times: making one costs milliseconds."""
 
 
 class Things:
@@ -31,6 +33,7 @@ class Things:
         self.physics, self._ours = physics, ours
         self._told: dict[int, ThingUpdate] = {}
         self._lies: dict[int, Fact] = {}
+        self._riders: dict[str, set[int]] = {}
         self._changed: set[int] = set()
         self._cut: dict[int, list[int]] = {}
         self._partings: tuple[Parting, ...] = ()
@@ -39,66 +42,93 @@ class Things:
 
     def receive(self, inbox: Inbox) -> None:
         """Do what others say is so, every tick before the step."""
-        for fact, holds in inbox.facts:
-            self._believe(fact, holds)
-        for number in inbox.released:
-            self._told.pop(number, None)
-        told = {update.thing: update for update in inbox.things}
         riding = self.physics.riding
+        self.physics.stirred = self.physics.stirred[:0]
+        self._believe(inbox.facts)
+        told = {update.thing: update for update in inbox.things}
         for number in self._told.keys() - told.keys():
             self._told.pop(number)
         for number, update in sorted(told.items()):
             first = number not in self._told
             self._told[number] = update
-            self._lies.pop(number, None)
+            self._rise(number)
             self._loosen(number, update.pose, update.velocity)
             riding.pull(number, update.pose, update.velocity, 1.0 if first else PULL)
             riding.unsettle(number)
         self._hold()
+        self._embody()
 
-    def _believe(self, fact: Fact, holds: bool) -> None:
-        """Take a fact over; where it says that a thing is counts only if that ``holds``."""
+    def _believe(self, facts: Iterable[tuple[Fact, bool]]) -> None:
+        """Take facts over, many at once for whoever comes late; where one says that a thing is counts if it holds."""
+        lie, trees = [], []
+        for fact, holds in facts:
+            if is_tree(fact.thing):
+                trees += self._cut_as(fact, holds)
+            elif self._lies_as(fact, holds):
+                lie.append(fact)
+        if trees:
+            self.physics.told_rest([update.tree for update in trees], [update.joint_q for update in trees])
+        if lie:
+            bunches = [unthing(fact.thing)[1] for fact in lie]
+            self._changed.update(self._tree_of(bunch) for bunch in bunches)
+            self.physics.lying.lay(bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie]))
+
+    def _lies_as(self, fact: Fact, holds: bool) -> bool:
+        """Let a box or a bunch be where a fact says; True if it is a bunch that has no body here and needs none yet."""
         number = fact.thing
-        if is_tree(number):
-            self._believe_tree(fact, holds)
-            return
-        pose = np.array(fact.pose)
-        there = self.physics.riding.where(fact.parent, pose) or (pose, np.zeros(6))
-        fresh = self._loosen(number, *there)
-        if not (holds or fresh):
-            return
+        kind, bunch = unthing(number)
+        bodiless = kind == Kind.BUNCH and number not in self.physics.riding
+        if not (holds or (bodiless and bunch not in self.physics.lying)):
+            return False
         self._told.pop(number, None)
         if fact.moving:
-            self._lies.pop(number, None)
+            self._rise(number)
+            pose = np.array(fact.pose)
+            self._loosen(number, *(self.physics.riding.where(fact.parent, pose) or (pose, np.zeros(6))))
             self.physics.riding.unsettle(number)
-        else:
-            self._lies[number] = fact
+            return False
+        self._lie(number, fact)
+        if not bodiless:
             self._put(number)
+        return bodiless
 
-    def _believe_tree(self, fact: Fact, holds: bool) -> None:
+    def _cut_as(self, fact: Fact, holds: bool) -> list[TreeUpdate]:
+        """Cut of a tree what a fact says; the state in which it rests, if the fact says that and ``holds``."""
         for body in fact.cut:
             if self.physics.model.body_tree[body] == fact.thing and not self.physics.state.body_cut[body]:
                 self.cut(body)
         if not (holds and fact.trees):
-            return
+            return []
         self._changed.add(fact.thing)
         (update,) = messages.decode_trees(fact.trees, self.physics.model.tree_size).updates(fact.author)
-        self.physics.sleep.wake(np.array([fact.thing]))
         self.pull_tree(update, 1.0)
+        return [] if fact.moving else [update]
+
+    def _embody(self) -> None:
+        """Give bunches that lie near an actor their bodies, a few now and then."""
+        lying = self.physics.lying
+        if len(lying) and self.physics.tick % EMBODY_TICKS == 0:
+            rigid = self.physics.rigid
+            actors = [rigid.base(name)[0][:3] for name in rigid.robots]
+            actors += [rigid.person(name).parts[0, :3] for name in rigid.people]
+            bunches = lying.nearest(np.array(actors), EMBODIED)
+            lying.embody(bunches)
+            for bunch in bunches:
+                self._put(thing(Kind.BUNCH, bunch))
 
     def cut(self, body: int) -> None:
         """Cut a body off because others have."""
         self.physics.told_cut(body)
         self._note_cut(body)
 
-    def _loosen(self, number: int, pose: np.ndarray, velocity: np.ndarray) -> bool:
-        """Of a bunch that hangs here still and nowhere else: take it off; whether that was so."""
+    def _loosen(self, number: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Of a bunch that hangs here still, or has no body: take it off, give it one."""
         kind, bunch = unthing(number)
-        if kind != Kind.BUNCH or not self.physics.state.bunch_attached[bunch]:
-            return False
-        self.physics.told_pick(bunch, pose, velocity)
-        self._changed.add(self._tree_of(bunch))
-        return True
+        if kind == Kind.BUNCH and bunch in self.physics.lying:
+            self.physics.lying.embody([bunch])
+        elif kind == Kind.BUNCH and self.physics.state.bunch_attached[bunch]:
+            self.physics.told_pick(bunch, pose, velocity)
+            self._changed.add(self._tree_of(bunch))
 
     def _hold(self) -> None:
         """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
@@ -106,9 +136,25 @@ class Things:
         pushed = moving & self._lies.keys()
         if pushed:
             pushed -= {number for number, actor in self.physics.riding.touched if actor in self._ours}
-        for number, fact in self._lies.items():
-            if number in pushed or self._moved_by_others(fact.parent):
+        for parent, riders in self._riders.items():
+            if self._moved_by_others(parent):
+                pushed |= riders
+        for number in sorted(pushed):
+            if number in self.physics.riding:
                 self._put(number)
+
+    def _lie(self, number: int, fact: Fact) -> None:
+        """From now on a thing lies where a fact says."""
+        self._rise(number)
+        self._lies[number] = fact
+        if fact.parent != GROUND:
+            self._riders.setdefault(fact.parent, set()).add(number)
+
+    def _rise(self, number: int) -> None:
+        """A thing does not lie any more."""
+        fact = self._lies.pop(number, None)
+        if fact is not None and fact.parent != GROUND:
+            self._riders[fact.parent].discard(number)
 
     def _moved_by_others(self, parent: str) -> bool:
         """Whether a parent goes where somebody else says."""
@@ -120,7 +166,7 @@ class Things:
         return box in self._told or (box in self._lies and self._moved_by_others(self._lies[box].parent))
 
     def _put(self, number: int) -> None:
-        """Put a thing where it lies."""
+        """Put a thing that has a body where it lies."""
         parent, relative = self._lies[number].parent, np.array(self._lies[number].pose)
         there = self.physics.riding.where(parent, relative)
         if there is not None:
@@ -168,7 +214,7 @@ class Things:
             if actor == name or (other is not None and other in mine):
                 found.append(number)
         for number in found:
-            self._lies.pop(number, None)
+            self._rise(number)
         return found
 
     def _box_of(self, number: int) -> str:
@@ -204,7 +250,7 @@ class Things:
     def rested(self, fact: Fact | None) -> None:
         """We have said that a thing of ours lies still: from now on it does, as for everybody else."""
         if fact is not None and not fact.moving and not is_tree(fact.thing):
-            self._lies[fact.thing] = fact
+            self._lie(fact.thing, fact)
             self.physics.riding.settle(fact.thing, fact.parent, np.array(fact.pose))
 
     # ------------------------------------------------------------------ inside

@@ -12,12 +12,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim.net import interest, messages, smooth
-from vinesim.net.bus import NEWEST, Answer, Bus, Publisher, Subscription
+from vinesim.net import interest, messages
+from vinesim.net.bus import NEWEST, Answer, Bus, Publisher
 from vinesim.net.clock import WINDOW, Clock, Ping
 from vinesim.net.counters import Counters
 from vinesim.net.messages import Hello, MessageError
-from vinesim.world.values import RobotUpdate
+from vinesim.net.motion import Actor
+from vinesim.net.poses import encode_pose
+from vinesim.world.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
 
@@ -40,61 +42,6 @@ class Mismatch(RuntimeError):
     """Actors that cannot share a world: their vineyards or their protocols differ."""
 
     exit_code = 4
-
-
-class Actor:
-    """Another actor and the last that is known of its pose."""
-
-    def __init__(self, hello: Hello) -> None:
-        self.hello = hello
-        self.joints = hello.joints
-        self.update: RobotUpdate | None = None
-        self.near: Subscription | None = None
-        self.moved_at = _LONG_AGO
-        self._state = np.zeros(0)
-        self._rate = np.zeros(0)
-        self._off = np.zeros(0)
-
-    def hear(self, update: RobotUpdate, time: float) -> bool:
-        """Take a newer pose at network ``time``; False if it is not newer."""
-        if update.time > time + smooth.FUTURE:
-            update = dataclasses.replace(update, time=time + smooth.FUTURE)
-        if self.update is not None and update.time <= self.update.time:
-            return False
-        if self.joints < 0:
-            self.joints = len(update.position)
-        if len(update.position) != self.joints:
-            raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
-        shown = None if self.update is None else self._shown(time)
-        q = update.base_q[3:]
-        self.update = update
-        self._state = np.concatenate([update.base_q, update.position])
-        self._rate = np.concatenate([update.base_qd[:3], smooth.spin(q, update.base_qd[3:]), update.velocity])
-        if shown is not None:
-            if shown[3:7] @ q < 0.0:
-                shown[3:7] *= -1.0
-            self._off = np.zeros(0)
-            self._off = shown - self._shown(time)
-            self.moved_at = time
-        return True
-
-    def at(self, time: float, now: float) -> RobotUpdate:
-        """The pose at network ``time``, to be shown ``now``."""
-        heard = self.update
-        assert heard is not None
-        shown = self._shown(time)
-        going = 1.0 if time - heard.time <= smooth.EXTRAPOLATION else 0.0
-        shown[3:7] /= np.sqrt(shown[3:7] @ shown[3:7])
-        return RobotUpdate(
-            heard.actor, now, shown[:7], heard.base_qd * going, shown[7:], heard.velocity * going
-        )  # fmt: skip
-
-    def _shown(self, time: float) -> np.ndarray:
-        assert self.update is not None
-        shown = self._state + self._rate * smooth.horizon(time - self.update.time)
-        if len(self._off):
-            shown += self._off * smooth.remaining(time - self.moved_at)
-        return shown
 
 
 class Actors:
@@ -215,7 +162,7 @@ class Actors:
                 actor.near.close()
                 actor.near = None
 
-    def say(self, robot: RobotUpdate, now: float, time: float) -> None:
+    def say(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
         """My pose: 60 Hz to those who are near, 5 Hz to everybody; encoded once, and only if somebody listens."""
         payload = b""
         for publisher, period in ((self._pose, ACTOR_PERIOD), (self._far_pose, FAR_PERIOD)):
@@ -224,6 +171,6 @@ class Actors:
                 continue
             self._pose_due[publisher] = max(due, now - period) + period
             if publisher.matching:
-                payload = payload or messages.encode_robot(dataclasses.replace(robot, actor=self.me.name, time=time))
+                payload = payload or encode_pose(dataclasses.replace(robot, actor=self.me.name, time=time))
                 if publisher.put(payload):
                     self.counters.actor.said(payload)

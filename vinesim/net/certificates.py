@@ -93,6 +93,14 @@ def roles(folder: pathlib.Path) -> dict[str, Role]:
             ) from error
         if name != file.stem:
             raise NoCertificate(f"{file}: is the certificate of {name!r}: rename it to {name}.pem")
+        if role == Role.SERVER:
+            now = datetime.datetime.now(datetime.UTC)
+            first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+            if not first <= now <= last:
+                raise NoCertificate(
+                    f"{file}: not valid now, but from {first:%Y-%m-%d} to {last:%Y-%m-%d}: make it anew with "
+                    f"'vinesim certs new {name} --dir {folder} --host HOST'"
+                )
         found[name] = role
     return found
 
@@ -159,7 +167,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(hours=1))  # clocks of machines differ
+        .not_valid_before(now - datetime.timedelta(days=2))  # clocks of machines differ
         .not_valid_after(now + datetime.timedelta(days=days))
     )
 

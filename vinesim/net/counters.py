@@ -37,6 +37,8 @@ class Counters:
     """Claims, corrections and rest."""
     fact: Traffic = dataclasses.field(default_factory=Traffic)
     """What was picked or cut and where things lie: these leave even if nobody is near, for the server keeps them."""
+    force: Traffic = dataclasses.field(default_factory=Traffic)
+    """What hands do to robots of other clients."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
     """Greetings, clock and what the server keeps (received only)."""
     malformed: int = 0

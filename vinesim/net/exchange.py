@@ -23,14 +23,16 @@ from vinesim.net.actors import Actors, Mismatch
 from vinesim.net.authority import NOBODY, Claim
 from vinesim.net.bus import EVERY, RECENT, Answer, Bus, Publisher, Subscription
 from vinesim.net.counters import Counters, Traffic
+from vinesim.net.forces import Forces
 from vinesim.net.interest import Cell
 from vinesim.net.messages import Fact, Hello, MessageError, Things, Trees
 from vinesim.net.ownership import Ownership
+from vinesim.net.poses import decode_pose
 from vinesim.net.streams import NO_ROOTS, Read, Roots, Said, ThingStream, TreeStream, counts, with_roots
 from vinesim.net.telling import Telling
 from vinesim.world.ids import is_tree
 from vinesim.world.model import Model
-from vinesim.world.values import RobotUpdate, ThingUpdate, TreeUpdate
+from vinesim.world.values import HumanUpdate, RobotUpdate, ThingUpdate, TreeUpdate
 
 __all__ = ["Counters", "Exchange", "Inbox", "Mismatch", "Traffic"]
 
@@ -50,7 +52,11 @@ class Inbox:
     joined: list[Hello] = dataclasses.field(default_factory=list)
     left: list[str] = dataclasses.field(default_factory=list)
     robots: dict[str, RobotUpdate] = dataclasses.field(default_factory=dict)
-    """Every other actor whose pose is known, every tick: extrapolated at most 150 ms, corrections blended in 100 ms."""
+    """Every other robot whose pose is known, every tick: extrapolated at most 150 ms, corrections blended in 100 ms."""
+    people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
+    """The same of people."""
+    pushes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """With what wrench [6] others push each of my links now: see :class:`vinesim.net.poses.Push`."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
     """Trees of which their owner sent news: the last record of each, extrapolated at most 150 ms."""
     things: list[ThingUpdate] = dataclasses.field(default_factory=list)
@@ -77,6 +83,7 @@ class Exchange:
         self.near = interest.checked(near)
         self.counters = Counters()
         self._actors = Actors(bus, me, self.counters)
+        self._forces = Forces(bus, me.name)
         self._own = Ownership(me.name, self._actors.known)
         self._telling = Telling(bus, self.counters)
         self._trees = TreeStream(model)
@@ -144,6 +151,7 @@ class Exchange:
         inbox.left = actors.roster(now)
         for name in inbox.left:
             self._own.leave(name, time, self._heir)
+            self._forces.forget(name)
         inbox.joined, answers = actors.answers(now)
         for answer in answers:
             self._take_snapshot(answer, time, inbox)
@@ -156,7 +164,10 @@ class Exchange:
             self._things.forget(thing)
         inbox.trees = self._trees.extrapolated(news, now, time)
         inbox.things = self._things.extrapolated(self._own.theirs, now, time)
-        inbox.robots = {n: a.at(time, now) for n, a in actors.known.items() if a.update is not None}
+        shown = [actor.at(time, now) for actor in actors.known.values() if actor.update is not None]
+        inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
+        inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
+        inbox.pushes = self._forces.on_me(now)
         for thing in self._own.corrections(time):
             if self.me.kind != ONLOOKER:
                 self._correct(thing)
@@ -168,8 +179,10 @@ class Exchange:
         parts = rest.split("/")
         sender = parts[0] if family == "a" else parts[-1]
         counters = self.counters
-        traffic = {"a": counters.actor, "c": counters.environment, "fact": counters.fact}.get(family, counters.event)
-        traffic.heard(payload)
+        families = {
+            "a": counters.actor, "c": counters.environment, "fact": counters.fact, "force": counters.force
+        }  # fmt: skip
+        families.get(family, counters.event).heard(payload)
         actor = self._actors.known.get(sender)
         if actor is None and (family != "fact" or sender not in self.kin):
             counters.dropped += sender not in self.kin
@@ -177,7 +190,10 @@ class Exchange:
         try:
             if family == "a":
                 assert actor is not None
-                counters.dropped += not actor.hear(messages.decode_robot(payload, sender), time)
+                counters.dropped += not actor.hear(decode_pose(payload, sender), time)
+                return
+            if family == "force":
+                counters.dropped += not self._forces.hear(payload, sender, time - self.offset)
                 return
             cell = int(parts[0]), int(parts[1])
             kind = messages.kind_of(payload)
@@ -226,7 +242,7 @@ class Exchange:
         if not self._telling.hear(cell, fact):
             return
         claim = Claim(fact.ownership, fact.authority, fact.author if fact.moving else NOBODY)
-        holds = self._own.hear_fact(fact.thing, claim, time)
+        holds = self._own.hear_fact(fact.thing, claim, fact.moving, time)
         if told:
             inbox.facts.append((self._telling.facts.of(fact.thing) or fact, holds))
 
@@ -283,7 +299,7 @@ class Exchange:
     def send(
         self,
         now: float,
-        robot: RobotUpdate,
+        robot: RobotUpdate | HumanUpdate,
         *,
         touched: Iterable[int] = (),
         moving: Iterable[int] = (),
@@ -293,6 +309,7 @@ class Exchange:
         cut: Callable[[int], Roots] = lambda _: NO_ROOTS,
         lies: Callable[[int], tuple[str, np.ndarray]] | None = None,
         changed: Callable[[int], bool] = lambda _: False,
+        pushed: dict[str, dict[str, np.ndarray]] | None = None,
     ) -> list[TreeUpdate]:
         """Say what must be said this tick; returns the rest records that left, exactly as all copies hold them.
 
@@ -303,11 +320,14 @@ class Exchange:
         good. ``read(thing)`` gives joints ([n, 4], [n, 3] rad/s) of a tree, and is called only for trees that somebody
         near may have to hear of, or pose [7] and velocity [6] of any other thing. ``cut(tree)`` tells what was cut off
         a tree, ``lies(thing)`` parent and pose [7] in its frame, and whether a tree was ``changed`` for good by picks
-        or cuts: then the shape in which it comes to rest is a fact.
+        or cuts: then the shape in which it comes to rest is a fact. ``pushed``: what my hands did to others' robots in
+        this tick, by robot and link, as wrenches [6].
         """
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         self._position = np.asarray(robot.base_q[:3], float)
         self._actors.say(robot, now, time)
+        for payload in self._forces.say(pushed or {}, now, time):
+            self.counters.force.said(payload)
         touched, moving = {int(thing) for thing in touched}, {int(thing) for thing in moving}
         for thing in sorted({int(thing) for thing in grabbed}):
             self._own.grab(thing)

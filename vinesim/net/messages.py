@@ -29,10 +29,10 @@ PROTOCOL = 1
 """Version of everything in this file. Others are refused."""
 
 MAGIC = b"VS"
-ROBOT, TREES, CLAIMS, FACTS, THINGS, HELLO, TIME, WELCOME = 1, 2, 3, 4, 5, 16, 17, 18
+ROBOT, TREES, CLAIMS, FACTS, THINGS, HUMAN, FORCE, HELLO, TIME, WELCOME = 1, 2, 3, 4, 5, 6, 7, 16, 17, 18
 """Kinds of message."""
 
-TIMED = frozenset((ROBOT, TREES, THINGS))
+TIMED = frozenset((ROBOT, TREES, THINGS, HUMAN, FORCE))
 """Kinds that say in their header at which network time they were true."""
 
 SAMPLE = 1100
@@ -124,6 +124,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many joints its updates carry; -1 leaves it open until the first one."""
     seed: int = -1
     """Seed of its vineyard, for whoever wants to grow the same; -1 keeps it to itself."""
+    height: float = 1.75
+    """Of a human [m]."""
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -313,6 +315,10 @@ def _open(payload: bytes, kind: int, name: str) -> tuple[int, float]:
     if not math.isfinite(time):
         raise MessageError(f"{name} with time {time}")
     return count, time
+
+
+HEAD, head, opened = _HEAD.size, _head, _open
+"""The same for messages that are written elsewhere: size of a header, how it is written and read."""
 
 
 def _pack(kind: int, value: Any) -> bytes:

@@ -150,12 +150,12 @@ class Ownership:
         elif claim.owner == sender:
             self._lost.append((thing, claim))
 
-    def hear_fact(self, thing: int, claim: Claim, time: float) -> bool:
+    def hear_fact(self, thing: int, claim: Claim, touching: bool, time: float) -> bool:
         """A claim that comes with a fact; whether where it says the thing is holds now."""
         known = self._known[thing]
         if claim != known.claim and not authority.wins(claim, known.claim):
             return False
-        self._adopt(thing, claim, False)
+        self._adopt(thing, claim, touching)
         known.heard_at = time
         return True
 

@@ -29,7 +29,9 @@ from mcap.writer import Writer
 from vinesim import __version__
 from vinesim.net import messages
 from vinesim.net.messages import MessageError
+from vinesim.net.poses import decode_pose, decode_push
 from vinesim.world.ids import Kind, unthing
+from vinesim.world.values import POINTS, HumanUpdate
 
 FLUSH = 0.5
 """What was recorded is in the hands of the operating system after this time [s], and on the disk: a recorder that is
@@ -80,11 +82,11 @@ def _named(thing: int) -> dict[str, Any]:
 
 
 def _say_pose(payload: bytes, key: str) -> dict[str, Any]:
-    update = messages.decode_robot(payload, sender_of(key))
-    return {
-        "timestamp": _stamp(update.time),
-        "frame_id": "map",
-        "pose": _pose(update.base_q),
+    update = decode_pose(payload, sender_of(key))
+    here = {"timestamp": _stamp(update.time), "frame_id": "map", "pose": _pose(update.base_q)}
+    if isinstance(update, HumanUpdate):
+        return here | {"points": {name: _pose(at) for name, at in zip(POINTS, update.pose.points, strict=True)}}
+    return here | {
         "velocity": update.base_qd.tolist(),
         "joint_position": update.position.tolist(),
         "joint_velocity": update.velocity.tolist(),
@@ -148,6 +150,14 @@ def _say_facts(payload: bytes, _: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _say_push(payload: bytes, _: str) -> dict[str, Any]:
+    push = decode_push(payload)
+    return {
+        "timestamp": _stamp(push.time),
+        "links": [{"link": link, "wrench": wrench.tolist()} for link, wrench in sorted(push.wrenches.items())],
+    }
+
+
 def _say_hello(payload: bytes, _: str) -> dict[str, Any]:
     return msgspec.to_builtins(messages.decode_hello(payload))
 
@@ -158,6 +168,8 @@ _SAYS: dict[int, Callable[[bytes, str], dict[str, Any]]] = {
     messages.CLAIMS: _say_claims,
     messages.FACTS: _say_facts,
     messages.THINGS: _say_things,
+    messages.HUMAN: _say_pose,
+    messages.FORCE: _say_push,
     messages.HELLO: _say_hello,
 }
 
@@ -205,6 +217,12 @@ _COMMON = {
 _POSE = _object("pose", "in the world, of a fact in its parent's frame", position=_XYZ, orientation=_XYZW)
 _TREES = _list(_object("tree", "one record", tree=_COUNT, bodies=_COUNT, touched=_YES, resting=_YES, **_CLAIM))
 _THINGS = _list(_object("thing", "a box or a loose bunch", touched=_YES, pose=_POSE, velocity=_list(_NUMBER), **_THING))
+_LINKS = _list(
+    _object(
+        "link", "one that is pushed", link=_TEXT,
+        wrench={**_list(_NUMBER), "description": "force [N], moment about its centre of mass [N m], world axes"},
+    )
+)  # fmt: skip
 _CLAIMS = _list(_object("claim", "who says to own a thing", owner=_TEXT, touched=_YES, **_THING))
 _FACTS = _list(
     _object(
@@ -220,7 +238,8 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             pose=_POSE,
             velocity={**_list(_NUMBER), "description": "of its base: m/s, rad/s, world axes"},
             joint_position={**_list(_NUMBER), "description": "rad or m"},
-            joint_velocity={**_list(_NUMBER), "description": "rad/s or m/s"}, **_COMMON,
+            joint_velocity={**_list(_NUMBER), "description": "rad/s or m/s"},
+            points=_object("points", "of a person", **dict.fromkeys(POINTS, _POSE)), **_COMMON,
         ),
     ),
     "c": (
@@ -235,13 +254,18 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             "vinesim.Event", "A claim, or what came to rest.", timestamp=_TIME, trees=_TREES, claims=_CLAIMS, **_COMMON
         ),
     ),
+    "force": (
+        "vinesim.Push",
+        _object("vinesim.Push", "What an actor does to a robot.", timestamp=_TIME, links=_LINKS, **_COMMON),
+    ),
     "fact": ("vinesim.Facts", _object("vinesim.Facts", "What stays true.", facts=_FACTS, **_COMMON)),
     "snap": ("vinesim.Facts", _object("vinesim.Facts", "What was true before.", facts=_FACTS, **_COMMON)),
     "hello": (
         "vinesim.Greeting",
         _object(
             "vinesim.Greeting", "How an actor introduced itself.", name=_TEXT, kind=_TEXT, robot=_TEXT, urdf=_TEXT,
-            scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT, **_COMMON,
+            scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT, height=_NUMBER,
+            **_COMMON,
         ),
     ),
     "live": ("vinesim.Live", _object("vinesim.Live", "An actor came or went.", live=_YES, **_COMMON)),

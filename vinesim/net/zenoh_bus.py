@@ -43,6 +43,9 @@ CONNECT = "tcp/127.0.0.1:7447"
 LEASE = 2000
 """A peer that is silent for this long is gone [ms]."""
 
+HUGE = 4 * messages.LARGEST
+"""What is larger [B] is not even put together from its fragments, here or in the router."""
+
 PATIENCE = 2.0
 """How long connecting may take [s]."""
 
@@ -72,6 +75,7 @@ def config(mode: str, **settings: Any) -> zenoh.Config:
         "scouting__gossip__enabled": False,
         "scouting__delay": 0,
         "transport__link__tx__lease": LEASE,
+        "transport__link__rx__max_message_size": HUGE,
         "transport__shared_memory__enabled": False,
         "transport__unicast__open_timeout": 1500,
         "transport__unicast__accept_timeout": 1500,
@@ -202,6 +206,8 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._gone: set[str] = set()
         """Endpoints that do not answer now."""
+        self._kept = True
+        """The server that keeps this world is there, or never was."""
         self._refusal = ""
         self._session = self._poses = _opened(way.bulk, self._credentials)
         try:
@@ -303,10 +309,14 @@ class ZenohBus:
     def trouble(self) -> str:
         if self._refusal:
             return self._refusal
-        gone = sorted(self._gone)
-        if not gone:
-            return ""
-        return f"the server at {gone[0]} is gone; the local simulation goes on and reconnects by itself"
+        for endpoint in sorted(self._gone):
+            return f"the server at {endpoint} is gone; the local simulation goes on and reconnects by itself"
+        if not self._kept:
+            return (
+                f"behind {self.endpoint} the server that keeps world {self.world!r} is gone; what is said for good is "
+                "said again when it is back"
+            )
+        return ""
 
     def join(self, greeting: bytes) -> None:
         key = f"{self._prefix}join/{self.name}/{self._session.zid()}"
@@ -338,10 +348,12 @@ class ZenohBus:
             if refused:
                 log.error("%s: the server that came back lets this actor in no more: %s", self.name, self._refusal)
 
-        self._declared += [
-            doorkeeper,
-            doorkeeper.declare_matching_listener(lambda status: status.matching and self.outside(ask_again)),
-        ]
+        def notice(status: zenoh.MatchingStatus) -> None:
+            self._kept = status.matching
+            if status.matching:
+                self.outside(ask_again)
+
+        self._declared += [doorkeeper, doorkeeper.declare_matching_listener(notice)]
         if not welcomes and doorkeeper.matching_status.matching:
             self.outside(ask_again)
 

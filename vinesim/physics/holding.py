@@ -117,8 +117,8 @@ class Holding:
     # ------------------------------------------------------------------ inside
 
     def _hands(self) -> list[tuple[Person, Hand]]:
-        people = [self.rigid.person(name) for name in self.rigid.people]
-        return [(person, hand) for person in people for hand in person.hands]
+        people = (self.rigid.person(name) for name in self.rigid.people)
+        return [(person, hand) for person in people if not person.copy for hand in person.hands]
 
     def _close(self, person: Person, hand: Hand) -> None:
         """Take what is nearest to the hand, if anything is near enough."""
@@ -126,8 +126,6 @@ class Holding:
         palm = self.rigid.hand(*key).pose
         rigid = self.rigid.near_hand(*key, GRASP)
         plant = self.touching.nearest(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
-        if person.spec.name in self.touching.copies and plant is not None:
-            plant = None  # what it does to plants is its own client's to compute
         if plant is not None and (rigid is None or plant[0] - THICK < rigid[0]):
             body = plant[1]
             self.plants.wake(self.plants.model.body_tree[body])

@@ -41,7 +41,7 @@ OF_GEOM = (
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Loose:
     """A bunch that hangs on no vine: its weight and its round shapes, in the frame that it had as a plant's body."""
 
@@ -94,6 +94,7 @@ def _place_of(slot: int) -> np.ndarray:
     return np.array([float(slot), 0.0, PARKED, 1.0, 0.0, 0.0, 0.0])
 
 
+@functools.lru_cache(maxsize=256)  # every compilation asks anew
 def alone(loose: Loose) -> mujoco.MjModel:
     """A bunch in a world of its own."""
     spec = mujoco.MjSpec()

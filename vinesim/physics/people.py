@@ -22,11 +22,10 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels import people as kernels
 from vinesim.kernels.launch import bind
-from vinesim.world.values import HandSample, HumanPose, HumanSpec, Shape
+from vinesim.physics.yard import ALL, GROUND, GUEST, ROUGH
+from vinesim.world.values import POINTS, HandSample, HumanPose, HumanSpec, Shape
 
 SIDES = ("left", "right")
-TRACKED = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
-"""Poses of a :class:`HumanPose`."""
 MASS = 0.4
 """[kg] A hand (0.6 % of a person's mass: Winter, Biomechanics and Motor Control, 2009)."""
 INERTIA = 0.02
@@ -144,7 +143,7 @@ class _Motion:
     """Kernels about one person, bound to their arrays."""
 
     def __init__(self, height: float) -> None:
-        points, poses = len(TRACKED) - 3, len(PARTS) + 2 * len(SIDES)
+        points, poses = len(POINTS) - 3, len(PARTS) + 2 * len(SIDES)
         self._tracked, self._parts = np.zeros((points, 7)), np.zeros((len(PARTS), 7))
         self._start, self._goal = np.zeros((poses, 7)), np.zeros((poses, 7))
         self._apart = np.zeros((3, poses, 3))
@@ -187,6 +186,8 @@ class Hand:
 
     side: str
     closed: bool = False
+    busy: bool = False
+    """Of a copy: it touches nothing, for at home it pushes a robot or holds something."""
     free: int = LINGER
     """[tick] since the last touch."""
     force: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
@@ -210,12 +211,13 @@ class Hand:
 class Person:
     """One person in MuJoCo's world: two hands that are free bodies, and a kinematic body."""
 
-    def __init__(self, spec: HumanSpec, bit: int) -> None:
+    def __init__(self, spec: HumanSpec, bit: int, *, copy: bool = False) -> None:
+        """``copy``: another client moves the person, and says what the hands hold and how they push robots."""
         for name in ("height", "stiffness", "force"):
             value = getattr(spec, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise HumanError(f"human {spec.name!r}: {name} is {value}; give a number above 0")
-        self.spec, self.bit = spec, bit
+        self.spec, self.bit, self.copy = spec, bit, copy
         self.damping = 2.0 * math.sqrt(spec.stiffness * MASS)
         """[N s/m] of the hand against its controller: an empty hand comes back without swinging over."""
         self.hands = tuple(Hand(side) for side in SIDES)
@@ -225,7 +227,8 @@ class Person:
         self.part_dofs = np.zeros((0, 6), int)
         """MuJoCo's degrees of freedom of the same."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
-        self._meets = 0
+        self._hand_bits = 0, 0
+        """What the hands are, and what they meet."""
         self._motion = _Motion(spec.height)
         self.move(spec.pose)
         self._before = self._now
@@ -241,18 +244,19 @@ class Person:
 
     def move(self, pose: HumanPose) -> None:
         """Take over where the tracked points are: the body is there at once, the hands try to be."""
-        points = [getattr(pose, name) for name in TRACKED]
+        points = [getattr(pose, name) for name in POINTS]
         square = np.array([np.nan if np.shape(at) != (7,) else 0.0 * at[:3].sum() + at[3:] @ at[3:] for at in points])
         if not (abs(square - 1.0) < 1e-3).all():
             worst = int(np.argmin(abs(square - 1.0) < 1e-3))
             raise HumanError(
-                f"human {self.spec.name!r}: {TRACKED[worst]} is {points[worst]}; give seven finite numbers, position "
+                f"human {self.spec.name!r}: {POINTS[worst]} is {points[worst]}; give seven finite numbers, position "
                 "and unit quaternion (x, y, z, w)"
             )
         self._now = np.concatenate([self._motion.posture(pose), [pose.left, pose.right]])
         """Poses of :data:`PARTS`, then of both controllers."""
         for hand in self.hands:
-            hand.closed = bool(getattr(pose, f"{hand.side}_closed"))
+            hand.closed = bool(getattr(pose, f"{hand.side}_closed")) and not self.copy
+            hand.busy = bool(getattr(pose, f"{hand.side}_busy")) and self.copy
 
     def speed(self, hand: Hand, dt: float) -> np.ndarray:
         """Velocity [3] of a controller in this tick, m/s."""
@@ -267,16 +271,18 @@ class Person:
 
     # ------------------------------------------------------------------ in MuJoCo
 
-    def attach(self, spec: mujoco.MjSpec, meets: int, ground: int, friction: list[float]) -> None:
-        """Add the person's bodies: they meet whatever has a bit in ``meets``, of which ``ground`` only hands do."""
-        name, self._meets = self.spec.name, meets
+    def attach(self, spec: mujoco.MjSpec, robots: int) -> None:
+        """Add the person's bodies; ``robots``: the bits of all robots."""
+        name, me = self.spec.name, 1 << self.bit
+        meets = ALL & ~me & ~GUEST if self.copy else ALL & ~me
+        self._hand_bits = (GUEST, meets & ~robots) if self.copy else (me, meets)
         for part, shape, pose in zip(PARTS, figure(self.spec.height), self.parts, strict=True):
             body = spec.worldbody.add_body(
                 name=f"{name}/{part}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=HEAVY, ipos=np.zeros(3),
                 inertia=[HEAVY] * 3, explicitinertial=True, gravcomp=1.0, sleep=mujoco.mjtSleepPolicy.mjSLEEP_NEVER,
             )  # fmt: skip
             body.add_freejoint(name=f"{name}/{part}")
-            _add(body, shape, 1 << self.bit, meets & ~ground, friction)
+            _add(body, shape, (me, meets & ~GROUND))
         for hand in self.hands:
             at = self.controller(hand)
             body = spec.worldbody.add_body(
@@ -286,7 +292,7 @@ class Person:
             )  # fmt: skip
             body.add_freejoint(name=f"{name}/{hand.link}")
             for shape in hand_shapes(hand.side):
-                _add(body, shape, 1 << self.bit, meets, friction)
+                _add(body, shape, self._hand_bits)
             spec.add_equality(
                 name=f"{name}/{hand.link}", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
                 name1=f"{name}/{hand.link}", active=False, solref=[0.02, 1.0], solimp=[0.99, 0.999, 0.001, 0.5, 2.0],
@@ -307,6 +313,7 @@ class Person:
             hand.q = slice(joint.qposadr[0], joint.qposadr[0] + 7)
             hand.v = slice(joint.dofadr[0], joint.dofadr[0] + 6)
         self._hand_q = np.stack([np.arange(hand.q.start, hand.q.stop) for hand in self.hands])
+        self.excuse(m)
 
     def drive(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
         """Before a tick: the body where it is told to be, each hand free at its controller or on its spring."""
@@ -353,14 +360,14 @@ class Person:
     def _look(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand, at: np.ndarray, step: np.ndarray) -> np.ndarray:
         """A step [3] m of a fast free hand, shortened if something is in its way."""
         length = float(np.linalg.norm(step))
-        if length < THICK:
+        if length < THICK or hand.busy:
             return step
         way, gone, geom = step / length, 0.0, np.zeros(1, np.int32)
         while gone < length + THICK:
             ahead = mujoco.mj_ray(m, d, at + gone * way, way, None, 1, hand.body, geom)
             if ahead < 0.0 or gone + ahead > length + THICK:
                 return step
-            if m.geom_contype[geom[0]] & ~(1 << self.bit):  # neither one's own body nor what is only to be seen
+            if m.geom_contype[geom[0]] & self._hand_bits[1]:  # neither one's own body nor what is only to be seen
                 return way * max(gone + ahead - 0.8 * THICK, 0.0)
             gone += ahead + 1e-3
         return step
@@ -409,18 +416,24 @@ class Person:
         d.eq_active[hand.weld] = 0
         self._touchable(m, hand, yes=True)
 
+    def excuse(self, m: mujoco.MjModel) -> None:
+        """Let nothing touch the hands that are busy elsewhere."""
+        for hand in self.hands:
+            if hand.holds is None:
+                self._touchable(m, hand, yes=not hand.busy)
+
     def _touchable(self, m: mujoco.MjModel, hand: Hand, *, yes: bool) -> None:
         geoms = slice(m.body_geomadr[hand.body], m.body_geomadr[hand.body] + m.body_geomnum[hand.body])
-        bit, meets = (1 << self.bit, self._meets) if yes else (0, 0)
+        bit, meets = self._hand_bits if yes else (0, 0)
         m.geom_contype[geoms] = m.body_contype[hand.body] = bit
         m.geom_conaffinity[geoms] = m.body_conaffinity[hand.body] = meets
 
 
-def _add(body: mujoco.MjsBody, shape: Shape, contype: int, conaffinity: int, friction: list[float]) -> None:
+def _add(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int]) -> None:
     size = [*shape.size, 0.0, 0.0][:3]
     body.add_geom(
         type=_KINDS[shape.kind], size=size, pos=shape.pose[:3], quat=frames.to_wxyz(shape.pose[3:]), mass=0.0,
-        contype=contype, conaffinity=conaffinity, friction=friction, priority=1,
+        contype=bits[0], conaffinity=bits[1], friction=ROUGH, priority=1,
         solimp=[0.99, 0.999, 0.001, 0.5, 2.0],
     )  # fmt: skip
 

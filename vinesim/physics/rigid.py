@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics import geoms, loose, renewal, yard
+from vinesim.physics import geoms, loose, renewal, wrenches, yard
 from vinesim.physics.loose import Loose
 from vinesim.physics.metric import Metric
 from vinesim.physics.people import HAND, PARTS, Hand, HumanError, Person, figure, hand_shapes, rouse
@@ -81,26 +81,35 @@ class Rigid:
         while not self.admit(self.prepare(spec)):
             pass
 
-    def prepare(self, spec: RobotSpec) -> Draft:
-        """The world with one more robot in it, for :meth:`admit`. Any thread may call this while the ticks go on.
+    def prepare(self, spec: RobotSpec | HumanSpec, *, copy: bool = False) -> Draft:
+        """The world with one more actor in it, for :meth:`admit`. Any thread may call this while the ticks go on.
 
-        Raises :class:`RobotError` if the URDF does not compile.
+        Raises :class:`RobotError` if the URDF does not compile. ``copy``: see :meth:`add_human`.
         """
+        robots, people = tuple(self._robots.values()), tuple(self._people.values())
+        if isinstance(spec, HumanSpec):
+            return self._draft(robots, (*people, Person(spec, self._admit("human", spec.name, HumanError), copy=copy)))
         robot = RobotBody(spec, self._admit("robot", spec.name, RobotError))
         try:
-            return self._draft((*self._robots.values(), robot), tuple(self._people.values()))
+            return self._draft((*robots, robot), people)
         except ValueError as error:
             raise unfit(spec, error) from error
 
     def admit(self, draft: Draft) -> bool:
-        """Between ticks, let the robot in for whom ``draft`` was made, at its ``spec.pose`` and ``spec.home``.
+        """Between ticks, let the actor in for whom ``draft`` was made, where its ``spec`` says.
 
         False, and nothing has happened, if others came or went meanwhile: prepare it anew.
         """
-        *others, newcomer = draft.robots
-        here = (list(self._robots.values()), list(self._people.values()))
-        if (others, list(draft.people)) != here or draft.slots <= max(self._slot.values(), default=-1):
+        here = (*self._robots.values(), *self._people.values())
+        those = (*draft.robots, *draft.people)
+        (newcomer, *more) = [actor for actor in those if actor not in here] or [None]
+        others = tuple(actor for actor in those if actor is not newcomer)
+        if newcomer is None or more or others != here or draft.slots <= max(self._slot.values(), default=-1):
             return False
+        if isinstance(newcomer, Person):
+            self._people[newcomer.spec.name] = newcomer
+            self._renew(draft)
+            return True
         spec = newcomer.spec
         self._robots[spec.name] = newcomer
         self._renew(draft)
@@ -128,6 +137,10 @@ class Rigid:
         """Robots and people."""
         return (*self._robots, *self._people)
 
+    def stands(self, name: str) -> np.ndarray:
+        """[3] m where a robot's base or a person's hips are."""
+        return self.person(name).parts[PARTS.index("hips"), :3] if name in self._people else self.base(name)[0][:3]
+
     def person(self, name: str) -> Person:
         """The body of a person who is here."""
         try:
@@ -135,10 +148,13 @@ class Rigid:
         except KeyError:
             raise HumanError(f"no human {name!r} here; there are: {', '.join(self._people) or 'none'}") from None
 
-    def add_human(self, spec: HumanSpec) -> None:
-        """Let a person join, at ``spec.pose``; all others go on exactly where they are. Raises :class:`HumanError`."""
-        self._people[spec.name] = Person(spec, self._admit("human", spec.name, HumanError))
-        self._compile()
+    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
+        """Let a person join, at ``spec.pose``; all others go on exactly where they are. Raises :class:`HumanError`.
+
+        ``copy``: another client moves the person; here the hands neither hold anything nor touch robots.
+        """
+        while not self.admit(self.prepare(spec, copy=copy)):
+            pass
 
     def remove_human(self, name: str) -> None:
         """Let a person leave, and whatever the hands hold."""
@@ -148,7 +164,12 @@ class Rigid:
 
     def move_human(self, name: str, pose: HumanPose) -> None:
         """Tell where a person's tracked points are at the end of the coming tick."""
-        self.person(name).move(pose)
+        person = self.person(name)
+        busy = [hand.busy for hand in person.hands]
+        person.move(pose)
+        if busy != [hand.busy for hand in person.hands]:
+            person.excuse(self.world)
+            self._list()
 
     def hand(self, name: str, side: str) -> HandSample:
         """A person's ``"left"`` or ``"right"`` hand after the last tick."""
@@ -211,18 +232,24 @@ class Rigid:
 
     def add_bunch(self, bunch: int, body: Loose, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Take a bunch over from its vine: ``pose`` [7] and ``velocity`` [6] (of its origin, angular; world axes)."""
-        if bunch in self._bunches:
-            raise ValueError(f"bunch {bunch} is loose already")
-        derived = loose.alone(body)
-        taken = set(self._slot.values())
-        slot = next((i for i in range(self._waiting) if i not in taken), self._waiting)
-        self._bunches[bunch], self._slot[bunch] = body, slot
-        if slot == self._waiting:
+        self.add_bunches({bunch: (body, pose, velocity)})
+
+    def add_bunches(self, bunches: dict[int, tuple[Loose, np.ndarray, np.ndarray]]) -> None:
+        """Several at once, each with its pose [7] and velocity [6]: they are listed but once."""
+        if known := sorted(bunches.keys() & self._bunches.keys()):
+            raise ValueError(f"bunch {known[0]} is loose already")
+        derived = {bunch: loose.alone(body) for bunch, (body, _, _) in bunches.items()}
+        free = iter(sorted(set(range(self._waiting + len(bunches))) - set(self._slot.values())))
+        for bunch, (body, _, _) in bunches.items():
+            self._bunches[bunch], self._slot[bunch] = body, next(free)
+        if max(self._slot[bunch] for bunch in bunches) >= self._waiting:
             self._compile()
         else:
-            loose.embody(self.world, slot, body, derived)
+            for bunch, (body, _, _) in bunches.items():
+                loose.embody(self.world, self._slot[bunch], body, derived[bunch])
             self._list()
-        self.place_bunch(bunch, pose, velocity)
+        for bunch, (_, pose, velocity) in bunches.items():
+            self.place_bunch(bunch, pose, velocity)
 
     def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put a loose bunch somewhere: ``pose`` [7], ``velocity`` [6] in world axes."""
@@ -288,6 +315,19 @@ class Rigid:
         """A force [N] and a moment [N m] on a link's centre of mass, world axes, until it is set anew."""
         wrench = self.data.xfrc_applied[self._body(name, link)]
         wrench[:3], wrench[3:] = force, moment
+
+    def bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
+        """Let a robot feel how people push it whom other clients move: wrenches [6] by link, until told anew.
+
+        Force [N] and moment about the link's centre of mass [N m], world axes. They count as contacts in :meth:`read`.
+        """
+        self._robot(name).bear(self.data, pushes)
+
+    def pushed_by(self, name: str) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
+        """What a person's hands did to robots in the last tick; see :func:`wrenches.of_hands`."""
+        robots = self._robots.items()
+        links = {body: (robot, link) for robot, found in robots for link, body in found.bodies.items()}
+        return wrenches.of_hands(self.world, self.data, self.person(name), links)
 
     # ------------------------------------------------------------------ what they feel and where they are
 
@@ -450,6 +490,9 @@ class Rigid:
             out = np.zeros(m.nv)
             mujoco.mj_mulJacTVec(m, d, out, native)
             self._contact += out
+        for robot in self._robots.values():
+            if robot.afar:
+                self._contact += robot.effort_from_afar(m, d)
         for person in self._people.values():
             person.feel(d)
         self._fresh = False
@@ -553,7 +596,7 @@ class Rigid:
             for robot in robots:
                 robot.attach(spec)
             for person in people:
-                person.attach(spec, yard.ALL & ~(1 << person.bit), yard.GROUND, yard.ROUGH)
+                person.attach(spec, sum(1 << robot.bit for robot in robots))
             for slot in range(slots):
                 loose.wait(spec, slot)
             world = renewal.compiled(spec)

@@ -15,7 +15,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics import renewal
 from vinesim.physics.urdf import RobotError, check, shapes_of, touchable
-from vinesim.physics.yard import ALL, GROUND, ROUGH
+from vinesim.physics.yard import ALL, GROUND, GUEST, ROUGH
 from vinesim.world.values import RobotSpec
 
 GIVE = 0.01
@@ -99,6 +99,8 @@ class RobotBody:
         self.bodies: dict[str, int] = {}
         self.felt: dict[str, Felt] = {}
         """What links with sensors felt in the last tick."""
+        self.afar: dict[str, np.ndarray] = {}
+        """Wrenches [6] on links by people whom other clients move: see :meth:`Rigid.bear`."""
 
     # ------------------------------------------------------------------ in MuJoCo
 
@@ -203,6 +205,24 @@ class RobotBody:
         self._set_gains(m)
         self.control[:] = given + self.stiffness * q + self.soon * v
 
+    def bear(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
+        """Feel other ``wrenches`` from afar than before; :class:`RobotError` if there is no such link."""
+        if unknown := sorted(wrenches.keys() - self.bodies.keys()):
+            raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, a link that it has not")
+        for link in self.afar.keys() - wrenches.keys():
+            d.xfrc_applied[self.bodies[link]] = 0.0
+        for link, wrench in wrenches.items():
+            d.xfrc_applied[self.bodies[link]] = wrench
+        self.afar = wrenches
+
+    def effort_from_afar(self, m: mujoco.MjModel, d: mujoco.MjData) -> np.ndarray:
+        """[dof] generalised force of the wrenches from afar."""
+        total = np.zeros(m.nv)
+        for link, wrench in self.afar.items():
+            body = self.bodies[link]
+            mujoco.mj_applyFT(m, d, wrench[:3], wrench[3:], d.xipos[body], body, total)
+        return total
+
     # ------------------------------------------------------------------ inside
 
     def _set_gains(self, m: mujoco.MjModel) -> None:
@@ -230,7 +250,7 @@ def _parsed(given: RobotSpec, bit: int) -> mujoco.MjSpec:
     """A robot without base and servos, as its URDF says; its shapes carry the collision ``bit``."""
     child = mujoco.MjSpec.from_string(touchable(given.urdf, frozenset(drive.joint for drive in given.drives)))
     for geom in child.geoms:
-        geom.contype, geom.conaffinity = bit, ALL & ~bit & ~GROUND
+        geom.contype, geom.conaffinity = bit, ALL & ~bit & ~GROUND & ~GUEST
         geom.friction = ROUGH
     for body in child.bodies[1:]:
         body.gravcomp = 1.0

@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vinesim import frames
 from vinesim.physics.detail import Detail
 from vinesim.physics.guard import Guard
 from vinesim.physics.holding import Holding
+from vinesim.physics.lying import Lying
 from vinesim.physics.parting import Blade, Partings
 from vinesim.physics.plants import Plants
 from vinesim.physics.riding import Riding
@@ -18,10 +20,10 @@ from vinesim.physics.touching import Touching
 from vinesim.physics.wind import Wind
 from vinesim.world.model import Model
 from vinesim.world.state import State
-from vinesim.world.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Parting, RobotSpec, View
+from vinesim.world.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
 
 STIRRED = 4.0
-"""[m] With robots about, wind moves only the trees whose foot is so near to one of them."""
+"""[m] With robots or people about, wind moves only the trees whose foot is so near to one of them."""
 
 
 class Physics:
@@ -42,6 +44,8 @@ class Physics:
         self.parting = Partings(self.plants, self.rigid, self.touching)
         self.holding = Holding(self.plants, self.rigid, self.touching)
         self.riding = Riding(self.rigid)
+        self.lying = Lying(self.plants, self.rigid, self.touching, self.riding)
+        self._links: tuple[tuple[Link, ...], tuple[Link, ...], tuple[Link, ...]] = ((), (), ())
         self._picking = picking
         self.detail = Detail(self.plants)
         self.sleep = Sleep(self.plants)
@@ -50,6 +54,8 @@ class Physics:
         """What blows, if anything does; set it as you like."""
         self.partings: tuple[Parting, ...] = ()
         """What left its plant in the last tick, or by command before it; sorted by body."""
+        self.stirred = np.zeros(0, np.int32)
+        """Trees that have moved without being awake [k], because others said so since the last tick."""
         self.tick = 0
         self._body_q: np.ndarray | None = None
         self._fresh = True
@@ -116,10 +122,22 @@ class Physics:
             tick=self.tick,
             body_q=self._body_q,
             bunch_attached=self.state.bunch_attached.copy(),
-            links=self.rigid.links(),
-            link_q=self.rigid.link_q(),
-            moved=self.plants.awake.copy(),
+            links=self.links(),
+            link_q=self.link_q(),
+            moved=np.union1d(self.plants.awake, self.stirred),
         )
+
+    def links(self) -> tuple[Link, ...]:
+        """All rigid bodies that can be seen, with a body or without; the same object until one comes or goes."""
+        rigid, lying = self.rigid.links(), self.lying.links()
+        if self._links[0] is not rigid or self._links[1] is not lying:
+            self._links = rigid, lying, rigid + lying
+        return self._links[2]
+
+    def link_q(self) -> np.ndarray:
+        """Poses [link, 7] of :meth:`links`."""
+        rigid = self.rigid.link_q()
+        return np.concatenate([rigid, self.lying.link_q()]) if len(self.lying) else rigid
 
     # ------------------------------------------------------------------ who is here
 
@@ -132,14 +150,17 @@ class Physics:
         self.rigid.remove_robot(name)
         self.parting.blades = [blade for blade in self.parting.blades if blade.actor != name]
 
-    def add_human(self, spec: HumanSpec) -> None:
-        """See :meth:`Rigid.add_human`."""
-        self.rigid.add_human(spec)
+    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
+        """See :meth:`Rigid.add_human`; a copy touches only trees of which its own client tells."""
+        self.rigid.add_human(spec, copy=copy)
+        if copy:
+            self.touching.copies.add(spec.name)
 
     def remove_human(self, name: str) -> None:
         """See :meth:`Rigid.remove_human`; what the hands held is let go."""
         self.rigid.remove_human(name)
         self.holding.forget(name)
+        self.touching.copies.discard(name)
 
     def move_human(self, name: str, pose: HumanPose) -> None:
         """Tell where a person's tracked points are at the end of the coming tick, and which hands are closed."""
@@ -169,6 +190,15 @@ class Physics:
         self.parting.told_cut(body)
         self._body_q = None
 
+    def told_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
+        """Others say in what shape trees rest ([body of the tree, 4] each): so they do here, and none wakes for it."""
+        for tree, turned in zip(trees, joint_q, strict=True):
+            self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(turned, np.float32))
+        self.plants.rest(np.array(trees, np.int32))
+        self.touching.moved(np.array(trees, np.int32))
+        self.stirred = np.union1d(self.stirred, trees).astype(np.int32)
+        self._body_q = None
+
     def watch(self, points: np.ndarray, radius: float) -> None:
         """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`Detail.watch`."""
         self.detail.watch(points, radius)
@@ -187,8 +217,8 @@ class Physics:
 
     def _blow(self) -> None:
         if self.wind is not None:
-            robots = [self.rigid.base(name)[0][:3] for name in self.rigid.robots]
-            self.wind.update(self.plants, self.time, (np.array(robots), STIRRED) if robots else None)
+            actors = [self.rigid.stands(name) for name in self.rigid.actors]
+            self.wind.update(self.plants, self.time, (np.array(actors), STIRRED) if actors else None)
 
     def _refine(self) -> None:
         self.detail.update(self.touching.near)

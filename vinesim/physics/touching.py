@@ -280,6 +280,11 @@ class Touching:
 
     # ------------------------------------------------------------------ who is close
 
+    def moved(self, trees: np.ndarray) -> None:
+        """Trees [k] were put elsewhere while they slept."""
+        self._bound(trees)
+        self._bound_tree_blocks(np.unique(trees // BLOCK))
+
     def _bound(self, trees: np.ndarray) -> None:
         """Bring the boxes around some trees up to their bodies."""
         self._trees[: len(trees)] = trees

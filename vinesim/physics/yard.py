@@ -22,9 +22,10 @@ after a tick: in the middle of a bottom as thin as it looks, it would be pushed 
 """
 
 # what stands, what lies about, and one bit for each actor, so that a robot never meets itself; loose bunches meet the
-# thick bed of a crate where all others meet its thin sole
-GROUND, FIXED, BOX, SOLE, LOOSE = 1 << 0, 1 << 1, 1 << 2, 1 << 3, 1 << 4
-FIRST_ACTOR, LAST_ACTOR = 5, 30
+# thick bed of a crate where all others meet its thin sole; hands of people whom other clients move are guests, whom
+# robots do not meet: with what force they push robots is their own clients' to say
+GROUND, FIXED, BOX, SOLE, LOOSE, GUEST = (1 << bit for bit in range(6))
+FIRST_ACTOR, LAST_ACTOR = 6, 30
 """Positions of the bits of robots and people."""
 ALL = (1 << (LAST_ACTOR + 1)) - 1
 

@@ -112,6 +112,26 @@ class HumanPose:
     left_closed: bool = False
     """Whether the hand closes on what it touches; what it holds it keeps until this is false again."""
     right_closed: bool = False
+    left_fingers: tuple[float, ...] = (0.0,) * 5
+    """How far thumb, index, middle, ring and little finger are bent: 0 straight, 1 all the way. To be seen only."""
+    right_fingers: tuple[float, ...] = (0.0,) * 5
+    left_busy: bool = False
+    """The hand pushes a robot or holds something, says its own client: ``left`` is where the palm then is, not the
+    controller, and the copy goes there and touches nothing. Of no meaning where the person is at home."""
+    right_busy: bool = False
+
+    @property
+    def points(self) -> np.ndarray:
+        """[7, 7] all poses, in the order of :data:`POINTS`."""
+        return np.stack([getattr(self, name) for name in POINTS])
+
+    def at(self, points: np.ndarray) -> HumanPose:
+        """The same hands and fingers with all poses [7, 7] elsewhere."""
+        return dataclasses.replace(self, **dict(zip(POINTS, points, strict=True)))
+
+
+POINTS = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
+"""Poses of a :class:`HumanPose`."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -366,6 +386,22 @@ class RobotUpdate:
     """[joint] rad or m"""
     velocity: np.ndarray
     """[joint] rad/s or m/s"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class HumanUpdate:
+    """Pose of one person as it crosses the network (D6.4 section 5.3)."""
+
+    actor: str
+    time: float
+    pose: HumanPose
+    velocity: np.ndarray
+    """[7, 6] of all points, m/s and rad/s in world axes, to tell where they are a little later."""
+
+    @property
+    def base_q(self) -> np.ndarray:
+        """[7] where others take the person to be: the hips."""
+        return self.pose.hips
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -1,0 +1,93 @@
+"""The picking job with a second client watching: what the robot lays into its box lies in the other's box, too."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.client import picking, places
+from vinesim.client.client import Client
+from vinesim.net.bus import MemoryHub
+from vinesim.physics.step import Physics
+from vinesim.robot.description import load
+from vinesim.robot.pick import Pick
+from vinesim.world.generate import generate
+from vinesim.world.ids import Kind, thing
+from vinesim.world.scene import load as load_scene
+from vinesim.world.scene import reseeded
+
+DT = 0.01
+GRAVITY = 9.81
+
+
+def pressed_on_ground(physics: Physics, box: int) -> float:
+    """Upward force of the ground on a box [N], of MuJoCo's own contacts."""
+    world, data = physics.rigid.world, physics.rigid.data
+    ground, body = world.geom("ground").id, world.body(f"box/{box}").id
+    total = 0.0
+    for i, geoms in enumerate(data.contact.geom):
+        if ground in geoms and body in world.geom_bodyid[geoms]:
+            force = np.zeros(6)
+            mujoco.mj_contactForce(world, data, i, force)
+            total += abs(data.contact.frame[i].reshape(3, 3)[:, 2] @ force[:3])
+    return total
+
+
+@pytest.mark.slow
+def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_weighed_on_the_vine():
+    now = [100.0]
+    scene = reseeded(load_scene("harvest"), 7)
+    model, vinebot, hub = generate(scene), load("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
+    task = next(picking.tasks(model, places.spawn_pose(scene, 0)[:2]))
+    box = thing(Kind.BOX, task.box)
+    beside = model.box_pose[task.box, :2] + [0.0, 1.6]
+    worker, visitor = (
+        Client(scene, model, vinebot, hub.bus(name), name=name, pose=pose, clock=lambda: now[0])
+        for name, pose in (("worker", task.stand), ("visitor", frames.pose([*beside, 0.0])))
+    )
+    # let MuJoCo compute the forces of what lies still, too
+    visitor.physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+
+    def run(ticks: int = 1) -> None:
+        for _ in range(ticks):
+            worker.tick()
+            visitor.tick()
+            hub.advance(DT)
+            now[0] += DT
+
+    run(100)
+    empty = float(model.box_mass[task.box]) * GRAVITY
+    pick = Pick(worker.physics, worker.robot, task)
+    worker.jobs.append(pick.control)
+    bunch, worst = thing(Kind.BUNCH, task.bunch), []
+    while not pick.done:
+        run()
+        cut = not worker.physics.state.bunch_attached[task.bunch]
+        if cut and visitor.exchange.owner(bunch) == "worker":
+            here, there = (client.physics.riding.read(bunch)[0] for client in (worker, visitor))
+            worst.append(float(np.linalg.norm(here[:3] - there[:3])))
+    assert pick.picked, pick.reason
+    run(300)
+    assert not visitor.physics.state.bunch_attached[task.bunch]
+    assert visitor.physics.state.bunch_attached.sum() == len(model.bunch_body) - 1
+    here, there = (
+        frames.compose(frames.inverse(riding.read(box)[0]), riding.read(bunch)[0])
+        for riding in (worker.physics.riding, visitor.physics.riding)
+    )
+    assert np.linalg.norm(here[:3] - there[:3]) < 5e-3
+    assert visitor.physics.riding.lies(bunch)[0] == f"box/{task.box}"
+    world = visitor.physics.rigid.world
+    world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    visitor.physics.riding.place(bunch, visitor.physics.riding.read(bunch)[0], np.zeros(6))
+    run(100)
+    weighed = np.mean([(run(), pressed_on_ground(visitor.physics, task.box))[1] for _ in range(50)]) - empty
+    assert weighed == pytest.approx(float(model.body_mass[model.bunch_body[task.bunch]]) * GRAVITY, rel=0.03)
+    counters = worker.exchange.counters
+    told = counters.environment, counters.event, counters.fact
+    assert sum(family.bytes_out for family in told) < 100e3
+    assert max(worst) < 0.03
+    sent = [family.bytes_out for family in told]
+    run(200)
+    assert [family.bytes_out for family in told] == sent

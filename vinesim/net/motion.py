@@ -1,0 +1,92 @@
+"""Another actor between two of its messages: dead reckoning of its pose, and the hiding of corrections."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.net import smooth
+from vinesim.net.bus import Subscription
+from vinesim.net.messages import Hello, MessageError
+from vinesim.world.values import POINTS, HumanUpdate, RobotUpdate
+
+ELSEWHERE = 1.0
+"""Who is this far [m] from where he was taken to be has been put there: it is shown at once, not blended."""
+
+_BASE = np.arange(3, 7)[None]
+_TURNS = 7 * np.arange(len(POINTS))[:, None] + _BASE
+
+
+class Actor:
+    """Another actor and the last that is known of its pose."""
+
+    def __init__(self, hello: Hello) -> None:
+        self.hello = hello
+        self.joints = hello.joints
+        self.update: RobotUpdate | HumanUpdate | None = None
+        self.near: Subscription | None = None
+        self.moved_at = -1e9
+        self._turns = _TURNS if hello.kind == "human" else _BASE
+        """Where in the numbers of a pose its quaternions are [k, 4]."""
+        self._state = self._rate = self._off = np.zeros(0)
+
+    def hear(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
+        """Take a newer pose at network ``time``; False if it is not newer."""
+        if (self.hello.kind == "human") != isinstance(update, HumanUpdate):
+            raise MessageError(f"pose of a {type(update).__name__} by {update.actor!r}, which is a {self.hello.kind}")
+        if update.time > time + smooth.FUTURE:
+            update = dataclasses.replace(update, time=time + smooth.FUTURE)
+        if self.update is not None and update.time <= self.update.time:
+            return False
+        if isinstance(update, RobotUpdate):
+            if self.joints < 0:
+                self.joints = len(update.position)
+            if len(update.position) != self.joints:
+                raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
+        shown = None if self.update is None else self._shown(time)
+        self.update = update
+        self._state, self._rate = _numbers(update)
+        self._off = np.zeros(0)
+        if shown is not None:
+            here = self._shown(time)
+            turn = shown[self._turns]
+            shown[self._turns] = np.copysign(1.0, (turn * here[self._turns]).sum(1, keepdims=True)) * turn
+            if float(np.linalg.norm(shown[:3] - here[:3])) < ELSEWHERE:
+                self._off = shown - here
+            self.moved_at = time
+        return True
+
+    def at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
+        """The pose at network ``time``, to be shown ``now``."""
+        heard, shown = self.update, self._shown(time)
+        assert heard is not None
+        going = 1.0 if time - heard.time <= smooth.EXTRAPOLATION else 0.0
+        turn = shown[self._turns]
+        shown[self._turns] = turn / np.sqrt((turn * turn).sum(1, keepdims=True))
+        if isinstance(heard, HumanUpdate):
+            return HumanUpdate(heard.actor, now, heard.pose.at(shown.reshape(-1, 7)), heard.velocity * going)
+        return dataclasses.replace(
+            heard, time=now, base_q=shown[:7], base_qd=heard.base_qd * going, position=shown[7:],
+            velocity=heard.velocity * going,
+        )  # fmt: skip
+
+    def _shown(self, time: float) -> np.ndarray:
+        assert self.update is not None
+        shown = self._state + self._rate * smooth.horizon(time - self.update.time)
+        if len(self._off):
+            shown += self._off * smooth.remaining(time - self.moved_at)
+        return shown
+
+
+def _numbers(update: RobotUpdate | HumanUpdate) -> tuple[np.ndarray, np.ndarray]:
+    """A pose as flat numbers, and their rates."""
+    if isinstance(update, HumanUpdate):
+        points = update.pose.points
+        rate = np.concatenate([update.velocity[:, :3], smooth.spin(points[:, 3:], update.velocity[:, 3:])], 1)
+        return points.ravel(), rate.ravel()
+    spin = smooth.spin(update.base_q[3:], update.base_qd[3:])
+    return (
+        np.concatenate([update.base_q, update.position]),
+        np.concatenate([update.base_qd[:3], spin, update.velocity]),
+    )
