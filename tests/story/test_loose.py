@@ -292,3 +292,23 @@ def test_while_the_server_is_away_everybody_works_on_and_all_agree_afterwards():
     for number in (BUNCH(0), BUNCH(1)):
         assert apart(ada, bob, number) < 5e-3
         assert ada.exchange.fact(number) == bob.exchange.fact(number) == world.server.facts.of(number)
+
+
+def test_a_robot_that_leaves_leaves_behind_what_rode_on_it():
+    world, ada, bob = near_worlds((-1.0, -1.0), (1.0, -2.0))
+    deck = frames.compose(ada.physics.rigid.base("ada")[0], frames.pose([0.0, 0.0, 0.253]))
+    ada.physics.riding.place(BOX(1), deck, np.zeros(6))
+    world.run(0.2)
+    world.until(lambda: at_rest(world), 3.0)
+    world.run(0.2)
+    assert world.server.facts.of(BOX(1)).parent == "ada/base_footprint"
+    ada.leave()
+    world.leave("ada")
+    world.until(lambda: "ada" not in bob.others, 0.2)
+    world.until(lambda: bob.exchange.owner(BOX(1)) == "bob", 1.0)
+    world.until(lambda: at_rest(world), 3.0)
+    world.run(0.1)
+    fact = world.server.facts.of(BOX(1))
+    assert (fact.author, fact.parent, fact.moving) == ("bob", "", False)
+    assert fact.pose[2] < 0.05
+    np.testing.assert_allclose(fact.pose[:2], deck[:2], atol=0.1)
