@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def run(
-    *, name: str | None, connect: str | None, scene: str, seed: int | None, spawn: int,
+    *, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None, spawn: int,
     place: tuple[float, float, float] | None, walk: tuple[float, float] | None, reach: int | None, height: float,
     near: float, device: str, threads: int, seconds: float | None, out: pathlib.Path | None, status: str, **_: Any,
 ) -> int:  # fmt: skip
@@ -49,7 +49,7 @@ def run(
         else:
             from vinesim.net.zenoh_bus import ZenohBus
 
-            bus = stack.enter_context(ZenohBus(name, connect=connect))
+            bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
         client = Client(
             plan, model, None, bus, name=name, pose=start, source=walker, height=height, near=near, device=device,
             threads=threads,

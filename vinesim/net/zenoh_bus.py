@@ -325,6 +325,8 @@ class ZenohBus:
 
     def _listen_for_loss(self, session: zenoh.Session, endpoint: str) -> object:
         def notice(event: zenoh.TransportEvent) -> None:
+            if session.is_closed() or (self._poses is self._session and session is not self._session):
+                return  # left, or given up: that is no loss
             if event.kind == zenoh.SampleKind.PUT:
                 self._gone.discard(endpoint)
                 log.info("%s: connected to %s again", self.name, endpoint)
