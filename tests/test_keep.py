@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 
 import pytest
@@ -79,6 +80,30 @@ def test_torn_at_any_byte_the_records_before_hold_and_the_file_is_kept(tmp_path_
         assert asides == []
     assert held(Journal.load(journal.path))[:sound] == held(again)[:sound]
     assert len(list(folder.glob("*.torn-*"))) == len(asides)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_whatever_is_in_the_file_nothing_of_it_is_lost(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("any")
+    with fresh(folder) as journal:
+        for index in range(3):
+            add(journal, (index, 0), fact(index))
+    content = bytearray(journal.path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+    journal.path.write_bytes(content)
+    again = None
+    with contextlib.suppress(NotKept):
+        again = Journal.load(journal.path)
+    if again is None:
+        assert journal.path.read_bytes() == content
+        return
+    again.close()
+    asides = [aside.read_bytes() for aside in folder.glob("*.torn-*")]
+    assert asides == [bytes(content)] or (asides == [] and len(again.facts) == 3)
+    assert held(again) == [((index, 0), fact(index)) for index in range(len(again.facts))]
 
 
 def test_a_flipped_bit_ends_what_is_believed_in_one_line(tmp_path, caplog):

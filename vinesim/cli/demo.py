@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -38,6 +39,8 @@ START = 300.0
 """How long a client may take to start; a first run compiles kernels [s]."""
 WAY = 14
 """The visitor comes from so far [m]."""
+ASIDE = 3.0
+"""A visitor watches a job from so far [m]."""
 PATIENCE = 10.0
 """How long the visitor may take to write what it saw [s]."""
 
@@ -224,14 +227,28 @@ def do(
         processes.append(server)
         endpoint = server.line(20.0).removeprefix("listening on ")
         console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
+        common = ["-m", "vinesim.cli", "client", "--role", "robot", "--connect", endpoint, "--scene", scene]
+        common += ["--seed", str(plan.seed), "--robot", robot, "--status", "json"]
+        visitor, newest = None, {}
+        if (place := onlooker(plan)) is not None:
+            visitor = Process.start(
+                VISITOR, *common, "--name", VISITOR, *place, "--namespace", VISITOR, "--out", str(out / VISITOR),
+                "--sensor-hz", "0.5", **quiet_ros,
+            )  # fmt: skip
+            processes.append(visitor)
+            newest[VISITOR] = json.loads(visitor.line(START))
         worker = Process.start(
-            PUSHER, "-m", "vinesim.cli", "client", "--role", "robot", "--name", PUSHER, "--connect", endpoint,
-            "--scene", scene, "--seed", str(plan.seed), "--robot", robot, "--job", job, "--status", "json",
-            "--seconds", str(seconds or 120.0), "--out", str(out / PUSHER), "--sensor-hz", "1", **quiet_ros,
+            PUSHER, *common, "--name", PUSHER, "--job", job, "--seconds", str(seconds or 120.0),
+            "--out", str(out / PUSHER), "--sensor-hz", "1", **quiet_ros,
         )  # fmt: skip
         processes.append(worker)
-        newest = {PUSHER: json.loads(worker.line(START))}
-        watch(worker, None, server, newest, console, headless)
+        newest[PUSHER] = json.loads(worker.line(START))
+        watch(worker, visitor, server, newest, console, headless)
+        if visitor is not None:
+            visitor.stop()
+            visitor.reap(PATIENCE)
+            if visitor.child.returncode:
+                raise visitor.failed()
     report = json.loads((out / PUSHER / "report.json").read_text())
     done = bool(report["job"]["succeeded"])
     reason = report["job"]["reason"] or ("" if done else f"stopped at {report['job']['phase']!r} before the end")
@@ -239,15 +256,38 @@ def do(
         "scene": scene, "seed": plan.seed, "robot": robot, "job": job, JOBS[job][1]: done, "reason": reason,
         "seconds": report["time"], "ros": no_ros or "used", "detail": report["job"],
         **{key: report[key] for key in ("tick_hz", "tick_p50_ms", "tick_p99_ms", "overruns", "real_time_factor")},
+        "bunches_picked": report["bunches_picked"],
     }  # fmt: skip
+    if visitor is not None:
+        seen = json.loads((out / VISITOR / "report.json").read_text())
+        told = {family: report["network"][family]["bytes_out"] for family in ("environment", "event", "fact")}
+        summary["told_visitor"] = {"bytes": told, "bytes_per_s": sum(told.values()) / max(report["time"], 1e-9)}
+        summary["visitor"] = {key: seen[key] for key in ("bunches_picked", "tick_hz", "tick_p99_ms", "network")}
     for picture in (out / PUSHER).glob("*.png"):
         shutil.copyfile(picture, out / picture.name)
     partial = out / "summary.json.part"
     partial.write_text(json.dumps(summary, indent=2) + "\n")
     partial.replace(out / "summary.json")
     console.print(f"{JOBS[job][1]} after {report['time']:.1f} s" if done else f"not {JOBS[job][1]}: {reason}")
+    if visitor is not None:
+        console.print(
+            f"{VISITOR} was told of it with {sum(told.values())} B, {summary['told_visitor']['bytes_per_s']:.0f} B/s, "
+            f"and has {seen['bunches_picked']} of {report['bunches_picked']} bunches off their vines"
+        )
     console.print(f"pictures and summary.json are in {out}/")
     return 0 if done else 5
+
+
+def onlooker(plan: Scene) -> list[str] | None:
+    """Where a visitor watches a job, as options: aside from where it starts, on the way to the second start place."""
+    from vinesim.client import places
+
+    if len(plan.spawns) < 2:
+        return None
+    here, there = (places.spawn_pose(plan, i)[:2] for i in (0, 1))
+    way = (there - here) / max(float(np.linalg.norm(there - here)), 1e-9)
+    place = here + ASIDE * way
+    return ["--place", f"{place[0]:.4f}", f"{place[1]:.4f}", f"{math.atan2(-way[1], -way[0]):.4f}"]
 
 
 def set_the_stage(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:

@@ -117,6 +117,7 @@ def run(
         )  # fmt: skip
         for i in range(1, len(names)):
             client.add_robot(descriptions[i], names[i], start_pose(plan, spawn, back, i), bus(names[i]))
+        stack.callback(client.leave)
         for one, perception in zip(names, perceptions, strict=True):
             perception.attach(client, client.robots[one])
         pace = Pace(client.physics.dt)

@@ -192,11 +192,11 @@ class Client:
         things = self.things
         things.look()
         moving, touching = things.moving, False
-        mine = frozenset().union(*(exchange.mine for exchange in self.exchanges.values()))
         for name, actor in (*self.robots.items(), *self.people.items()):
             exchange, pose = self.exchanges[name], actor.update(now)
+            mine = exchange.mine
             parted = things.parted(name, all_others=name == self.name)
-            touched = things.touched(name, exchange.mine)
+            touched = things.touched(name, mine)
             touching |= bool(touched)
             settled = exchange.send(
                 now, pose, touched=touched, moving=moving, read=things.read,
@@ -209,6 +209,17 @@ class Client:
             for number in mine - exchange.mine:
                 things.rested(exchange.fact(number))
         self.far.note(self, touching)
+
+    def leave(self) -> None:
+        """Before the buses close: say of what rides on our robots where it is, for with them its parent goes."""
+        now = self._clock()
+        for name, robot in self.robots.items():
+            riders = self.things.riders(name)
+            if riders:
+                self.exchanges[name].send(
+                    now, robot.update(now), read=self.things.read, grabbed=riders, parted=riders,
+                    lies=self.physics.riding.lies,
+                )  # fmt: skip
 
     def side_of(self, point: np.ndarray) -> str:
         """The arm that is on the same side as a point [3] in the world."""

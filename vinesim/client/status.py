@@ -62,6 +62,7 @@ class Status:
         figures |= {
             "environment_bytes_when_far": client.far.bytes,
             "ticks_touching_when_far": client.far.ticks_touching,
+            "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "malformed": client.exchange.counters.malformed,
             "network": dataclasses.asdict(client.exchange.counters),
             "deadlines_dropped": self.pace.dropped,

@@ -46,15 +46,15 @@ class Things:
         self.physics.stirred = self.physics.stirred[:0]
         self._believe(inbox.facts)
         told = {update.thing: update for update in inbox.things}
-        for number in self._told.keys() - told.keys():
-            self._told.pop(number)
-        for number, update in sorted(told.items()):
-            first = number not in self._told
-            self._told[number] = update
-            self._rise(number)
-            self._loosen(number, update.pose, update.velocity)
-            riding.pull(number, update.pose, update.velocity, 1.0 if first else PULL)
-            riding.unsettle(number)
+        for update in inbox.things:
+            self._rise(update.thing)
+            self._loosen(update.thing, update.pose, update.velocity)
+        if told:
+            blend = np.array([PULL if number in self._told else 1.0 for number in told])
+            poses = np.array([update.pose for update in inbox.things])
+            riding.pull_all(list(told), poses, np.array([update.velocity for update in inbox.things]), blend)
+            riding.unsettle(list(told))
+        self._told = told
         self._hold()
         self._embody()
 
@@ -85,11 +85,11 @@ class Things:
             self._rise(number)
             pose = np.array(fact.pose)
             self._loosen(number, *(self.physics.riding.where(fact.parent, pose) or (pose, np.zeros(6))))
-            self.physics.riding.unsettle(number)
+            self.physics.riding.unsettle([number])
             return False
         self._lie(number, fact)
         if not bodiless:
-            self._put(number)
+            self._put([number])
         return bodiless
 
     def _cut_as(self, fact: Fact, holds: bool) -> list[TreeUpdate]:
@@ -114,7 +114,7 @@ class Things:
             bunches = lying.nearest(np.array(actors), EMBODIED)
             lying.embody(bunches)
             for bunch in bunches:
-                self._put(thing(Kind.BUNCH, bunch))
+                self._put([thing(Kind.BUNCH, bunch)])
 
     def cut(self, body: int) -> None:
         """Cut a body off because others have."""
@@ -133,15 +133,14 @@ class Things:
     def _hold(self) -> None:
         """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
         moving = set(self.physics.riding.moving)
-        pushed = moving & self._lies.keys()
+        pushed = {number for number in moving & self._lies.keys() if self._bearer(number) not in self._ours}
         if pushed:
             pushed -= {number for number, actor in self.physics.riding.touched if actor in self._ours}
-        for parent, riders in self._riders.items():
-            if self._moved_by_others(parent):
-                pushed |= riders
         for number in sorted(pushed):
-            if number in self.physics.riding:
-                self._put(number)
+            self._put([number])
+        for parent, riders in self._riders.items():
+            if riders and self._moved_by_others(parent):
+                self._put(sorted(riders))
 
     def _lie(self, number: int, fact: Fact) -> None:
         """From now on a thing lies where a fact says."""
@@ -165,13 +164,19 @@ class Things:
             return parent.partition("/")[0] not in self._ours
         return box in self._told or (box in self._lies and self._moved_by_others(self._lies[box].parent))
 
-    def _put(self, number: int) -> None:
-        """Put a thing that has a body where it lies."""
-        parent, relative = self._lies[number].parent, np.array(self._lies[number].pose)
-        there = self.physics.riding.where(parent, relative)
+    def _put(self, numbers: list[int]) -> None:
+        """Put things of one parent where they lie, as far as they have bodies."""
+        riding = self.physics.riding
+        numbers = [number for number in numbers if number in riding]
+        if not numbers:
+            return
+        parent = self._lies[numbers[0]].parent
+        relative = np.array([self._lies[number].pose for number in numbers])
+        there = riding.where(parent, relative)
         if there is not None:
-            self.physics.riding.place(number, *there)
-            self.physics.riding.settle(number, parent, relative)
+            riding.place_all(numbers, *there)
+            for number, pose in zip(numbers, relative, strict=True):
+                riding.settle(number, parent, pose)
 
     def pull_tree(self, update: TreeUpdate, blend: float) -> None:
         """Move a tree towards what its owner says, and what was cut off it."""
@@ -207,8 +212,8 @@ class Things:
         return [*parted, *trees]
 
     def touched(self, name: str, mine: Container[int]) -> list[int]:
-        """Everything that moves and that an actor of ours touches, or what it moves; and what lies in its boxes."""
-        found = [number for number in self.physics.riding.moving if self._box_of(number) == name]
+        """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
+        found = [number for number in self.physics.riding.moving if self._bearer(number) == name]
         for number, actor in (*self.physics.riding.touched, *self.physics.touched):
             other = thing_named(actor)
             if actor == name or (other is not None and other in mine):
@@ -217,11 +222,15 @@ class Things:
             self._rise(number)
         return found
 
-    def _box_of(self, number: int) -> str:
-        """Who put the box down in which a thing is said to lie."""
+    def _bearer(self, number: int) -> str:
+        """Who bears what a thing is said to lie on: whose link it is, or who put the box down; of the ground nobody."""
         fact = self._lies.get(number)
-        box = None if fact is None else thing_named(fact.parent)
-        return self._lies[box].author if box in self._lies else ""
+        if fact is None or fact.parent == GROUND:
+            return ""
+        box = thing_named(fact.parent)
+        if box is None:
+            return fact.parent.partition("/")[0]
+        return (self._bearer(box) or self._lies[box].author) if box in self._lies else ""
 
     @property
     def moving(self) -> list[int]:
@@ -246,6 +255,12 @@ class Things:
     def changed(self, tree: int) -> bool:
         """Whether picks or cuts have changed a tree for good."""
         return tree in self._changed
+
+    def riders(self, name: str) -> list[int]:
+        """What lies, as everybody knows, on the links of an actor."""
+        return sorted(
+            number for parent, riders in self._riders.items() if parent.startswith(f"{name}/") for number in riders
+        )  # fmt: skip
 
     def rested(self, fact: Fact | None) -> None:
         """We have said that a thing of ours lies still: from now on it does, as for everybody else."""

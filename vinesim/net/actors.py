@@ -55,6 +55,8 @@ class Actors:
         self.kin: set[str] = set()
         self.clock = Clock()
         self.known: dict[str, Actor] = {}
+        self.met: set[str] = set()
+        """Who was ever let in: last words may arrive when their author has gone."""
         greeting = messages.encode_hello(me)
         bus.join(greeting)
         bus.serve(f"hello/{me.name}", lambda _: greeting)
@@ -134,6 +136,7 @@ class Actors:
             )
             return
         self.known[name] = Actor(hello, self._buffer)
+        self.met.add(name)
         yield hello
 
     def _refuse(self, name: str, why: str) -> None:
@@ -143,6 +146,11 @@ class Actors:
             raise Mismatch(text)
         log.warning("ignoring a newcomer: %s", text)
         self._refused.add(name)
+        self.met.discard(name)
+
+    def refused(self, name: str) -> bool:
+        """Whether an actor was found to live in another world."""
+        return name in self._refused
 
     def blame(self, sender: str, error: MessageError) -> None:
         """Count a message that cannot be believed, and say so once for each sender."""

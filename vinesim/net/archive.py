@@ -111,7 +111,7 @@ class Archive:
         self._closing = False
         self.trouble = ""
         """Empty, or in words why nothing is written now; facts are then kept in memory until it is mended."""
-        self._thread = threading.Thread(target=self._run, name="archive")
+        self._thread = threading.Thread(target=self._run, name="archive", daemon=True)
         self._thread.start()
 
     def plan(self, world: str) -> Plan | None:

@@ -39,6 +39,9 @@ __all__ = ["Counters", "Exchange", "Inbox", "Mismatch", "Traffic"]
 ORPHANED = 0.5
 """What moves and is nobody's for so long [s] becomes the nearest actor's: somebody must say where it comes to rest."""
 
+MOST_EARLY = 100
+"""So many messages with facts of one actor are kept until its greeting has come."""
+
 _NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -92,6 +95,7 @@ class Exchange:
         self._things = ThingStream()
         self._counts = counts(model)
         self._orphans: dict[int, float] = {}
+        self._early: dict[str, list[tuple[str, bytes]]] = {}
         self._window: Cell | None = None
         self._position = np.zeros(3)
         self._heard_cells: dict[Cell, tuple[Subscription, Subscription]] = {}
@@ -158,7 +162,8 @@ class Exchange:
         for answer in answers:
             self._take_snapshot(answer, time, inbox)
         news: dict[int, tuple[Trees, str]] = {}
-        for key, payload in self.bus.drain():
+        early = [letter for hello in inbox.joined for letter in self._early.pop(hello.name, ())]
+        for key, payload in early + self.bus.drain():
             self._hear(key, payload, time, news, inbox)
         self._own.forget(time)
         inbox.released = self._own.released()
@@ -185,7 +190,7 @@ class Exchange:
         }  # fmt: skip
         families.get(family, counters.event).heard(payload)
         actor = self._actors.known.get(sender)
-        if actor is None and (family != "fact" or sender not in self.kin):
+        if actor is None and not (family == "fact" and self._may_tell(sender, key, payload)):
             counters.dropped += sender not in self.kin
             return
         try:
@@ -212,6 +217,16 @@ class Exchange:
                 self._hear_trees(messages.decode_trees(payload, self.model.tree_size), sender, time, news)
         except MessageError as error:
             self._actors.blame(sender, error)
+
+    def _may_tell(self, sender: str, key: str, payload: bytes) -> bool:
+        """Whether a fact of somebody who is not here counts. One who is about to be let in is heard then: nobody says
+        a fact twice.
+        """
+        if sender in self.kin or sender in self._actors.met:
+            return True
+        if not self._actors.refused(sender) and len(self._early.setdefault(sender, [])) < MOST_EARLY:
+            self._early[sender].append((key, payload))
+        return False
 
     def _hear_trees(self, trees: Trees, sender: str, time: float, news: dict[int, tuple[Trees, str]]) -> None:
         """Judge every record by its claim."""

@@ -205,14 +205,17 @@ class ThingStream:
 
     def extrapolated(self, theirs: set[int], now: float, time: float) -> list[ThingUpdate]:
         """Everything that others move, where it is now; after 150 ms without a word it stands still."""
-        found = []
-        for thing in sorted(self._heard.keys() & theirs):
-            heard = self._heard[thing]
-            age = time - heard.time
-            pose = _moved(heard.pose, heard.velocity, float(smooth.horizon(age)))
-            velocity = heard.velocity if age <= smooth.EXTRAPOLATION else np.zeros(6)
-            found.append(dataclasses.replace(heard, time=now, pose=pose, velocity=velocity))
-        return found
+        heard = [self._heard[thing] for thing in sorted(self._heard.keys() & theirs)]
+        if not heard:
+            return []
+        age = time - np.array([update.time for update in heard])[:, None]
+        velocity = np.array([update.velocity for update in heard])
+        poses = _moved(np.array([update.pose for update in heard]), velocity, smooth.horizon(age))
+        going = velocity * (age <= smooth.EXTRAPOLATION)
+        return [
+            dataclasses.replace(update, time=now, pose=pose, velocity=rate)
+            for update, pose, rate in zip(heard, poses, going, strict=True)
+        ]
 
 
 def with_roots(trees: Trees, roots: list[Roots]) -> Trees:

@@ -59,8 +59,9 @@ class Telling:
 
     def follow(self, window: Iterable[Cell], now: float) -> None:
         """Hear the facts of these cells from now on, and ask what was known of those that are new."""
-        wanted = set(window)
-        apart = bool(self.bus.trouble)
+        wanted, apart = set(window), bool(self.bus.trouble)
+        if not self._asked and apart == self._apart and wanted == self._ears.keys() == self._voices.keys():
+            return
         if self._apart and not apart:
             for thing, (cell, fact) in self._authored.items():
                 self._unsaid.setdefault(cell, {})[thing] = fact

@@ -49,17 +49,17 @@ class Riding:
         self._at: dict[int, int] = {}
         self._pairs = np.zeros((0, 2), np.int64)
         self._bands_before = np.zeros((0, 2))
+        self._touched: list[tuple[int, str]] | None = None
         self._renew()
 
     # ------------------------------------------------------------------ the tick
 
     def update(self) -> None:
         """After a tick: who is still, who is not, and on what."""
-        if self._generation != self.rigid.generation:
-            self._renew()
+        self._keep_up()
         d = self.rigid.data
         self._still += 1
-        self._pairs = self._touching()
+        self._pairs, self._touched = self._touching(), None
         bands, before = self._bands(), self._bands_before
         self._bands_before = bands
         # what fell asleep in a box that moved is judged when the box has come to rest
@@ -88,11 +88,18 @@ class Riding:
     @property
     def moving(self) -> list[int]:
         """Things that are not at rest in their parent's frame."""
+        self._keep_up()
         return self.things[self._still < PATIENCE].tolist()
 
     @property
     def touched(self) -> list[tuple[int, str]]:
         """(thing, actor) for everything that moves and is touched: by robots, people, boxes (``box/3``) or bunches."""
+        self._keep_up()
+        if self._touched is None:
+            self._touched = self._list_touched()
+        return self._touched
+
+    def _list_touched(self) -> list[tuple[int, str]]:
         found = set()
         for row, body in self._pairs[self._still[self._pairs[:, 0]] < PATIENCE].tolist():
             owner = self.rigid.owners.get(body)
@@ -108,6 +115,7 @@ class Riding:
     # ------------------------------------------------------------------ one thing
 
     def __contains__(self, thing: int) -> bool:
+        self._keep_up()
         return thing in self._at
 
     def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
@@ -128,6 +136,7 @@ class Riding:
         """Pose [7] and velocity [6] of a parent; None if it is not here."""
         if parent == GROUND:
             return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
+        self._keep_up()
         box = thing_named(parent)
         if box is not None:
             return self.read(box) if box in self._at else None
@@ -142,32 +151,37 @@ class Riding:
         return pose, np.concatenate([twist[3:], twist[:3]])
 
     def where(self, parent: str, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """World pose [7] and velocity [6] of what is still at a pose [7] in a parent's frame; None without parent."""
+        """World poses [..., 7] and velocities [..., 6] of what is still in a parent's frame; None if that is gone."""
         frame = self.frame(parent)
         if frame is None:
             return None
-        pose, velocity = frames.compose(frame[0], relative), frame[1].copy()
-        velocity[:3] += frames.cross(velocity[3:], pose[:3] - frame[0][:3])
+        pose = frames.compose(frame[0], relative)
+        velocity = np.broadcast_to(frame[1], (*pose.shape[:-1], 6)).copy()
+        velocity[..., :3] += frames.cross(velocity[..., 3:], pose[..., :3] - frame[0][:3])
         return pose, velocity
 
     def place(self, thing: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Put it somewhere: pose [7], velocity [6] in world axes."""
-        row, d = self._row_of(thing), self.rigid.data
-        turn = frames.normalize(np.asarray(pose[3:], float))
-        q, v = self._q[row], self._v[row]
-        d.qpos[q : q + 3], d.qpos[q + 3 : q + 7] = pose[:3], frames.to_wxyz(turn)
-        d.qvel[v : v + 3] = velocity[:3]
-        d.qvel[v + 3 : v + 6] = frames.rotate(frames.conjugate(turn), np.asarray(velocity[3:], float))
-        rouse(self.rigid.world, d, int(self._body[row]))
+        """Put one thing somewhere: pose [7], velocity [6] in world axes."""
+        self.place_all([thing], np.asarray(pose, float)[None], np.asarray(velocity, float)[None])
+
+    def place_all(self, things: list[int], pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Put things [k] somewhere: poses [k, 7], velocities [k, 6] in world axes."""
+        rows, d = np.array([self._row_of(thing) for thing in things]), self.rigid.data
+        turn = frames.normalize(pose[:, 3:])
+        d.qpos[self._q[rows][:, None] + np.arange(7)] = np.concatenate([pose[:, :3], frames.to_wxyz(turn)], -1)
+        spin = frames.rotate(frames.conjugate(turn), velocity[:, 3:])
+        d.qvel[self._v[rows][:, None] + np.arange(6)] = np.concatenate([velocity[:, :3], spin], -1)
+        for body in self._body[rows].tolist():
+            rouse(self.rigid.world, d, body)
         self.rigid.stale()
 
-    def pull(self, thing: int, pose: np.ndarray, velocity: np.ndarray, blend: float) -> None:
-        """Move it by ``blend`` of the way towards a pose [7], and as fast as ``velocity`` [6] at once."""
-        here, _ = self.read(thing)
-        if np.linalg.norm(pose[:3] - here[:3]) > FAR:
-            blend = 1.0
-        turn = np.where(here[3:] @ pose[3:] < 0.0, -1.0, 1.0) * pose[3:]
-        self.place(thing, here + blend * (np.concatenate([pose[:3], turn]) - here), velocity)
+    def pull_all(self, things: list[int], pose: np.ndarray, velocity: np.ndarray, blend: np.ndarray) -> None:
+        """Move things [k] by ``blend`` [k] of the way towards poses [k, 7]; as fast as ``velocity`` [k, 6] at once."""
+        here = self._poses(np.array([self._row_of(thing) for thing in things]))
+        far = np.linalg.norm(pose[:, :3] - here[:, :3], axis=1) > FAR
+        there = pose.copy()
+        there[(here[:, 3:] * pose[:, 3:]).sum(1) < 0.0, 3:] *= -1.0
+        self.place_all(things, here + np.where(far, 1.0, blend)[:, None] * (there - here), velocity)
 
     def settle(self, thing: int, parent: str, relative: np.ndarray) -> None:
         """Take it for at rest in a parent's frame, as others say it is."""
@@ -175,16 +189,20 @@ class Riding:
         self._parent[row] = self._body_of(parent)
         self._anchor[row], self._still[row] = relative, PATIENCE
 
-    def unsettle(self, thing: int) -> None:
-        """Take it for moving, as others say it does."""
-        row = self._row_of(thing)  # first: what has just come renews the rows
-        self._still[row] = 0
+    def unsettle(self, things: list[int]) -> None:
+        """Take things for moving, as others say they do."""
+        rows = [self._row_of(thing) for thing in things]  # first: what has just come renews the rows
+        self._still[rows] = 0
 
     # ------------------------------------------------------------------ inside
 
-    def _row_of(self, thing: int) -> int:
+    def _keep_up(self) -> None:
+        """Find everything again if the world was compiled or listed anew since."""
         if self._generation != self.rigid.generation:
             self._renew()
+
+    def _row_of(self, thing: int) -> int:
+        self._keep_up()
         return self._at[thing]
 
     def _poses(self, rows: np.ndarray) -> np.ndarray:
@@ -221,7 +239,8 @@ class Riding:
         pairs = np.concatenate([pairs, pairs[:, ::-1]])
         row = self._row[pairs[:, 0]]
         here = row >= 0
-        return np.unique(np.stack([row[here], pairs[here, 1]], -1), axis=0)
+        each = np.unique(row[here] * m.nbody + pairs[here, 1])
+        return np.stack([each // m.nbody, each % m.nbody], -1)
 
     def _supports(self, rows: np.ndarray, inside: np.ndarray) -> np.ndarray:
         """On what these rows [k] ride now: MuJoCo bodies [k]; ``inside`` [n] are those still within their band."""
@@ -250,7 +269,7 @@ class Riding:
         return np.where(keep, self._parent, np.where(found == _NONE, 0, found))[rows]
 
     def _renew(self) -> None:
-        """The world was compiled or listed anew: find everything in it again."""
+        """Find everything in the world as it is now; parents keep their names, not their numbers."""
         rigid = self.rigid
         m = rigid.world
         rigid.refresh()
@@ -281,14 +300,16 @@ class Riding:
         self._parent = np.zeros(len(self.things), np.int64)
         self._anchor = self._poses(np.arange(len(self.things)))
         self._still = np.where(self.things >= thing(Kind.BOX, 0), PATIENCE, 0)
-        self._pairs = np.zeros((0, 2), np.int64)
+        self._pairs, self._touched = np.zeros((0, 2), np.int64), None
         self._bands_before = np.tile(STILL, (len(self.things), 1))
         for number, (parent, anchor, still) in known.items():
             if number in self._at:
                 row = self._at[number]
                 self._parent[row] = self._body_of(parent)
-                if parent == GROUND or self._parent[row]:
-                    self._anchor[row], self._still[row] = anchor, still
+                gone = parent != GROUND and self._parent[row] == 0
+                self._still[row] = 0 if gone else still
+                if not gone:
+                    self._anchor[row] = anchor
 
     def _parent_names(self) -> list[str]:
         names = {body: name for name, body in self._body_named.items()}
