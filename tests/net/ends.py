@@ -45,7 +45,7 @@ class Served:
 
     def run(self) -> None:
         """Start it, and wait until it listens."""
-        command = [sys.executable, "-m", "vinesim.cli", "server", "--listen", self.endpoint]
+        command = [sys.executable, "-m", "vinesim.cli", "server", "--status", "none", "--listen", self.endpoint]
         self.process = self._start(command, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         line = self.process.stdout.readline()

@@ -15,6 +15,7 @@ from ends import Served, need_links, wait
 
 from vinesim.net.emulator import Count, Emulator, Line
 from vinesim.net.puppet import Stage
+from vinesim.world.ids import Kind, thing
 
 WINDOW = 1.0
 """How long is counted [s]."""
@@ -65,7 +66,7 @@ class Theatre:
     def settle(self) -> None:
         """Back to the beginning: nobody touches anything, everybody in its place, all is said."""
         for name, x in (("ada", 1.0), ("bob", 2.0), ("cleo", 30.0)):
-            self.tell(name, touch=[], swing=[], place=[x, 0.0])
+            self.tell(name, touch=[], swing=[], carry=[], sway=0.12, place=[x, 0.0])
         wait(
             lambda: all(
                 owner is None for stage in self.stages.values() for owner in stage.tell()["owner"].values()
@@ -178,7 +179,7 @@ def test_who_comes_near_hears_and_who_goes_does_not(world):
     world.tell("ada", touch=[0])
     world.tell("cleo", place=[1.0, 1.0])
     wait(lambda: world.tell("cleo")["owner"].get("0") == "ada", "cleo to hear of it")
-    assert world.count()["cleo"][1] > 1000
+    assert world.count()["cleo"][1] > 700
     world.tell("cleo", place=[30.0, 0.0])
     time.sleep(0.5)
     assert world.count()["cleo"][:2] == (0, 0)
@@ -190,7 +191,7 @@ def test_branch_that_swings_on_is_heard_and_one_that_rests_is_not(world):
     world.tell("ada", touch=[0])
     wait(lambda: world.tell("bob")["owner"].get("0") == "ada", "bob to hear of it")
     world.tell("ada", touch=[], swing=[0])
-    assert world.count()["bob"][1] > 1000
+    assert world.count()["bob"][1] > 700
     world.tell("ada", swing=[])
     wait(lambda: world.tell("bob")["owner"]["0"] is None, "bob to hear that it rests")
     time.sleep(0.2)
@@ -228,3 +229,102 @@ def test_actors_are_heard_at_60_hz_near_and_at_5_hz_far(world):
     # near: 60 and 5 of the same actor, and 5 of the far one; what lies in one tick counts once
     assert 30.0 < heard["bob"] < 75.0
     assert 5.0 < heard["cleo"] < 13.0
+
+
+BUNCH, BOX = thing(Kind.BUNCH, 1), thing(Kind.BOX, 1)
+
+
+def facts(before: dict, after: dict, way: str) -> int:
+    return after["counters"]["fact"][way] - before["counters"]["fact"][way]
+
+
+def test_hanging_bunch_is_part_of_its_tree_and_heard_only_near(world):
+    """F73, F75: touching a bunch is touching its tree; who is not near hears nothing, and knows as much as before."""
+    world.settle()
+    before = world.tell("cleo")
+    world.tell("ada", touch=[2], sway=0.2)
+    wait(lambda: world.tell("bob")["owner"].get("2") == "ada", "bob to hear of it")
+    counted = world.count()
+    assert counted["bob"][1] > 500
+    assert counted["cleo"][:2] == (0, 0)
+    after = world.tell("cleo")
+    assert after["heard"] == before["heard"]
+    assert after["claim"] == before["claim"]
+
+
+def test_loose_bunch_from_cut_to_ground_to_hand_to_box(world):
+    """F76, F77, F78: a stream while it moves; one fact when it comes to rest, and not one byte after it."""
+    world.settle()
+    start = {name: world.tell(name) for name in world.stages}
+    world.tell("ada", pick=[BUNCH])
+    wait(lambda: str(BUNCH) in world.tell("bob")["facts"], "bob to hear that it left its vine")
+    carried = world.count()
+    assert carried["ada"][0] > 500
+    assert carried["bob"][1] > 500
+    assert carried["cleo"][:2] == (0, 0)
+    assert world.tell("bob")["owner"][str(BUNCH)] == "ada"
+
+    idle = None
+    for parent in ("", "box/3"):
+        before = {name: world.tell(name) for name in world.stages}
+        world.tell("ada", lay={BUNCH: parent})
+        wait(lambda: not world.tell("bob")["facts"][str(BUNCH)]["moving"], "bob to hear that it lies")
+        time.sleep(0.2)
+        lying = {name: world.tell(name) for name in world.stages}
+        assert lying["bob"]["facts"][str(BUNCH)]["parent"] == parent
+        assert facts(before["ada"], lying["ada"], "messages_out") == 1
+        assert facts(before["bob"], lying["bob"], "messages_in") == 1
+        silent = world.count()
+        idle = idle or silent
+        for name in world.stages:
+            assert silent[name][:2] == (0, 0)
+            assert apart(silent[name][2], idle[name][2]) < CHATTER
+        assert facts(lying["ada"], world.tell("ada"), "messages_out") == 0
+        if parent == "":
+            world.tell("ada", grab=[BUNCH], carry=[BUNCH])
+            wait(lambda: world.tell("bob")["owner"][str(BUNCH)] == "ada", "bob to hear that it is picked up")
+            assert world.count()["bob"][1] > 500
+    assert facts(start["cleo"], world.tell("cleo"), "bytes_in") == 0, "29 m away nothing was heard of any of it"
+
+
+def test_box_is_one_stream_while_it_is_carried_and_none_while_it_rides(world):
+    """F79, F80: one stream for the box, zero for what is in it; on a robot that drives, which does not move it in its
+    own frame, nothing (where the box is then follows from the fact that says on what it rides)."""
+    world.settle()
+    world.tell("ada", grab=[BOX], carry=[BOX])
+    wait(lambda: world.tell("bob")["owner"].get(str(BOX)) == "ada", "bob to hear of the box")
+    before = world.tell("ada")["counters"]["environment"]
+    world.count()
+    after = world.tell("ada")["counters"]["environment"]
+    size = (after["bytes_out"] - before["bytes_out"]) / (after["messages_out"] - before["messages_out"])
+    assert size < 60, "a head and one record of 26 B, whatever lies in the box"
+
+    world.tell("ada", lay={BOX: "ada/base_link"})
+    wait(lambda: world.tell("bob")["facts"].get(str(BOX), {}).get("parent") == "ada/base_link", "bob to hear where")
+    time.sleep(0.2)
+    for step in range(5):  # and drives 2.5 m
+        world.tell("ada", place=[1.0, 0.5 * step])
+        assert world.count()["bob"][1] == 0
+    assert world.tell("bob")["facts"][str(BOX)]["parent"] == "ada/base_link"
+
+
+def test_a_link_that_is_cut_for_five_seconds_heals(world):
+    world.settle()
+    ada, bob = world.stages["ada"], world.stages["bob"]
+    world.tell("ada", touch=[1])
+    wait(lambda: bob.tell()["owner"].get("1") == "ada", "bob to hear of the tree")
+    start = bob.tell()["now"]
+    world.net.cut("ada")
+    wait(lambda: bob.tell()["went"].get("ada", 0.0) > start and "bob" in ada.tell()["went"], "both to notice", 5.0)
+    assert bob.tell()["went"]["ada"] - start < 3.0
+    # what was hers is touched by another meanwhile: two owners, each in a world of its own
+    bob.tell(touch=[1])
+    wait(lambda: bob.tell()["now"] - start > 5.0, "five seconds")
+    assert ada.tell()["owner"]["1"] == "ada"
+    assert bob.tell()["owner"]["1"] == "bob"
+    world.net.shape("ada", Line())
+    mended = bob.tell()["now"]
+    wait(lambda: bob.tell()["came"]["ada"] > mended, "the streams to come again")
+    wait(lambda: len({str(s.tell()["claim"].get("1")) for s in (ada, bob)}) == 1, "one claim")
+    wait(lambda: len({s.tell()["owner"].get("1") for s in (ada, bob)}) == 1, "one owner")
+    assert ada.tell()["owner"]["1"] in ("ada", "bob")

@@ -168,6 +168,12 @@ def client(
     near: Annotated[
         float, typer.Option(min=0.1, max=5.0, help="Others nearer than this to a thing hear of it [m].")
     ] = 5.0,
+    jitter_buffer: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=500.0, help="Show other actors so much later, and free of the network's jitter [ms]."
+        ),
+    ] = 0.0,
     device: Annotated[str, typer.Option(help="Where plants are simulated: cpu, cuda or cuda:N.")] = "cpu",
     threads: Annotated[
         int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 32 awake trees, on free cores.")

@@ -32,7 +32,8 @@ def run(
     *, role: str, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None,
     robot: list[str] | None,
     spawn: int, place: tuple[float, float, float] | None, back: float, namespace: str, ros: bool, push: int | None,
-    job: str | None, watch: int | None, near: float, device: str,
+    job: str | None, watch: int | None, near: float, jitter_buffer: float,
+    device: str,
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
@@ -108,7 +109,8 @@ def run(
         ]  # fmt: skip
         senses = perceptions[0]
         client = Client(
-            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, near=near, device=device,
+            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, near=near,
+            jitter_buffer=1e-3 * jitter_buffer, device=device,
             threads=threads, executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
         for i in range(1, len(names)):

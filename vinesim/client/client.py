@@ -65,6 +65,7 @@ class Client:
         source: Callable[[float], HumanPose] | None = None,
         height: float = 1.75,
         near: float = interest.NEAR,
+        jitter_buffer: float = 0.0,
         device: str = "cpu",
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
@@ -86,7 +87,7 @@ class Client:
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
         self.things = Things(self.physics, self.exchanges)
-        self._near = near
+        self._near, self._jitter_buffer = near, jitter_buffer
         self._enter(description, pose, source, height, bus)
         self.exchange = self.exchanges[name]
         self.others: dict[str, RemoteRobot | RemotePerson] = {}
@@ -121,7 +122,7 @@ class Client:
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
             seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._near)
+        exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
         self._share(name, exchange)
@@ -133,7 +134,7 @@ class Client:
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._near)
+        exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
         self.people[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
         self._share(spec.name, exchange)
         return person

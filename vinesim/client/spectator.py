@@ -59,7 +59,7 @@ class Spectator(Client):
             name=self.name, kind=ONLOOKER, scene=self.scene.name, digest=self.model.digest(),
             index=label_index(self.name), joints=0, seed=self.scene.seed,
         )  # fmt: skip
-        self.exchanges[self.name] = Exchange(bus, hello, self.model, near=self._near)
+        self.exchanges[self.name] = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
 
     def sense(self) -> None:
         """Show the world to whoever wants to see it."""

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vinesim.net import interest, messages
+from vinesim.net.buffer import Buffer
 from vinesim.net.bus import NEWEST, Answer, Bus, Publisher
 from vinesim.net.clock import WINDOW, Clock, Ping
 from vinesim.net.counters import Counters
@@ -47,8 +48,10 @@ class Mismatch(RuntimeError):
 class Actors:
     """All others in this world: who came, who went, where they are."""
 
-    def __init__(self, bus: Bus, me: Hello, counters: Counters) -> None:
+    def __init__(self, bus: Bus, me: Hello, counters: Counters, buffer: float = 0.0) -> None:
+        """``buffer`` [s]: all others' poses are shown so much later, see :class:`Buffer`."""
         self.bus, self.me, self.counters = bus, me, counters
+        self._buffer = Buffer(buffer).delay
         self.kin: set[str] = set()
         self.clock = Clock()
         self.known: dict[str, Actor] = {}
@@ -132,7 +135,7 @@ class Actors:
                 f"{self.me.name!r} has {self.me.scene!r} with {self.me.digest!r}",
             )
             return
-        self.known[name] = Actor(hello)
+        self.known[name] = Actor(hello, self._buffer)
         self.met.add(name)
         yield hello
 

@@ -25,6 +25,9 @@ from vinesim.world.values import Measurement
 
 COUNTS = (10, 30, 100)
 PER_PROCESS = 10
+PER_CORE = 15
+"""A core plays so many puppets at 60 Hz; more would measure how they starve, not what a router carries."""
+
 SECONDS = 6.0
 MEETING = 30.0
 """How long clients may take to meet [s]."""
@@ -70,7 +73,17 @@ with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", 
 @contextlib.contextmanager
 def router(*options: str) -> Iterator[tuple[str, subprocess.Popen]]:
     """A server in a process of its own: its endpoint, and the process."""
-    command = [sys.executable, "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0", *options]
+    command = [
+        sys.executable,
+        "-m",
+        "vinesim.cli",
+        "server",
+        "--status",
+        "none",
+        "--listen",
+        "tcp/127.0.0.1:0",
+        *options,
+    ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
@@ -144,7 +157,14 @@ def _poses(report: dict[str, Any]) -> int:
 
 
 def load() -> Iterator[Measurement]:
-    """10, 30 and 100 clients on one router, 30 on two that are linked."""
-    with router() as only:
+    """10, 30 and 100 clients on one router, then shared out between two that are linked, as far as there are cores."""
+    most = PER_CORE * len(os.sched_getaffinity(0))
+    yield Measurement("load", "clients that the cores of this machine can play", float(most), "")
+    with router() as first:
         for count in COUNTS:
-            yield from run(count, [only])
+            if count <= most:
+                yield from run(count, [first])
+    with router() as first, router("--connect", first[0]) as second:
+        for count in COUNTS:
+            if count <= most:
+                yield from run(count, [first, second])

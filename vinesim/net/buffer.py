@@ -53,13 +53,24 @@ class Buffer:
 
         Before the first sample it is that one; after the newest it is extrapolated, as without a buffer.
         """
+        before, after, share, since = self._between(now)
+        if before == after:
+            return self.states[before] + self.rates[before] * smooth.horizon(since)
+        return (1.0 - share) * self.states[before] + share * self.states[after]
+
+    def rate(self, now: float) -> np.ndarray:
+        """The change of what is shown at ``now`` [1/s]: said by its author, not found by differences."""
+        before, after, share, since = self._between(now)
+        if before == after:
+            return self.rates[before] * float(0.0 <= since <= smooth.EXTRAPOLATION)
+        return (1.0 - share) * self.rates[before] + share * self.rates[after]
+
+    def _between(self, now: float) -> tuple[int, int, float, float]:
+        """The samples around what is shown (one twice at an end), how far between them, how long after the first."""
         time = now - self.delay
         after = bisect.bisect_right(self.times, time)
-        if after == 0:
-            return self.states[0]
-        before = after - 1
-        since = time - self.times[before]
-        if after == len(self.times):
-            return self.states[before] + self.rates[before] * smooth.horizon(since)
-        share = since / (self.times[after] - self.times[before])
-        return (1.0 - share) * self.states[before] + share * self.states[after]
+        if after in (0, len(self.times)):
+            end = max(after - 1, 0)
+            return end, end, 0.0, time - self.times[end]
+        since = time - self.times[after - 1]
+        return after - 1, after, since / (self.times[after] - self.times[after - 1]), since

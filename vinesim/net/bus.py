@@ -180,14 +180,17 @@ class MemoryHub:
     """A network in memory with its own explicit clock: delay, jitter, loss and splits, all seeded.
 
     ``delay`` and ``jitter`` [s] are one way (uniform delay - jitter to delay + jitter, so samples overtake each
-    other); ``loss`` is the chance that an unreliable sample vanishes. Reliable ones arrive once and in order.
+    other); ``loss`` is the chance that an unreliable sample vanishes, ``doubled`` that it arrives twice. Reliable ones
+    arrive once and in order.
     """
 
-    def __init__(self, *, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, seed: int = 0) -> None:
+    def __init__(
+        self, *, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, doubled: float = 0.0, seed: int = 0
+    ) -> None:
         if delay < 0.0 or jitter < 0.0 or not 0.0 <= loss <= 1.0:
             raise ValueError(f"delay {delay} s and jitter {jitter} s must not be negative, loss {loss} from 0 to 1")
         self.time = 0.0
-        self.delay, self.jitter, self.loss = delay, jitter, loss
+        self.delay, self.jitter, self.loss, self.doubled = delay, jitter, loss, doubled
         self.down = False
         """True: the server is gone, nothing passes and nobody sees anybody."""
         self.refuses: Callable[[bytes], str] = lambda greeting: ""
@@ -244,7 +247,8 @@ class MemoryHub:
             if reliable:
                 self.later(functools.partial(self._deliver, bus, key, payload), (sender, name))
             elif self._random.random() >= self.loss:
-                self.later(functools.partial(self._deliver, bus, key, payload))
+                for _ in range(1 + (self.doubled > 0.0 and self._random.random() < self.doubled)):
+                    self.later(functools.partial(self._deliver, bus, key, payload))
 
     def question(self, asker: MemoryBus, key: str, payload: bytes) -> None:
         """To every member that serves ``key``, and back."""

@@ -78,14 +78,19 @@ class Exchange:
     boxes and loose bunches are things, numbered by :func:`vinesim.world.ids.thing`.
     """
 
-    def __init__(self, bus: Bus, me: Hello, model: Model, *, near: float = interest.NEAR) -> None:
-        """``near`` [m]: others nearer than this to a thing see what I do to it (at most 5 m, what cells cover)."""
+    def __init__(
+        self, bus: Bus, me: Hello, model: Model, *, near: float = interest.NEAR, jitter_buffer: float = 0.0
+    ) -> None:
+        """``near`` [m]: others nearer than this to a thing see what I do to it (at most 5 m, what cells cover).
+
+        ``jitter_buffer`` [s]: others' poses are shown so much later, and smoother, see :mod:`buffer`.
+        """
         if me.name != bus.name:
             raise ValueError(f"greeting of {me.name!r} on the bus of {bus.name!r}: one actor has one name")
         self.bus, self.me, self.model = bus, me, model
         self.near = interest.checked(near)
         self.counters = Counters()
-        self._actors = Actors(bus, me, self.counters)
+        self._actors = Actors(bus, me, self.counters, jitter_buffer)
         self._forces = Forces(bus, me.name)
         self._own = Ownership(me.name, self._actors.known)
         self._telling = Telling(bus, self.counters)

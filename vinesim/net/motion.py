@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from vinesim.net import smooth
+from vinesim.net.buffer import Buffer
 from vinesim.net.bus import Subscription
 from vinesim.net.messages import Hello, MessageError
 from vinesim.world.values import POINTS, HumanUpdate, RobotUpdate
@@ -21,8 +22,10 @@ _TURNS = 7 * np.arange(len(POINTS))[:, None] + _BASE
 class Actor:
     """Another actor and the last that is known of its pose."""
 
-    def __init__(self, hello: Hello) -> None:
+    def __init__(self, hello: Hello, buffer: float = 0.0) -> None:
+        """``buffer`` [s]: its poses are shown so much later, see :class:`Buffer`; 0 extrapolates them to now."""
         self.hello = hello
+        self._buffer = Buffer(buffer)
         self.joints = hello.joints
         self.update: RobotUpdate | HumanUpdate | None = None
         self.near: Subscription | None = None
@@ -48,7 +51,9 @@ class Actor:
         self.update = update
         self._state, self._rate = _numbers(update)
         self._off = np.zeros(0)
-        if shown is not None:
+        if self._buffer.delay > 0.0:
+            self._keep(update.time)
+        elif shown is not None:
             here = self._shown(time)
             turn = shown[self._turns]
             shown[self._turns] = np.copysign(1.0, (turn * here[self._turns]).sum(1, keepdims=True)) * turn
@@ -64,6 +69,10 @@ class Actor:
         going = 1.0 if time - heard.time <= smooth.EXTRAPOLATION else 0.0
         turn = shown[self._turns]
         shown[self._turns] = turn / np.sqrt((turn * turn).sum(1, keepdims=True))
+        if self._buffer.delay > 0.0 and isinstance(heard, RobotUpdate):
+            rate = self._buffer.rate(time)
+            twist = np.concatenate([rate[:3], heard.base_qd[3:]])
+            return RobotUpdate(heard.actor, now, shown[:7], twist, shown[7:], rate[7:])
         if isinstance(heard, HumanUpdate):
             return HumanUpdate(heard.actor, now, heard.pose.at(shown.reshape(-1, 7)), heard.velocity * going)
         return dataclasses.replace(
@@ -71,8 +80,19 @@ class Actor:
             velocity=heard.velocity * going,
         )  # fmt: skip
 
+    def _keep(self, time: float) -> None:
+        """One more sample for the buffer, its quaternions on the side of those before."""
+        if self._buffer.states:
+            before, turns = self._buffer.states[-1], self._turns
+            side = np.copysign(1.0, (before[turns] * self._state[turns]).sum(1, keepdims=True))
+            self._state[turns] *= side
+            self._rate[turns] *= side
+        self._buffer = self._buffer.heard(time, self._state, self._rate)
+
     def _shown(self, time: float) -> np.ndarray:
         assert self.update is not None
+        if self._buffer.delay > 0.0:
+            return self._buffer.shown(time).copy()
         shown = self._state + self._rate * smooth.horizon(time - self.update.time)
         if len(self._off):
             shown += self._off * smooth.remaining(time - self.moved_at)
