@@ -1,7 +1,6 @@
 """Pictures and data sets as files: formats as their readers read them, bitwise repeatable, whole after any end."""
 
 import json
-import os
 import pathlib
 import resource
 import signal
@@ -78,20 +77,18 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
 ) -> None:
     out = tmp_path / "set"
     command = _command(scene, out, 1)
-    done: dict[str, int] = {}
-    for end in (signal.SIGINT, signal.SIGKILL):
+    for end, images in ((signal.SIGINT, 0), (signal.SIGKILL, 1)):  # Ctrl-C while vines grow, a kill after an image
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
-            _until(lambda: len(_records(out)) > len(done))  # noqa: B023
+            _until(lambda: (out / "dataset.json").exists() and len(_records(out)) >= images)  # noqa: B023
             run.send_signal(end)
             said = run.communicate(timeout=30)[0]
         assert run.returncode == (130 if end == signal.SIGINT else -signal.SIGKILL)
-        assert {name: _records(out)[name] for name in done} == done  # what was there was not done again
-        done = _records(out)
-        assert 0 < len(done) < IMAGES
-        assert not (out / "annotations.json").exists()
         if end == signal.SIGINT:
-            assert f"{len(done)} of {IMAGES}" in said
-            assert not list(out.rglob(".*"))
+            assert f"0 of {IMAGES} images" in said
+            assert list(_files(out)) == ["dataset.json"]
+    done = _records(out)
+    assert 0 < len(done) < IMAGES
+    assert not (out / "annotations.json").exists()
     (out / "images" / ".000001.png.1.part").write_bytes(b"half")  # as a kill may leave it
     last = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert last.returncode == 0, last.stderr
@@ -186,22 +183,28 @@ def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, 
         dataset.begin(plan, tmp_path / "mine.txt")
 
 
-def test_a_full_disk_is_said_in_one_line_and_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
+def test_a_full_disk_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     """No file may grow beyond 20 kB: to a program that is a full disk, at the first picture."""
+    plan = Plan(load(scene), 5, "d435", (160, 120))
+    dataset.begin(plan, tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(DatasetError, match=r"image 0 cannot be written .* make room"):
+            list(dataset.draw(plan, tmp_path, [0]))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(_files(tmp_path)) == ["dataset.json"]
 
-    def small() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
-    environment = dict(os.environ, PYTHONDONTWRITEBYTECODE="1")
-    done = subprocess.run(
-        _command(scene, tmp_path / "set", 1),
-        capture_output=True, text=True, timeout=60, preexec_fn=small, env=environment,
-    )  # fmt: skip
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
+def test_what_stops_a_worker_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    bare = tmp_path / "bare.toml"
+    bare.write_text(scene.read_text().replace("[6, 8]", "[0, 0]"))
+    done = subprocess.run(_command(bare, tmp_path / "set", 1), capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert len(lines) == 1, done.stderr
-    assert "image 0 cannot be written" in lines[0]
-    assert "make room" in lines[0]
+    assert [line for line in done.stderr.splitlines() if line.strip()] == [
+        "vinesim: scene 'one vine' bears no bunch to look at; raise fruit.bunches"
+    ]
     assert list(_files(tmp_path / "set")) == ["dataset.json"]
 
 
