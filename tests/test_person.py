@@ -9,12 +9,15 @@ import pytest
 from touch_scenes import cane
 
 from vinesim import frames
+from vinesim.cli.human import before
 from vinesim.client.client import Client
+from vinesim.client.places import bunch_centres, bunch_in_reach, start_pose
 from vinesim.client.walker import Legs, Walker
 from vinesim.net import poses
 from vinesim.net.bus import MemoryHub
 from vinesim.physics.people import PARTS, standing
 from vinesim.robot.description import Description, load
+from vinesim.world.generate import generate
 from vinesim.world.grow import assemble
 from vinesim.world.scene import load as load_scene
 from vinesim.world.values import HumanPose
@@ -292,3 +295,44 @@ def test_an_arm_that_comes_to_a_hand_feels_it(vinebot):
     assert shove.felt()[1] < -3.0, "the hand pushes back"
     np.testing.assert_allclose(shove.felt(), shove.given(), atol=0.05 * np.abs(shove.given()).max())
     assert np.abs(efforts).max() > 1.0
+
+
+# ---------------------------------------------------------------------- plants and what grows on them
+
+
+def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
+    """F74 with a human: held by the hand on one client, it moves on the other, whose copy of the hand holds nothing."""
+    world = World()
+    world.scene = load_scene("demo")
+    world.model = generate(world.scene)
+    stand = start_pose(world.scene, 0)
+    bunch = bunch_in_reach(world.model, stand)
+    body = int(world.model.bunch_body[bunch])
+    centre = bunch_centres(world.model)[bunch]
+    walker = Walker(frames.pose(np.array([*before(centre, stand), 0.0]), stand[3:]))
+    eva = world.join("eva", None, walker.root, walker)
+    aside = frames.compose(stand, frames.pose(np.array([-1.5, 1.0, 0.0])))
+    anna = world.join("anna", vinebot, aside)
+    world.run(0.6)
+    middle = np.array([0.5 * float(world.model.bunch_length[bunch]), 0.0, 0.0])
+    walker.do(
+        walker.face(tuple(centre[:2])), walker.reach("right", lambda: centre), walker.wait(0.3),
+        walker.withdraw("right", 0.4), walker.wait(0.5),
+    )  # fmt: skip
+    for _ in range(400):
+        world.run(DT)
+        if eva.physics.hand("eva", "right").holds is not None:
+            break
+    assert eva.physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    world.run(1.6)
+    for client in world.clients:
+        client.physics.refresh()
+    poses_now = [client.physics.state.body_q[body].astype(float) for client in world.clients]
+    here, there = (pose[:3] + frames.rotate(pose[3:], middle) for pose in poses_now)
+    assert np.linalg.norm(here - centre) > 0.05
+    assert np.linalg.norm(there - here) < 0.02
+    assert anna.exchange.owner(int(world.model.body_tree[body])) == "eva"
+    assert anna.physics.hand("eva", "right").holds is None
+    np.testing.assert_allclose(
+        anna.physics.hand("eva", "right").pose[:3], eva.physics.hand("eva", "right").pose[:3], atol=0.01
+    )
