@@ -6,19 +6,25 @@ import dataclasses
 
 import numpy as np
 import pytest
+import seeing
 from touch_scenes import cane
 
 from vinesim import frames
 from vinesim.cli.human import before
-from vinesim.client.client import Client
+from vinesim.client.client import Client, label_index
 from vinesim.client.places import bunch_centres, bunch_in_reach, start_pose
 from vinesim.client.walker import Legs, Walker
 from vinesim.net import poses
 from vinesim.net.bus import MemoryHub
 from vinesim.physics.people import PARTS, standing
 from vinesim.robot.description import Description, load
+from vinesim.sensors.camera import Camera
+from vinesim.sensors.lidar import Lidar, LidarSpec
+from vinesim.sensors.picture import looking
+from vinesim.sensors.primitives import Primitives
 from vinesim.world.generate import generate
 from vinesim.world.grow import assemble
+from vinesim.world.ids import Organ, label
 from vinesim.world.scene import load as load_scene
 from vinesim.world.values import HumanPose
 
@@ -173,6 +179,39 @@ def test_who_is_set_down_elsewhere_is_there_at_once():
         x = parts_of(ida, "eva")[PARTS.index("hips"), 0]
         assert abs(x - here.hips[0]) < 1e-3 or abs(x - there.hips[0]) < 1e-3, "never in between"
     assert x == pytest.approx(there.hips[0], abs=1e-3)
+
+
+def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
+    """F59, F62: points with the label of each lie where it is on its own client."""
+    world = World()
+    anna = world.join("anna", vinebot, frames.pose(np.zeros(3)))
+    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.yaw(2.0)))
+    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.yaw(1.0)))
+    world.run(0.8)
+    view = anna.physics.view()
+    primitives = Primitives(world.model, grass=0.0)
+    primitives.update(view)
+    eye = np.array([0.0, 0.0, 1.3])
+    scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, frames.pose(eye))
+    gaze = looking(eye, np.array([3.0, -0.4, 1.0]))
+    frame = Camera(seeing.IDEAL, seeing.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, gaze)
+    seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
+    for organ, name, at in (
+        (Organ.HUMAN, "eva", eva.physics.rigid.stands("eva")),
+        (Organ.ROBOT, "bert", bert.physics.rigid.stands("bert")),
+    ):
+        mine = label(organ, label_index(name))
+        points = eye + scan.xyz[scan.labels == mine].astype(float)
+        assert len(points) > 50, name
+        assert np.linalg.norm(points[:, :2] - at[:2], axis=1).max() < 0.8
+        here = seen == mine
+        assert here.sum() > 50, name
+        info, depth = frame.info, frame.depth[here].astype(float)
+        rays = np.stack([(columns[here] - info.cx) / info.fx, (rows[here] - info.cy) / info.fy, np.ones(len(depth))], 1)
+        found = gaze[:3] + frames.rotate(gaze[3:], rays * depth[:, None])
+        assert np.linalg.norm(found[:, :2] - at[:2], axis=1).max() < 0.8
+        assert found[:, 2].min() > -0.01
+        assert found[:, 2].max() < 2.2
 
 
 # ---------------------------------------------------------------------- felt
