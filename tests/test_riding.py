@@ -10,6 +10,7 @@ from vinesim import frames
 from vinesim.physics.riding import PATIENCE, Riding
 from vinesim.physics.step import Physics
 from vinesim.robot.drives import Robot
+from vinesim.world.grow import Tree, Wood, assemble
 
 DECK = frames.pose([0.0, 0.0, 0.253])
 
@@ -136,3 +137,16 @@ def test_a_copy_is_pulled_the_faster_part_at_once_and_a_far_one_put_there():
     np.testing.assert_allclose(velocity, speed, atol=1e-12)
     riding.pull_all([BOX(0)], far[None], speed[None], np.array([0.2]))
     np.testing.assert_allclose(riding.read(BOX(0))[0][:3], far[:3], atol=1e-12)
+
+
+def test_a_bunch_that_has_just_come_can_be_called_moving_at_once():
+    """Found by the bench of two who fight for one bunch: the first loose bunch of a world without boxes, in the tick
+    in which it comes, was looked for in the arrays of before."""
+    tree = Tree(frames.pose(np.array([0.5, 0.0, 1.5])))
+    tree.bunch(tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)[-1], 0.4, clusters=False)
+    physics = Physics(assemble([tree]))
+    physics.riding.update()
+    physics.told_pick(0, frames.pose([0.5, 0.0, 1.0]), np.zeros(6))
+    physics.riding.unsettle([BUNCH(0)])
+    physics.riding.update()
+    assert BUNCH(0) in physics.riding.moving

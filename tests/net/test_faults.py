@@ -86,7 +86,7 @@ def test_two_that_grab_one_thing_at_once_end_with_one_owner(company):
         company[name].tell(touch=[])
 
 
-def test_a_client_that_is_killed_is_gone_and_what_it_moved_is_a_neighbours_or_rests(company):
+def test_a_client_that_is_killed_is_gone_and_what_it_moved_is_a_neighbours_or_rests(company, record_property):
     dan = company.stages["dan"]
     dan.tell(touch=[5])
     wait(lambda: company.owners(5) == {"dan"}, "all to hear who moves the tree")
@@ -94,12 +94,13 @@ def test_a_client_that_is_killed_is_gone_and_what_it_moved_is_a_neighbours_or_re
     del company.stages["dan"]
     took = wait(lambda: not any("dan" in s.tell()["others"] for s in company.stages.values()), "dan to be missed")
     dan.close()
+    record_property("missed after [s]", took)
     assert took < NOTICED
     wait(lambda: company.agree(5), "all to agree whose the tree is now")
     assert company.owners(5) <= {None, *company.stages}
 
 
-def test_a_frozen_client_is_gone_in_two_and_a_half_seconds_and_comes_back(company):
+def test_a_frozen_client_is_gone_in_two_and_a_half_seconds_and_comes_back(company, record_property):
     ada, bob = company["ada"], company["bob"]
     ada.tell(touch=[1])
     wait(lambda: company.hears("bob", 1, -math.inf), "bob to hear of the tree")
@@ -108,6 +109,7 @@ def test_a_frozen_client_is_gone_in_two_and_a_half_seconds_and_comes_back(compan
     wait(lambda: "ada" in bob.tell()["went"], "ada to be missed", 5.0)
     went = bob.tell()["went"]["ada"]
     ada.process.send_signal(signal.SIGCONT)
+    record_property("missed after [s]", went - start)
     assert went - start < NOTICED
     wait(lambda: bob.tell()["came"]["ada"] > went, "ada to be back")
     now = bob.tell()["now"]
@@ -115,7 +117,7 @@ def test_a_frozen_client_is_gone_in_two_and_a_half_seconds_and_comes_back(compan
     wait(lambda: company.agree(1), "all to name the same owner")
 
 
-def test_a_server_that_is_killed_and_restarted_carries_again_within_a_second(company):
+def test_a_server_that_is_killed_and_restarted_carries_again_within_a_second(company, record_property):
     ada, bob = company["ada"], company["bob"]
     ada.tell(touch=[6])
     wait(lambda: company.hears("bob", 6, -math.inf), "bob to hear of the tree")
@@ -127,5 +129,6 @@ def test_a_server_that_is_killed_and_restarted_carries_again_within_a_second(com
     company.server.run()
     ready = bob.tell()["now"]
     took = wait(lambda: company.hears("bob", 6, ready), "the stream to come again")
+    record_property("streams again after [s]", took)
     assert took < 1.0 + 0.5, "a second, and half of one for a busy machine"
     assert bob.tell()["owner"]["6"] == "ada"

@@ -308,7 +308,7 @@ def test_box_is_one_stream_while_it_is_carried_and_none_while_it_rides(world):
     assert world.tell("bob")["facts"][str(BOX)]["parent"] == "ada/base_link"
 
 
-def test_a_link_that_is_cut_for_five_seconds_heals(world):
+def test_a_link_that_is_cut_for_five_seconds_heals(world, record_property):
     world.settle()
     ada, bob = world.stages["ada"], world.stages["bob"]
     world.tell("ada", touch=[1])
@@ -316,6 +316,7 @@ def test_a_link_that_is_cut_for_five_seconds_heals(world):
     start = bob.tell()["now"]
     world.net.cut("ada")
     wait(lambda: bob.tell()["went"].get("ada", 0.0) > start and "bob" in ada.tell()["went"], "both to notice", 5.0)
+    record_property("missed after [s]", bob.tell()["went"]["ada"] - start)
     assert bob.tell()["went"]["ada"] - start < 3.0
     # what was hers is touched by another meanwhile: two owners, each in a world of its own
     bob.tell(touch=[1])
@@ -327,4 +328,5 @@ def test_a_link_that_is_cut_for_five_seconds_heals(world):
     wait(lambda: bob.tell()["came"]["ada"] > mended, "the streams to come again")
     wait(lambda: len({str(s.tell()["claim"].get("1")) for s in (ada, bob)}) == 1, "one claim")
     wait(lambda: len({s.tell()["owner"].get("1") for s in (ada, bob)}) == 1, "one owner")
+    record_property("one owner again after [s]", bob.tell()["now"] - mended)
     assert ada.tell()["owner"]["1"] in ("ada", "bob")

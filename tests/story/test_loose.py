@@ -75,6 +75,15 @@ def test_a_bunch_is_told_of_from_cut_to_rest_then_nothing_until_it_is_gripped():
     parent, _ = ada.physics.riding.lies(BUNCH(0))
     assert parent in ("ada/left", "ada/right")
     assert bob.physics.riding.lies(BUNCH(0))[0] == parent
+    # put down, it stays behind when the hand goes up, whatever was said of the hand
+    for lift, fingers, seconds in ((down, 0.07, 0.8), (down, 0.0, 0.5), (down + 0.5, 0.0, 0.5)):
+        ask(ada, lift, fingers)
+        world.run(seconds)
+    world.until(lambda: at_rest(world), 5.0)
+    world.run(0.1)
+    assert ada.physics.riding.lies(BUNCH(0))[0] == bob.physics.riding.lies(BUNCH(0))[0] == ""
+    assert pose_of(ada, BUNCH(0))[2] < lying + 0.05
+    assert apart(ada, bob, BUNCH(0)) < 1e-3
 
 
 def test_in_a_box_a_bunch_is_silent_and_a_pushed_box_is_one_stream():
@@ -131,6 +140,15 @@ def test_a_box_that_rides_on_a_robot_costs_nothing_and_is_where_the_robot_is():
     world.run(1.0)
     assert apart(ada, bob, BOX(1)) < 0.02
     assert (sent(ada), sent(bob)) == before
+    # what has left it is where it went, not where it was said to lie; and that is ada's to say
+    beside = frames.compose(ada.physics.rigid.base("ada")[0], frames.pose([0.0, 1.0, 0.001]))
+    ada.physics.riding.place(BOX(1), beside, np.zeros(6))
+    world.run(0.1)
+    world.until(lambda: at_rest(world), 3.0)
+    world.run(0.2)
+    np.testing.assert_allclose(pose_of(ada, BOX(1))[:3], beside[:3], atol=0.01)
+    assert world.server.facts.of(BOX(1)).author == "ada"
+    assert apart(ada, bob, BOX(1)) < 1e-3
 
 
 @pytest.mark.parametrize("near", [True, False])

@@ -23,9 +23,10 @@ from vinesim.client.client import Client
 from vinesim.client.places import bunch_centres, bunch_in_reach, spawn_pose
 from vinesim.client.trace import Trace
 from vinesim.net import messages, smooth
+from vinesim.net.actors import ACTOR_PERIOD
 from vinesim.net.buffer import Buffer
 from vinesim.net.bus import EVERY, MemoryHub
-from vinesim.net.exchange import ACTOR_PERIOD, Inbox
+from vinesim.net.exchange import Inbox
 from vinesim.physics.step import Physics
 from vinesim.robot.description import Description
 from vinesim.robot.description import load as load_robot
@@ -59,7 +60,9 @@ SEEN = 0.001
 @functools.cache
 def _stage() -> tuple[Scene, Model, Description]:
     scene = msgspec.structs.replace(load("demo"), boxes=())  # in their place the second robot will stand
-    return scene, generate(scene), load_robot("vinebot")
+    model = generate(scene)
+    model.bunch_pull[:] = model.bunch_bend[:] = 1e6  # who fights by the wrong rule would tear the bunch off
+    return scene, model, load_robot("vinebot")
 
 
 class Pair:
@@ -124,9 +127,16 @@ class Pair:
         assert self.second.others
 
 
-def _grab(client: Client, send: Callable[..., list[TreeUpdate]], *args: Any, touched: list[int], **options: Any) -> Any:
+def _grab(
+    client: Client,
+    send: Callable[..., list[TreeUpdate]],
+    *args: Any,
+    touched: list[int],
+    grabbed: list[int],
+    **options: Any,
+) -> Any:
     others = [tree for tree in touched if client.exchange.owner(tree) not in (None, client.name)]
-    return send(*args, touched=touched, grabbed=others, **options)
+    return send(*args, touched=touched, grabbed=[*grabbed, *others], **options)
 
 
 def _trace(client: Client) -> Trace:

@@ -133,7 +133,7 @@ class Things:
     def _hold(self) -> None:
         """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
         moving = set(self.physics.riding.moving)
-        pushed = moving & self._lies.keys()
+        pushed = {number for number in moving & self._lies.keys() if self._bearer(number) not in self._ours}
         if pushed:
             pushed -= {number for number, actor in self.physics.riding.touched if actor in self._ours}
         for number in sorted(pushed):
@@ -212,8 +212,8 @@ class Things:
         return [*parted, *trees]
 
     def touched(self, name: str, mine: Container[int]) -> list[int]:
-        """Everything that moves and that an actor of ours touches, or what it moves; and what lies in its boxes."""
-        found = [number for number in self.physics.riding.moving if self._box_of(number) == name]
+        """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
+        found = [number for number in self.physics.riding.moving if self._bearer(number) == name]
         for number, actor in (*self.physics.riding.touched, *self.physics.touched):
             other = thing_named(actor)
             if actor == name or (other is not None and other in mine):
@@ -222,11 +222,15 @@ class Things:
             self._rise(number)
         return found
 
-    def _box_of(self, number: int) -> str:
-        """Who put the box down in which a thing is said to lie."""
+    def _bearer(self, number: int) -> str:
+        """Who bears what a thing is said to lie on: whose link it is, or who put the box down; of the ground nobody."""
         fact = self._lies.get(number)
-        box = None if fact is None else thing_named(fact.parent)
-        return self._lies[box].author if box in self._lies else ""
+        if fact is None or fact.parent == GROUND:
+            return ""
+        box = thing_named(fact.parent)
+        if box is None:
+            return fact.parent.partition("/")[0]
+        return (self._bearer(box) or self._lies[box].author) if box in self._lies else ""
 
     @property
     def moving(self) -> list[int]:

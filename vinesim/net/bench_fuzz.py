@@ -18,6 +18,7 @@ from vinesim.net import interest, messages
 from vinesim.net.authority import Claim
 from vinesim.net.bus import MemoryHub
 from vinesim.net.messages import Fact, Hello
+from vinesim.net.poses import Push, encode_pose, encode_push
 from vinesim.net.puppet import Puppet, row, swung
 from vinesim.world.ids import Kind, thing
 from vinesim.world.model import Model
@@ -36,11 +37,13 @@ _EXTREMES = (
 
 def sound(model: Model, actor: Puppet, now: float, chance: random.Random) -> tuple[str, bytes]:
     """A family of keys and a message as ``actor`` might send it."""
-    kind = chance.choice(("a", "c", "things", "own", "fact", "hello"))
+    kind = chance.choice(("a", "c", "things", "own", "fact", "force", "hello"))
     tree = chance.randrange(len(model.tree_first))
     claim = Claim(chance.randrange(3), chance.randrange(1 << 16), EVIL)
     if kind == "a":
-        return kind, messages.encode_robot(actor.pose(now))
+        return kind, encode_pose(actor.pose(now))
+    if kind == "force":
+        return kind, encode_push(Push(now, {"base_link": np.array([chance.uniform(-50.0, 50.0)] * 6)}))
     if kind == "c":
         q, qd = swung(model, tree, now)
         flags = np.array([chance.choice((0, messages.TOUCHED, messages.RESTING))])
@@ -96,7 +99,7 @@ def storm(model: Model, actor: Puppet, seed: int, now: float = 0.0) -> Iterator[
     """Broken messages without end, each with the key it is sent under."""
     chance = random.Random(seed)
     cells = sorted({interest.cell(pose[:3]) for pose in model.tree_pose.astype(float)})
-    earlier = [messages.encode_robot(actor.pose(now))]
+    earlier = [encode_pose(actor.pose(now))]
     while True:
         family, payload = sound(model, actor, now, chance)
         bad = broken(payload, chance.choice(earlier), chance)
@@ -105,9 +108,12 @@ def storm(model: Model, actor: Puppet, seed: int, now: float = 0.0) -> Iterator[
         if chance.random() < 0.1:
             bad = chance.choice(earlier)
         if chance.random() < 0.1:
-            family = chance.choice(("a", "c", "own", "fact"))
+            family = chance.choice(("a", "c", "own", "fact", "force"))
         x, y = chance.choice(cells)
-        key = chance.choice((f"a/{EVIL}", f"a/{EVIL}/far")) if family == "a" else f"{family}/{x}/{y}/{EVIL}"
+        if family == "a":
+            key = chance.choice((f"a/{EVIL}", f"a/{EVIL}/far"))
+        else:
+            key = f"force/ada/{EVIL}" if family == "force" else f"{family}/{x}/{y}/{EVIL}"
         now += 0.001
         yield key, bad
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from vinesim.net import messages
 from vinesim.net.bus import MemoryHub
-from vinesim.net.puppet import HUMAN_JOINTS, ROBOT_JOINTS, Puppet
+from vinesim.net.poses import encode_pose
+from vinesim.net.puppet import Puppet
 from vinesim.world.generate import generate
 from vinesim.world.model import Model
 from vinesim.world.scene import load
@@ -58,8 +59,7 @@ def cast(hub: MemoryHub, model: Model, where: np.ndarray) -> list[Puppet]:
         person = number >= ROBOTS
         name = f"{'person' if person else 'robot'}{number}"
         puppet = Puppet(
-            hub.bus(name), model, (float(place[0]), float(place[1])), kind="human" if person else "robot",
-            joints=HUMAN_JOINTS if person else ROBOT_JOINTS,
+            hub.bus(name), model, (float(place[0]), float(place[1])), kind="human" if person else "robot"
         )  # fmt: skip
         near = np.argsort(np.linalg.norm(roots - place, axis=1), kind="stable").tolist()
         for wanted, has in ((BUNCHES, True), (BRANCHES, False)):
@@ -72,7 +72,7 @@ def cast(hub: MemoryHub, model: Model, where: np.ndarray) -> list[Puppet]:
 
 def broadcast(model: Model, puppets: list[Puppet]) -> float:
     """Bytes a second that a client hears if everybody is sent everything at 60 Hz."""
-    poses = sum(len(messages.encode_robot(puppet.pose(0.0))) for puppet in puppets[1:])
+    poses = sum(len(encode_pose(puppet.pose(0.0))) for puppet in puppets[1:])
     return HZ * (poses + RIGID * len(model.bunch_body))
 
 

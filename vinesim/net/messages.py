@@ -7,7 +7,8 @@ version, not finite or too large raises :class:`MessageError` in words, and noth
 Rotations travel as rotation vectors, three i16 of pi/32767 rad (error 0.003 degrees a component); joint rates of
 a tree as i8 of that tree's own scale (error 0.4 % of its fastest joint). An owner that wants to agree with its copies
 to the bit uses :func:`quantised` of what it sends. Boxes and loose bunches travel as 26 bytes each, in the cell under
-which they are said: position in steps of 0.1 mm, rotation as the three smallest of four numbers, 10 bits each.
+which they are said: position in steps of 0.1 mm, rotation as the three smallest of four numbers, 10 bits each (error
+0.28 degrees).
 """
 
 from __future__ import annotations

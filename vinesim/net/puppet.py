@@ -29,13 +29,13 @@ from vinesim.net.messages import Hello
 from vinesim.world.grow import Tree, Wood, assemble
 from vinesim.world.ids import is_tree
 from vinesim.world.model import Model
-from vinesim.world.values import RobotUpdate
+from vinesim.world.values import POINTS, HumanPose, HumanUpdate, RobotUpdate
 
 TICK = 0.01
 """A client's tick [s]."""
 
-ROBOT_JOINTS, HUMAN_JOINTS = 27, 28
-"""Joints of a puppet: as many as vinebot has; for a person, what as many bytes say: seven tracked poses and fingers."""
+ROBOT_JOINTS = 27
+"""As many as vinebot has."""
 
 SWAY, SWING = 0.12, 1.3
 """The tip of a touched tree sways by so much [m], so often [Hz]: its owner must then speak 12 to 20 times a second, as
@@ -70,6 +70,7 @@ class Puppet:
         restless: bool = True,
     ) -> None:
         """Stand at ``place`` [2] m; ``restless`` lets the joints swing, so that no two poses are alike."""
+        joints = 0 if kind == "human" else joints
         hello = Hello(bus.name, kind=kind, scene="puppets", digest=digest, joints=joints)
         self.bus, self.model, self.name = bus, model, bus.name
         self.exchange = Exchange(bus, hello, model, near=near)
@@ -99,7 +100,7 @@ class Puppet:
         self.released: list[int] = []
         self.reads = 0
         self.ticks = 0
-        self.robots: dict[str, RobotUpdate] = {}
+        self.robots: dict[str, RobotUpdate | HumanUpdate] = {}
         """The others, as last shown."""
         self._now = 0.0
 
@@ -129,8 +130,14 @@ class Puppet:
         )  # fmt: skip
         self.ticks += 1
 
-    def pose(self, now: float) -> RobotUpdate:
+    def pose(self, now: float) -> RobotUpdate | HumanUpdate:
         """What it would say of itself at ``now``."""
+        if self.exchange.me.kind == "human":
+            points = np.tile(frames.pose(self.place), (len(POINTS), 1))
+            points[:, 2] = (0.0, 1.65, 1.1 + 0.2 * np.sin(2.0 * now), 1.1, 0.9, 0.1, 0.1)
+            velocity = np.zeros((len(POINTS), 6))
+            velocity[2, 2] = 0.4 * np.cos(2.0 * now)
+            return HumanUpdate(self.name, now, HumanPose(*points), velocity)
         phase = np.arange(self.joints) + (2.0 * now if self.restless else 0.0)
         speed = 0.6 * np.cos(phase) if self.restless else np.zeros(self.joints)
         return RobotUpdate(self.name, now, frames.pose(self.place), np.zeros(6), 0.3 * np.sin(phase), speed)
@@ -170,8 +177,9 @@ class Puppet:
             "facts": self.facts,
             "heard": self.heard,
             "released": self.released,
-            "poses": {name: update.position[:1].tolist() for name, update in sorted(self.robots.items())},
+            "poses": {name: getattr(one, "position", one.base_q)[:1].tolist() for name, one in self.robots.items()},
             "counters": dataclasses.asdict(exchange.counters),
+            "bytes_in": self.bus.bytes_in,
             "lost": self.bus.lost,
             "trouble": self.bus.trouble,
         }

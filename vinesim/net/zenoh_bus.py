@@ -12,6 +12,7 @@ datagrams pass.
 from __future__ import annotations
 
 import collections
+import contextlib
 import json
 import logging
 import pathlib
@@ -19,7 +20,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from typing import Any, Self
 
 import zenoh
@@ -49,6 +49,12 @@ HUGE = 4 * messages.LARGEST
 PATIENCE = 2.0
 """How long connecting may take [s]."""
 
+
+WATCH = 0.5
+"""Between two looks at whether datagrams pass [s]."""
+
+SILENT = 3.0
+"""They do not if they have not for so long, while the stream did [s]."""
 
 RETRY = 0.05
 """Between two attempts to be let in again [s]."""
@@ -117,7 +123,7 @@ def _close_all() -> None:
         close_session(session)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _meant_for_the_user(endpoint: str) -> Iterator[None]:
     try:
         yield
@@ -143,8 +149,9 @@ def _opened(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Session:
 class _Publisher:
     """See :class:`vinesim.net.bus.Publisher`."""
 
-    def __init__(self, bus: ZenohBus, publisher: zenoh.Publisher, reliable: bool) -> None:
-        self._bus, self._publisher, self._reliable = bus, publisher, reliable
+    def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], reliable: bool) -> None:
+        self._bus, self._declare, self._reliable = bus, declare, reliable
+        self._publisher = declare(bus.carrier(reliable))
 
     @property
     def matching(self) -> bool:
@@ -160,19 +167,30 @@ class _Publisher:
             self._publisher.put(payload)
         return True
 
+    def move(self, session: zenoh.Session) -> None:
+        """Send over another session from now on."""
+        self._publisher = self._declare(session)
+
     def close(self) -> None:
-        self._bus.outside(self._publisher.undeclare)
+        self._bus.movable.discard(self)
+        self._bus.outside(lambda: self._publisher.undeclare())
 
 
 class _Subscription:
     """See :class:`vinesim.net.bus.Subscription`."""
 
-    def __init__(self, bus: ZenohBus) -> None:
-        self._bus = bus
-        self.declared: zenoh.Subscriber | None = None
+    def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Subscriber], reliable: bool) -> None:
+        self._bus, self._declare = bus, declare
+        self._declared: zenoh.Subscriber | None = None
+        bus.outside(lambda: self.move(bus.carrier(reliable)))
+
+    def move(self, session: zenoh.Session) -> None:
+        """Hear it over another session from now on."""
+        self._declared = self._declare(session)
 
     def close(self) -> None:
-        self._bus.outside(lambda: self.declared and self.declared.undeclare())
+        self._bus.movable.discard(self)
+        self._bus.outside(lambda: self._declared and self._declared.undeclare())
 
 
 class ZenohBus:
@@ -202,6 +220,10 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._gone: set[str] = set()
         """Endpoints that do not answer now."""
+        self._datagrams_to = "" if way.live is None else str(way.live)
+        self._silent_since: float | None = None
+        self.movable: set[_Publisher | _Subscription] = set()
+        """What goes over the session of poses."""
         self._kept = True
         """The server that keeps this world is there, or never was."""
         self._refusal = ""
@@ -222,7 +244,7 @@ class ZenohBus:
             self.close()
             raise
         self._work: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
-        self._worker = threading.Thread(target=_run, args=(self._work,), name=f"bus of {name}", daemon=True)
+        self._worker = threading.Thread(target=self._run, name=f"bus of {name}", daemon=True)
         self._worker.start()
 
     def _datagrams(self, endpoint: Endpoint) -> zenoh.Session:
@@ -242,6 +264,29 @@ class ZenohBus:
                 "it is older than Zenoh 1.10, or listens without mixed_rel", self.name, endpoint,
             )  # fmt: skip
         return session
+
+    def carrier(self, reliable: bool) -> zenoh.Session:
+        """The session over which events go, or poses."""
+        return self._session if reliable else self._poses
+
+    def _watch(self) -> None:
+        """Where datagrams pass no more while the stream lives, let poses take the stream from now on."""
+        if self._poses is self._session:
+            return
+        if self._datagrams_to not in self._gone or self.endpoint in self._gone:
+            self._silent_since = None
+            return
+        now = time.monotonic()
+        self._silent_since = self._silent_since or now
+        if now - self._silent_since < SILENT:
+            return
+        log.warning("%s: no datagrams pass to %s any more: poses go over %s", self.name, self._datagrams_to,
+                    self.endpoint)  # fmt: skip
+        given_up, self._poses = self._poses, self._session
+        for each in list(self.movable):
+            each.move(self._session)
+        self._gone.discard(self._datagrams_to)
+        close_session(given_up)
 
     @property
     def links(self) -> list[str]:
@@ -371,18 +416,23 @@ class ZenohBus:
     def publisher(self, key: str, reliable: bool = False) -> _Publisher:
         if "*" in key:
             raise WrongUse(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
-        declared = (self._session if reliable else self._poses).declare_publisher(
-            self._prefix + key,
-            congestion_control=zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.INTERACTIVE_HIGH if reliable else zenoh.Priority.REAL_TIME,
-            reliability=zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT,
-            express=False,
-            allowed_destination=zenoh.Locality.REMOTE,
-        )
-        return _Publisher(self, declared, reliable)
+
+        def declare(session: zenoh.Session) -> zenoh.Publisher:
+            return session.declare_publisher(
+                self._prefix + key,
+                congestion_control=zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.INTERACTIVE_HIGH if reliable else zenoh.Priority.REAL_TIME,
+                reliability=zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT,
+                express=False,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
+
+        publisher = _Publisher(self, declare, reliable)
+        if not reliable:
+            self.movable.add(publisher)
+        return publisher
 
     def subscribe(self, pattern: str, depth: int = NEWEST) -> _Subscription:
-        subscription = _Subscription(self)
         skip = len(self._prefix)
 
         def store(sample: zenoh.Sample) -> None:
@@ -393,14 +443,12 @@ class ZenohBus:
             else:
                 self._store.put(depth, str(sample.key_expr)[skip:], sample.payload.to_bytes())
 
-        session = self._session if depth >= EVERY else self._poses
+        def declare(session: zenoh.Session) -> zenoh.Subscriber:
+            return session.declare_subscriber(self._prefix + pattern, store, allowed_origin=zenoh.Locality.REMOTE)
 
-        def declare() -> None:
-            subscription.declared = session.declare_subscriber(
-                self._prefix + pattern, store, allowed_origin=zenoh.Locality.REMOTE
-            )
-
-        self.outside(declare)
+        subscription = _Subscription(self, declare, depth >= EVERY)
+        if depth < EVERY:
+            self.movable.add(subscription)
         return subscription
 
     def drain(self) -> list[tuple[str, bytes]]:
@@ -442,6 +490,23 @@ class ZenohBus:
         """Do something that may take its time, in order, in the thread outside the tick."""
         self._work.put(what)
 
+    def _run(self) -> None:
+        """The thread outside the tick."""
+        due = time.monotonic() + WATCH
+        while True:
+            what: Callable[[], object] | None = self._watch
+            if (left := due - time.monotonic()) > 0.0:
+                with contextlib.suppress(queue.Empty):
+                    what = self._work.get(timeout=left)
+            if what is None:
+                return
+            if what == self._watch:
+                due = time.monotonic() + WATCH
+            try:
+                what()
+            except zenoh.ZError as error:
+                log.warning("the network refused: %s", error)
+
     def close(self) -> None:
         work = getattr(self, "_work", None)
         if work is not None:
@@ -455,11 +520,3 @@ class ZenohBus:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _run(work: queue.SimpleQueue) -> None:
-    while (what := work.get()) is not None:
-        try:
-            what()
-        except zenoh.ZError as error:
-            log.warning("the network refused: %s", error)

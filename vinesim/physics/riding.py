@@ -191,7 +191,8 @@ class Riding:
 
     def unsettle(self, things: list[int]) -> None:
         """Take things for moving, as others say they do."""
-        self._still[[self._row_of(thing) for thing in things]] = 0
+        rows = [self._row_of(thing) for thing in things]  # first: what has just come renews the rows
+        self._still[rows] = 0
 
     # ------------------------------------------------------------------ inside
 
