@@ -155,18 +155,26 @@ def test_a_second_recorder_leaves_the_first_ones_file_alone(story):
     assert not any("recorder" in key for key in keys(second))
 
 
-def test_what_was_left_is_replayed_to_a_viewer(story):
+@pytest.mark.parametrize("listen", [False, True])
+def test_what_was_left_is_replayed_to_a_viewer(story, listen):
+    """To a server that is there, or as one that begins when the viewer has come."""
     endpoint, path, _ = story
-    with ZenohBus("viewer", connect=endpoint) as bus:
-        viewer = Light(bus, 1.5, kind="spectator", joints=0)
-        with ended(command("replay", str(path), "--connect", endpoint)) as replay:
-            Company(viewer).until(lambda: replay.poll() is not None, "its end")
-            _, said = replay.communicate()
-        assert replay.returncode == 0, said
+    way = ["--listen", "tcp/127.0.0.1:0", "--speed", "2"] if listen else ["--connect", endpoint]
+    with contextlib.ExitStack() as stack:
+        if listen:
+            replay = stack.enter_context(ended(command("replay", str(path), *way)))
+            endpoint = replay.stdout.readline().removeprefix("listening on ").strip()
+        viewer = Light(stack.enter_context(ZenohBus("viewer", connect=endpoint)), 1.5, kind="spectator", joints=0)
+        if not listen:
+            replay = stack.enter_context(ended(command("replay", str(path), *way)))
+        Company(viewer).until(lambda: replay.poll() is not None, "its end")
+        _, said = replay.communicate()
+    assert replay.returncode == 0, said
     lines = said.splitlines()
     assert "it ends in the middle" in lines[0]
-    assert int(re.match(r"(\d+) messages were heard", lines[-1])[1]) > 100
-    assert viewer.joined == ["ada", "bob"]
+    heard = next(int(found[1]) for line in lines if (found := re.match(r"(\d+) messages were heard", line)))
+    assert heard > 100
+    assert sorted(viewer.joined) == ["ada", "bob"]
     assert viewer.exchange.counters.malformed == 0
     (rest,) = rests(path)
     resting = [update for update in viewer.heard if update.resting]
