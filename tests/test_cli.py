@@ -11,6 +11,7 @@ import pytest
 
 from vinesim.net import messages
 from vinesim.net.agreement import Plan
+from vinesim.net.recording import Recording
 from vinesim.net.server import Server
 from vinesim.net.zenoh_bus import ZenohBus
 
@@ -38,10 +39,10 @@ def free_port():
 
 def test_help_shows_every_command_with_examples():
     top = vinesim("--help").stdout
-    for command in ("demo", "server", "client", "scene", "bench", "ros", "certs"):
+    for command in ("demo", "server", "client", "record", "replay", "scene", "bench", "ros", "certs"):
         assert command in top
     commands = (["demo"], ["server"], ["client"], ["scene", "show"], ["bench"], ["ros", "build-interfaces"])
-    for command in (*commands, ["certs", "new"]):
+    for command in (*commands, ["certs", "new"], ["record"], ["replay"]):
         assert "Examples:" in vinesim(*command, "--help").stdout, command
 
 
@@ -84,6 +85,26 @@ def test_port_taken():
         holder.listen()
         endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
         refused(vinesim("server", "--listen", endpoint), 4, endpoint)
+
+
+def test_files_that_cannot_be_replayed(tmp_path):
+    (tmp_path / "scene.toml").write_text('name = "demo"\n')
+    refused(vinesim("replay", "scene.toml", "--out", "pictures", cwd=tmp_path), 2, "scene.toml", "no MCAP file")
+    with Recording(tmp_path / "old.mcap", {"protocol": "0", "release": "0.0.9"}):
+        pass
+    refused(vinesim("replay", "old.mcap", "--out", "pictures", cwd=tmp_path), 2, "version 0", "0.0.9")
+    with Recording(tmp_path / "empty.mcap"):
+        pass
+    refused(vinesim("replay", "empty.mcap", "--out", "pictures", cwd=tmp_path), 2, "empty.mcap", "no message")
+    assert not (tmp_path / "pictures").exists()
+
+
+def test_no_server_to_record_and_nowhere_to_write(tmp_path):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    refused(vinesim("record", "run.mcap", "--connect", endpoint, cwd=tmp_path), 4, endpoint, "vinesim server")
+    assert list(tmp_path.iterdir()) == []
+    with Server("tcp/127.0.0.1:0") as server:
+        refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 4, "no/run.mcap")
 
 
 def test_two_actors_with_one_name():
@@ -178,7 +199,7 @@ def test_secured_from_certificate_to_client(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["client", "--role", "spectator"], ["spectator", "not built yet"]),
+        (["client", "--role", "spectator", "--status", "xml"], ["xml", "json"]),
         (["client", "--role", "tractor"], ["tractor", "robot"]),
         (["client", "--push", "99999", "--no-ros"], ["99999"]),
         (["client", "--tls", "certs", "--no-ros"], ["--tls certs", "--connect tls/HOST:7447"]),
@@ -195,6 +216,10 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["client", "--spawn", "99", "--no-ros"], ["99"]),
         (["client", "--status", "xml"], ["xml", "json"]),
         (["bench", "nothing"], ["nothing", "plants", "camera"]),
+        (["record", "run.mcap", "--only", "cats"], ["cats", "poses", "trees"]),
+        (["record", "run.mcap", "--area", "0", "0", "-1", "1"], ["area 0 0 -1 1", "X0 < X1"]),
+        (["replay", "nowhere.mcap", "--out", "pictures"], ["nowhere.mcap", "No such file"]),
+        (["replay", "run.mcap"], ["--connect", "--listen", "--out"]),
         (["demo", "--scene", "nowhere"], ["nowhere"]),
         (["demo", "--robot", "nobody"], ["nobody"]),
         (["demo", "--job", "dance"], ["dance", "push", "pick", "exchange"]),
@@ -204,3 +229,11 @@ def test_secured_from_certificate_to_client(tmp_path):
 def test_wrong_use(arguments, words, tmp_path):
     refused(vinesim(*arguments, cwd=tmp_path), 2, *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_person_joins_and_goes(tmp_path):
+    ended = vinesim("client", "--role", "human", "--reach", "3", "--seconds", "1", "--out", str(tmp_path), cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["name"].startswith("human-")
+    assert report["time"] == pytest.approx(1.0)

@@ -136,7 +136,7 @@ def server(
 
 @app.command()
 def client(
-    role: Annotated[str, typer.Option(help="robot or human. (spectator is not built yet.)")] = "robot",
+    role: Annotated[str, typer.Option(help="robot, human or spectator.")] = "robot",
     name: Annotated[str | None, typer.Option(help="The actor's name, one of a kind; robot-PID unless given.")] = None,
     connect: Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")] = None,
     tls: Annotated[
@@ -193,6 +193,7 @@ def client(
       vinesim client --role robot --connect tcp/127.0.0.1:7447 --name picker --spawn 1
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
+      vinesim client --role spectator --connect tcp/127.0.0.1:7447 --place 2 0 1.57 --out pictures
       vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva --reach 12
     """
     options = dict(locals())
@@ -200,9 +201,82 @@ def client(
         from vinesim.cli.human import run as visit
 
         raise typer.Exit(visit(**options))
+    if role == "spectator":
+        from vinesim.cli.spectate import run as look
+
+        raise typer.Exit(look(**options))
     from vinesim.cli.join import run
 
     raise typer.Exit(run(**{name: value for name, value in options.items() if name not in ("walk", "reach", "height")}))
+
+
+@app.command()
+def record(
+    file: Annotated[pathlib.Path, typer.Argument(help="The MCAP file to write; if there is one, FILE-2 and so on.")],
+    connect: Annotated[str, typer.Option(help="Server.")] = "tcp/127.0.0.1:7447",
+    world: Annotated[str, typer.Option(help="Which of the server's worlds.")] = "vineyard",
+    tls: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder with ca.pem, NAME.pem and NAME.key, of a spectator; see --name.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name on its certificate; NAME-1 ... stand in an area.")] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="Refuse to record any other scene. Whatever is there unless given.")
+    ] = None,
+    seed: Seed = None,
+    area: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(help="Stand in this area, X0 Y0 X1 Y1 [m]: what happens there is sent because of you."),
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(help="Of poses,trees,things,events,facts,forces; all unless given.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")] = None,
+) -> None:
+    """Write down what is sent in a world, as MCAP. Unless an area is given, nothing more is sent because of it.
+
+    \b
+    Examples:
+      vinesim record run.mcap
+      vinesim record run.mcap --connect tcp/192.168.1.5:7447 --seconds 60
+      vinesim record run.mcap --area -5 -5 5 5 --only poses,trees
+    """
+    options = dict(locals())
+    from vinesim.cli.record import run
+
+    raise typer.Exit(run(**options))
+
+
+@app.command()
+def replay(
+    file: Annotated[pathlib.Path, typer.Argument(help="A file that vinesim record wrote, whole or cut off.")],
+    connect: Annotated[str | None, typer.Option(help="Play it to this server.")] = None,
+    listen: Annotated[str | None, typer.Option(help="Be a server, and play it once somebody is there.")] = None,
+    world: Annotated[str, typer.Option(help="Which of the server's worlds.")] = "vineyard",
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Times as fast as it was.")] = 1.0,
+    start: Annotated[float, typer.Option("--from", min=0.0, help="Seconds after its beginning to start at.")] = 0.0,
+    end: Annotated[float | None, typer.Option("--to", help="Seconds after its beginning to stop at.")] = None,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(help="Look at it: folder for a picture a second, without any server.")
+    ] = None,
+    place: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="With --out: look from X Y [m] along YAW [rad]; unless given, follow a robot."),
+    ] = None,
+    scene: Annotated[str | None, typer.Option(help="With --out: its scene file, if it is none that ships.")] = None,
+    seed: Seed = None,
+) -> None:
+    """Let a recording happen again: for a server's clients, or as pictures.
+
+    \b
+    Examples:
+      vinesim replay run.mcap --out pictures
+      vinesim replay run.mcap --connect tcp/127.0.0.1:7447 --from 20 --to 40
+      vinesim replay run.mcap --listen tcp/0.0.0.0:7447 --speed 0.5
+    """
+    options = dict(locals())
+    from vinesim.cli.replay import run
+
+    raise typer.Exit(run(**options))
 
 
 @scene_app.command("show")

@@ -38,11 +38,9 @@ def run(
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
-        built = "is not built yet" if role == "spectator" else "is none of robot, human, spectator"
-        raise WrongUse(f"role {role!r} {built}; give --role robot")
+        raise WrongUse(f"role {role!r} is none of robot, human, spectator; give one of them")
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
-
     if tls is not None and connect is None:
         raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 

@@ -28,7 +28,7 @@ class Arrivals:
     def __init__(
         self, rigid: Rigid, own: Description | None, executor: concurrent.futures.Executor | None = None
     ) -> None:
-        """``own``: a description that needs not be read again; without ``executor`` all is done at once."""
+        """``own``: a description that needs not be read again, if any; without ``executor`` all is done at once."""
         self.rigid, self.own = rigid, own
         self._executor = executor
         self._expected: dict[str, Hello] = {}

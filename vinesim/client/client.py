@@ -50,6 +50,9 @@ def label_index(name: str) -> int:
 class Client:
     """One actor's share of a world. ``clock`` is any steady clock in seconds; tests pass their own."""
 
+    picking = True
+    """Whether bunches part here when they are pulled too hard."""
+
     def __init__(
         self,
         scene: Scene,
@@ -73,7 +76,7 @@ class Client:
         ``executor`` prepares others who join, so that no tick has to; without one they are there at once.
         """
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, device=device, threads=threads)
+        self.physics = Physics(model, device=device, threads=threads, picking=self.picking)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
@@ -85,10 +88,7 @@ class Client:
         """The share of each in the world, by name; the first is :attr:`exchange`."""
         self.things = Things(self.physics, self.exchanges)
         self._near, self._jitter_buffer = near, jitter_buffer
-        if description is None:
-            self.add_human(HumanSpec(name, label_index(name), standing(pose, height), height), source, bus)
-        else:
-            self.robot = self.add_robot(description, name, pose, bus)
+        self._enter(description, pose, source, height, bus)
         self.exchange = self.exchanges[name]
         self.others: dict[str, RemoteRobot | RemotePerson] = {}
         self.jobs: list[Callable[[float], None]] = []
@@ -104,11 +104,23 @@ class Client:
         self._copies: dict[int, TreeUpdate] = {}
         self.arrivals = Arrivals(self.physics.rigid, description, executor)
 
+    def _enter(
+        self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
+        height: float, bus: Bus,
+    ) -> None:  # fmt: skip
+        """Come into the world as what this client is to be."""
+        if description is None:
+            spec = HumanSpec(self.name, label_index(self.name), standing(pose, height), height)
+            self.add_human(spec, source, bus)
+        else:
+            self.robot = self.add_robot(description, self.name, pose, bus)
+
     def add_robot(self, description: Description, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Move one more robot, standing at ``pose`` [7]; ``bus`` is opened in its name."""
         hello = Hello(
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=self.scene.name,
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
+            seed=self.scene.seed,
         )  # fmt: skip
         exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
@@ -120,7 +132,7 @@ class Client:
         """Move one more person as ``source`` says (see :class:`Person`; None: still); ``bus`` is opened in its name."""
         hello = Hello(
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
-            height=spec.height,
+            height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
         exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
         self.people[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))

@@ -6,7 +6,7 @@ that goes, unless it is our own robot that moves it.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Collection, Container, Iterable
 
 import numpy as np
 
@@ -28,7 +28,7 @@ EMBODY_TICKS, EMBODIED = 20, 4
 class Things:
     """What one client knows of all that is loose."""
 
-    def __init__(self, physics: Physics, ours: Container[str]) -> None:
+    def __init__(self, physics: Physics, ours: Collection[str]) -> None:
         """``ours``: the names of all actors that this client moves."""
         self.physics, self._ours = physics, ours
         self._told: dict[int, ThingUpdate] = {}
@@ -134,8 +134,8 @@ class Things:
         """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
         moving = set(self.physics.riding.moving)
         pushed = {number for number in moving & self._lies.keys() if self._bearer(number) not in self._ours}
-        if pushed:
-            pushed -= {number for number, actor in self.physics.riding.touched if actor in self._ours}
+        for name in self._ours if pushed else ():
+            pushed -= self.physics.riding.reached(name)
         for number in sorted(pushed):
             self._put([number])
         for parent, riders in self._riders.items():
@@ -213,14 +213,15 @@ class Things:
 
     def touched(self, name: str, mine: Container[int]) -> list[int]:
         """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
-        found = [number for number in self.physics.riding.moving if self._bearer(number) == name]
-        for number, actor in (*self.physics.riding.touched, *self.physics.touched):
+        riding = self.physics.riding
+        found = {number for number in riding.moving if self._bearer(number) == name} | riding.reached(name)
+        for number, actor in (*riding.touched, *self.physics.touched):
             other = thing_named(actor)
-            if actor == name or (other is not None and other in mine):
-                found.append(number)
+            if other in mine or (actor == name and is_tree(number)):
+                found.add(number)
         for number in found:
             self._rise(number)
-        return found
+        return sorted(found)
 
     def _bearer(self, number: int) -> str:
         """Who bears what a thing is said to lie on: whose link it is, or who put the box down; of the ground nobody."""

@@ -200,17 +200,21 @@ class MemoryHub:
         self._pending: list[tuple[float, int, Callable[[], None]]] = []
         self._members: dict[str, MemoryBus] = {}
         self._seen: dict[str, set[str]] = {}
+        self._unseen: set[str] = set()
         self._last: dict[tuple[str, str], float] = {}
 
-    def bus(self, name: str) -> MemoryBus:
-        """A new member; :class:`NameTaken` if the name is live."""
+    def bus(self, name: str, *, live: bool = True) -> MemoryBus:
+        """A new member; :class:`NameTaken` if the name is live. Not ``live``: nobody sees that it is there."""
         if name in self._members:
             raise NameTaken(name, "memory")
         bus = MemoryBus(self, name)
-        self._seen[name] = {name}
-        for other in sorted(self._members):
-            self._seen[name].add(other)
-            self.later(functools.partial(self._notice, other, name, True), ("live", other))
+        self._seen[name] = {name, *self._members.keys() - self._unseen}
+        if live:
+            for other in sorted(self._members):
+                self.later(functools.partial(self._notice, other, name, True), ("live", other))
+        else:
+            self._seen[name].discard(name)
+            self._unseen.add(name)
         self._members[name] = bus
         return bus
 
@@ -271,6 +275,7 @@ class MemoryHub:
         """A member is gone; the others notice one journey later."""
         self._members.pop(name, None)
         self._seen.pop(name, None)
+        self._unseen.discard(name)
         for other in sorted(self._members):
             self.later(functools.partial(self._notice, other, name, False), ("live", other))
 

@@ -39,6 +39,9 @@ __all__ = ["Counters", "Exchange", "Inbox", "Mismatch", "Traffic"]
 ORPHANED = 0.5
 """What moves and is nobody's for so long [s] becomes the nearest actor's: somebody must say where it comes to rest."""
 
+ONLOOKER = "spectator"
+"""Kind of actor that owns nothing and says nothing but where it is."""
+
 MOST_EARLY = 100
 """So many messages with facts of one actor are kept until its greeting has come."""
 
@@ -176,7 +179,8 @@ class Exchange:
         inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
         inbox.pushes = self._forces.on_me(now)
         for thing in self._own.corrections(time):
-            self._correct(thing)
+            if self.me.kind != ONLOOKER:
+                self._correct(thing)
         return inbox
 
     def _hear(self, key: str, payload: bytes, time: float, news: dict[int, tuple[Trees, str]], inbox: Inbox) -> None:
@@ -293,10 +297,15 @@ class Exchange:
 
     def _heir(self, thing: int) -> str:
         """Who takes over what a gone actor moved."""
-        where = self._actors.places()
-        if self._window is not None:
+        return authority.successor(self._place(thing), self._able())
+
+    def _able(self) -> dict[str, np.ndarray]:
+        """Where those are who can own things: all but onlookers."""
+        known, where = self._actors.known, self._actors.places()
+        where = {name: place for name, place in where.items() if known[name].hello.kind != ONLOOKER}
+        if self._window is not None and self.me.kind != ONLOOKER:
             where[self.me.name] = self._position
-        return authority.successor(self._place(thing), where)
+        return where
 
     def _correct(self, thing: int) -> None:
         """Say what holds, to all who listen to the thing's cell."""
@@ -370,8 +379,7 @@ class Exchange:
         homeless = {thing for thing in moving if not is_tree(thing) and self.owner(thing) is None}
         self._orphans = {thing: self._orphans.get(thing, now) for thing in homeless}
         for thing in sorted(thing for thing, since in self._orphans.items() if now - since >= ORPHANED):
-            where = self._actors.places() | {self.me.name: self._position}
-            if authority.successor(read(thing)[0][:3], where) == self.me.name:
+            if authority.successor(read(thing)[0][:3], self._able()) == self.me.name:
                 self._own.inherit(thing)
 
     def _follow(self, now: float) -> None:

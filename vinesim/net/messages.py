@@ -33,6 +33,9 @@ MAGIC = b"VS"
 ROBOT, TREES, CLAIMS, FACTS, THINGS, HUMAN, FORCE, HELLO, TIME, WELCOME = 1, 2, 3, 4, 5, 6, 7, 16, 17, 18
 """Kinds of message."""
 
+TIMED = frozenset((ROBOT, TREES, THINGS, HUMAN, FORCE))
+"""Kinds that say in their header at which network time they were true."""
+
 SAMPLE = 1100
 """Samples on the live session stay below this [B], one datagram, as far as a single tree allows."""
 
@@ -120,6 +123,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Index of its label in label images."""
     joints: int = -1
     """How many joints its updates carry; -1 leaves it open until the first one."""
+    seed: int = -1
+    """Seed of its vineyard, for whoever wants to grow the same; -1 keeps it to itself."""
     height: float = 1.75
     """Of a human [m]."""
 
@@ -283,6 +288,22 @@ def kind_of(payload: bytes) -> int:
     if payload[2] != PROTOCOL:
         raise WrongVersion(payload[2])
     return payload[3]
+
+
+def time_of(payload: bytes) -> float | None:
+    """The network time [s] at which a message was true; None if its kind does not say."""
+    if kind_of(payload) not in TIMED or len(payload) < _HEAD.size:
+        return None
+    time = _HEAD.unpack_from(payload)[4]
+    return time if math.isfinite(time) else None
+
+
+def restamped(payload: bytes, shift: float) -> bytes:
+    """The same message as if it had been true ``shift`` seconds later; itself if its kind does not say when it was."""
+    time = time_of(payload)
+    return (
+        payload if time is None else payload[: _HEAD.size - 8] + struct.pack("<d", time + shift) + payload[_HEAD.size :]
+    )
 
 
 def _open(payload: bytes, kind: int, name: str) -> tuple[int, float]:

@@ -16,6 +16,7 @@ ELSEWHERE = 1.0
 """Who is this far [m] from where he was taken to be has been put there: it is shown at once, not blended."""
 
 _BASE = np.arange(3, 7)[None]
+_HIPS = slice(7 * POINTS.index("hips"), 7 * POINTS.index("hips") + 3)
 _TURNS = 7 * np.arange(len(POINTS))[:, None] + _BASE
 
 
@@ -32,6 +33,8 @@ class Actor:
         self.moved_at = -1e9
         self._turns = _TURNS if hello.kind == "human" else _BASE
         """Where in the numbers of a pose its quaternions are [k, 4]."""
+        self._place = _HIPS if hello.kind == "human" else slice(3)
+        """Where the place is by which one sees that it was put elsewhere."""
         self._state = self._rate = self._off = np.zeros(0)
 
     def hear(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
@@ -57,7 +60,7 @@ class Actor:
             here = self._shown(time)
             turn = shown[self._turns]
             shown[self._turns] = np.copysign(1.0, (turn * here[self._turns]).sum(1, keepdims=True)) * turn
-            if float(np.linalg.norm(shown[:3] - here[:3])) < ELSEWHERE:
+            if float(np.linalg.norm((shown - here)[self._place])) < ELSEWHERE:
                 self._off = shown - here
             self.moved_at = time
         return True

@@ -197,9 +197,12 @@ class ZenohBus:
     """See :class:`vinesim.net.bus.Bus`. A context manager: a session left open hangs at exit."""
 
     def __init__(
-        self, name: str, *, connect: str = CONNECT, world: str = WORLD, certificates: pathlib.Path | None = None
-    ) -> None:
+        self, name: str, *, connect: str = CONNECT, world: str = WORLD, certificates: pathlib.Path | None = None,
+        live: bool = True,
+    ) -> None:  # fmt: skip
         """Come into ``world`` as ``name`` through the server at ``connect``, see :func:`endpoints.ways`.
+
+        Not ``live``: nobody sees that one is there.
 
         ``certificates``: folder with ``ca.pem`` and this actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then
         ``tls/`` or ``quic/``. :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the
@@ -216,7 +219,8 @@ class ZenohBus:
         self._store = Store()
         self._answers: collections.deque[tuple[str, bytes, float]] = collections.deque()
         self._live: dict[str, set[str]] = {}
-        self._alive = frozenset((name,))
+        self._me = frozenset((name,)) if live else frozenset()
+        self._alive = self._me
         self._lock = threading.Lock()
         self._gone: set[str] = set()
         """Endpoints that do not answer now."""
@@ -232,7 +236,7 @@ class ZenohBus:
             liveliness = self._session.liveliness()
             self._declared: list[object] = [
                 self._listen_for_loss(self._session, self.endpoint),
-                self._claim_name(),
+                *([self._claim_name()] if live else []),
             ]
             for reply in liveliness.get(f"{self._prefix}live/*/*", timeout=PATIENCE):
                 if reply.ok is not None:
@@ -321,6 +325,8 @@ class ZenohBus:
 
     def _listen_for_loss(self, session: zenoh.Session, endpoint: str) -> object:
         def notice(event: zenoh.TransportEvent) -> None:
+            if session.is_closed() or (self._poses is self._session and session is not self._session):
+                return  # left, or given up: that is no loss
             if event.kind == zenoh.SampleKind.PUT:
                 self._gone.discard(endpoint)
                 log.info("%s: connected to %s again", self.name, endpoint)
@@ -338,7 +344,7 @@ class ZenohBus:
         with self._lock:
             sessions = self._live.setdefault(name, set())
             (sessions.add if there else sessions.discard)(session)
-            self._alive = frozenset(name for name, sessions in self._live.items() if sessions) | {self.name}
+            self._alive = frozenset(name for name, sessions in self._live.items() if sessions) | self._me
 
     # ------------------------------------------------------------ the bus
 

@@ -23,6 +23,8 @@ CARRIED = 0.015, float(np.radians(5.0))
 """The same on a robot's link: what it carries is shaken, and need not be told of while it stays about there."""
 SHAKEN = 0.05, float(np.radians(30.0))
 """The same in a box that moves, where bunches rock and roll; when the box has come to rest, :data:`STILL` counts."""
+JERK = 0.01
+"""[m/s] A box that is as fast moves already, before it has left its band."""
 PATIENCE = 50
 """[tick] So long must a thing be still to be at rest."""
 FAR = 0.5
@@ -45,7 +47,7 @@ class Riding:
         self._generation = -1
         self._parent = np.zeros(0, np.int64)
         self._anchor = np.zeros((0, 7))
-        self._still = np.zeros(0, np.int64)
+        self._still = self._calm = np.zeros(0, np.int64)
         self._at: dict[int, int] = {}
         self._pairs = np.zeros((0, 2), np.int64)
         self._bands_before = np.zeros((0, 2))
@@ -59,6 +61,8 @@ class Riding:
         self._keep_up()
         d = self.rigid.data
         self._still += 1
+        speed = d.qvel[self._v[:, None] + np.arange(3)]
+        self._calm = np.where((speed * speed).sum(1) > JERK * JERK, 0, self._calm + 1)
         self._pairs, self._touched = self._touching(), None
         bands, before = self._bands(), self._bands_before
         self._bands_before = bands
@@ -98,6 +102,27 @@ class Riding:
         if self._touched is None:
             self._touched = self._list_touched()
         return self._touched
+
+    def reached(self, actor: str) -> set[int]:
+        """Things that move and that an actor touches, itself or through others that it touches: boxes, bunches."""
+        self._keep_up()
+        moves = self._still < PATIENCE
+        if not moves.any():
+            return set()
+        bodies = [body for body, (owner, _) in self.rigid.owners.items() if owner == actor]
+        row, other = self._pairs.T
+        touched = np.zeros(len(self.things), bool)
+        touched[row[np.isin(other, bodies)]] = True
+        for hand in self.rigid.person(actor).hands if actor in self.rigid.people else ():
+            held = None if hand.holds is None else thing_named(hand.holds[0])
+            if held in self._at:
+                touched[self._at[held]] = True
+        on = self._row[other]
+        while True:
+            more = row[(on >= 0) & touched[on] & ~touched[row]]
+            if not len(more):
+                return set(self.things[touched & moves].tolist())
+            touched[more] = True
 
     def _list_touched(self) -> list[tuple[int, str]]:
         found = set()
@@ -227,7 +252,7 @@ class Riding:
         """How far each thing may move and turn and still be still [n, 2] m, rad."""
         on = self._row[self._parent]
         carried = self._kind[self._parent] == _LINK
-        shaken = (on >= 0) & ((self._still[on] < PATIENCE) | carried[on])
+        shaken = (on >= 0) & ((np.minimum(self._still, self._calm)[on] < PATIENCE) | carried[on])
         return np.where(shaken[:, None], SHAKEN, np.where(carried[:, None], CARRIED, STILL))
 
     def _touching(self) -> np.ndarray:
@@ -265,7 +290,8 @@ class Riding:
             found[leaning[helped]] = found[on[helped]]
         touches = np.zeros(count, bool)
         touches[row[np.where(self._kind[other] == _STANDS, 0, other) == self._parent[row]]] = True
-        keep = inside & (touches | (found == _NONE))
+        asleep = self.rigid.data.tree_asleep[self._tree] >= 0  # of these MuJoCo tells no contacts
+        keep = (inside & (touches | (found == _NONE))) | asleep
         return np.where(keep, self._parent, np.where(found == _NONE, 0, found))[rows]
 
     def _renew(self) -> None:
@@ -274,7 +300,10 @@ class Riding:
         m = rigid.world
         rigid.refresh()
         names = self._parent_names() if self._at else []
-        known = {number: (names[row], self._anchor[row], self._still[row]) for number, row in self._at.items()}
+        known = {
+            number: (names[row], self._anchor[row], self._still[row], self._calm[row])
+            for number, row in self._at.items()
+        }
         self._generation = rigid.generation
         boxes = [thing(Kind.BOX, i) for i in range(len(rigid.model.box_mass))]
         bunches = [thing(Kind.BUNCH, i) for i in rigid.loose]
@@ -300,11 +329,13 @@ class Riding:
         self._parent = np.zeros(len(self.things), np.int64)
         self._anchor = self._poses(np.arange(len(self.things)))
         self._still = np.where(self.things >= thing(Kind.BOX, 0), PATIENCE, 0)
+        self._calm = self._still.copy()
         self._pairs, self._touched = np.zeros((0, 2), np.int64), None
         self._bands_before = np.tile(STILL, (len(self.things), 1))
-        for number, (parent, anchor, still) in known.items():
+        for number, (parent, anchor, still, calm) in known.items():
             if number in self._at:
                 row = self._at[number]
+                self._calm[row] = calm
                 self._parent[row] = self._body_of(parent)
                 gone = parent != GROUND and self._parent[row] == 0
                 self._still[row] = 0 if gone else still

@@ -1,0 +1,100 @@
+"""``vinesim record``: write down what is sent in a world."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import pathlib
+import signal
+import sys
+import threading
+import time
+
+from vinesim.client.record import FAMILIES, Recorder, Stand, grid
+from vinesim.net.recording import Recording, free_path
+from vinesim.net.zenoh_bus import ZenohBus
+
+POLL = 0.004
+"""Between two looks at what arrived [s]."""
+
+
+class WrongUse(ValueError):
+    """Options that cannot be meant; the text says which."""
+
+
+def run(
+    *, file: pathlib.Path, connect: str, world: str, name: str | None, tls: pathlib.Path | None,
+    scene: str | None, seed: int | None,
+    area: tuple[float, float, float, float] | None, only: str | None, seconds: float | None,
+) -> int:  # fmt: skip
+    """Record until told to stop; 0 if the file is complete."""
+    families = FAMILIES if only is None else tuple(filter(None, only.split(",")))
+    if unknown := [family for family in families if family not in FAMILIES] or ([] if families else [only]):
+        raise WrongUse(f"--only {','.join(map(str, unknown))}: give some of {','.join(FAMILIES)}")
+    stands = grid(area) if area is not None else []
+    about = {"world": world, "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
+    about["asked"] = "what is sent anyway" if area is None else "area " + " ".join(f"{edge:g}" for edge in area)
+    about |= _vineyard(scene, seed)
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    with contextlib.ExitStack() as stack:
+        name = name or f"recorder-{os.getpid()}"
+        bus = stack.enter_context(ZenohBus(name, connect=connect, world=world, certificates=tls, live=False))
+        path = free_path(file)
+        recording = stack.enter_context(Recording(path, about))
+        recorder = Recorder(
+            bus, recording, only=families, everything=area is not None, digest=about.get("digest", "")
+        )  # fmt: skip
+        other = f" ({file} is there already and stays as it is)" if path != file else ""
+        print(f"recording world {world} at {connect} into {path}{other}", file=sys.stderr, flush=True)
+        standing: list[Stand] = []
+        begun = said = time.monotonic()
+        while not stop.wait(POLL):
+            now = time.monotonic()
+            if seconds is not None and now - begun >= seconds:
+                break
+            if recorder.digest and len(standing) < len(stands):
+                own = f"{name}-{len(standing) + 1}"
+                recorder.own.add(own)
+                there = stack.enter_context(ZenohBus(own, connect=connect, world=world, certificates=tls))
+                scene_name = recording.about.get("scene", "")
+                standing.append(Stand(there, stands[len(standing)], scene_name, recorder.digest, now))
+            recorder.step()
+            for stand in standing:
+                stand.step(now)
+            if now - said >= 1.0:
+                said = now
+                _progress(recorder, now - begun, alone=area is None and len(recorder.actors) < 2)
+        recorder.close()
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    print(f"{path}: {recording.count} messages, {recording.size} B, {time.monotonic() - begun:.1f} s", file=sys.stderr)
+    return 0
+
+
+def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
+    """What a scene file says of the only vineyard that is to be recorded."""
+    if scene is None:
+        if seed is not None:
+            raise WrongUse(f"--seed {seed}: a seed is of a scene, give --scene too")
+        return {}
+    from vinesim.world.generate import generate
+    from vinesim.world.scene import load, reseeded
+
+    plan = reseeded(load(scene), seed)
+    return {"scene": plan.name, "seed": str(plan.seed), "digest": generate(plan).digest()}
+
+
+def _progress(recorder: Recorder, elapsed: float, alone: bool) -> None:
+    """One line that is written over, on a terminal; nothing into a file."""
+    if not sys.stderr.isatty():
+        return
+    trouble = recorder.bus.trouble
+    company = ", ".join(sorted(recorder.actors)) or "nobody"
+    hint = "  (with fewer than two actors nothing is sent; --area asks for it)" if alone else ""
+    line = f"{elapsed:7.1f} s  {recorder.recording.count} messages  {recorder.recording.size / 1e6:.2f} MB  {company}"
+    width = os.get_terminal_size(sys.stderr.fileno()).columns - 1
+    print(f"\r{(trouble or line + hint)[:width]:<{width}}", end="", file=sys.stderr, flush=True)

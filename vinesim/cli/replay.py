@@ -1,0 +1,134 @@
+"""``vinesim replay``: let a recording happen again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pathlib
+import signal
+import sys
+import threading
+import time
+
+import numpy as np
+
+from vinesim.net import messages
+from vinesim.net.poses import decode_pose
+from vinesim.net.recording import NotARecording, Tape, read, sender_of
+
+POLL = 0.004
+"""Between two looks at what is due [s]."""
+
+
+class WrongUse(ValueError):
+    """Options that cannot be meant; the text says which."""
+
+
+def run(
+    *, file: pathlib.Path, connect: str | None, listen: str | None, world: str, speed: float, start: float,
+    end: float | None, out: pathlib.Path | None, place: tuple[float, float, float] | None, scene: str | None,
+    seed: int | None,
+) -> int:  # fmt: skip
+    """Play a file; 0 when its end is reached, or on Ctrl-C."""
+    if sum(way is not None for way in (connect, listen, out)) != 1:
+        raise WrongUse("give one of --connect (play to a server), --listen (be one) and --out (look at it)")
+    tape = read(file)
+    if tape.damage:
+        print(tape.damage, file=sys.stderr, flush=True)
+    if not tape.entries:
+        raise NotARecording(f"{file} holds no message: nothing can be replayed")
+    if start >= tape.length or (end is not None and end <= start):
+        raise WrongUse(f"--from {start:g}{'' if end is None else f' --to {end:g}'}: {file} lasts {tape.length:.1f} s")
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    who = ", ".join(tape.actors) or "nobody"
+    print(f"{file}: {len(tape.entries)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
+    if out is not None:
+        return _look(tape, stop, out, place, scene, seed, speed, start, end)
+    return _tell(tape, stop, connect, listen, world, speed, start, end)
+
+
+def _tell(
+    tape: Tape, stop: threading.Event, connect: str | None, listen: str | None, world: str, speed: float,
+    start: float, end: float | None,
+) -> int:  # fmt: skip
+    """Play to a network."""
+    from vinesim.client.replay import Replay
+    from vinesim.net.server import Server
+    from vinesim.net.zenoh_bus import ZenohBus
+
+    with contextlib.ExitStack() as stack:
+        if listen is not None:
+            server = stack.enter_context(Server(listen))
+            connect = server.endpoint
+            print(f"listening on {connect}", flush=True)
+            while not (server.actors or stop.wait(POLL)):  # begin when somebody is there to see it
+                pass
+        assert connect is not None
+        endpoint = connect
+
+        def bus(name: str, live: bool = True) -> ZenohBus:
+            return ZenohBus(name, connect=endpoint, world=world, live=live)
+
+        teller = stack.enter_context(bus(f"replay-{os.getpid()}", live=False))
+        play = Replay(tape, teller, bus, time.monotonic(), speed=speed, start=start, end=end)
+        stack.callback(play.close)
+        while not (play.ended or stop.wait(POLL)):
+            play.step(time.monotonic())
+    print(f"{play.sent} messages were heard", file=sys.stderr)
+    return 0
+
+
+def _look(
+    tape: Tape, stop: threading.Event, out: pathlib.Path, place: tuple[float, float, float] | None,
+    scene: str | None, seed: int | None, speed: float, start: float, end: float | None,
+) -> int:  # fmt: skip
+    """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
+    from vinesim.client.replay import ReplayBus
+    from vinesim.client.spectator import Pictures, Spectator, looking_at, viewpoint
+    from vinesim.world.generate import generate
+    from vinesim.world.scene import SceneError, load, reseeded
+
+    if scene is None and "scene" not in tape.about:
+        raise WrongUse(f"{tape.path} does not say which scene it is of: give --scene")
+    if seed is None and "seed" in tape.about:
+        seed = int(tape.about["seed"])
+    try:
+        plan = reseeded(load(scene or tape.about["scene"]), seed)
+    except SceneError as error:
+        raise SceneError(f"the scene of {tape.path}: {error}; give --scene FILE") from error
+    model = generate(plan)
+    digest = tape.about.get("digest", model.digest())
+    if digest != model.digest():
+        raise NotARecording(
+            f"{tape.path} is of scene {tape.about.get('scene', '?')!r} with digest {digest}, "
+            f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
+        )
+    eyes = viewpoint(*place) if place is not None else looking_at(_first_pose(tape))
+    out.mkdir(parents=True, exist_ok=True)
+    bus = ReplayBus(tape, "spectator", start=start, end=end)
+    spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
+    pictures = Pictures(spectator, out, 1.0)
+    while not (bus.ended or stop.is_set()):
+        bus.play(spectator.physics.dt * speed)
+        if place is None and spectator.physics.rigid.robots:
+            spectator.pose = looking_at(spectator.physics.rigid.base(min(spectator.physics.rigid.robots))[0])
+        spectator.tick()
+    pictures.save(spectator)
+    print(f"{pictures.count} pictures are in {out}/", file=sys.stderr)
+    return 0
+
+
+def _first_pose(tape: Tape) -> np.ndarray:
+    """Where the first robot stood [7] when it was first heard of, or if there is none, the first person."""
+    for kind in ("robot", "human"):
+        such = {
+            sender_of(entry.key)
+            for entry in tape.entries
+            if entry.key.startswith("hello/") and messages.decode_hello(entry.payload).kind == kind
+        }
+        for entry in tape.entries:
+            if entry.key.startswith("a/") and sender_of(entry.key) in such:
+                return decode_pose(entry.payload, "").base_q
+    raise WrongUse(f"{tape.path} has no pose of anybody to look at: give --place X Y YAW")

@@ -1,0 +1,123 @@
+"""The spectator role: a client without a robot, that sees what happens near its place and touches nothing."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.client.client import Client, label_index
+from vinesim.net.bus import Bus
+from vinesim.net.exchange import ONLOOKER, Exchange
+from vinesim.net.messages import Hello
+from vinesim.robot.description import Description
+from vinesim.sensors import picture
+from vinesim.sensors.camera import Camera, CameraSpec
+from vinesim.sensors.eyes import load_kernels
+from vinesim.sensors.primitives import Primitives
+from vinesim.world.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
+
+EYES = 1.6
+"""Height of a standing person's eyes above the ground [m]."""
+
+ASIDE = 2.6
+"""Whoever is looked at is seen from this far [m], ..."""
+
+TURN = 0.7
+"""... from this far [rad] beside straight behind it, ..."""
+
+MIDDLE = 1.2
+"""... and at this height [m]."""
+
+
+def viewpoint(x: float, y: float, heading: float) -> np.ndarray:
+    """Pose [7] of the eyes of somebody who stands at (x, y) [m] and looks along ``heading`` [rad]."""
+    return frames.pose([x, y, EYES], frames.yaw(heading))
+
+
+def looking_at(base: np.ndarray) -> np.ndarray:
+    """Pose [7] of the eyes of somebody who looks over the shoulder of a robot whose base is at ``base`` [7]."""
+    ahead = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
+    heading = float(np.arctan2(ahead[1], ahead[0])) + TURN
+    eye = base[:2] - ASIDE * np.array([np.cos(heading), np.sin(heading)])
+    return viewpoint(float(eye[0]), float(eye[1]), heading)
+
+
+class Spectator(Client):
+    """A client that only looks. ``pose`` [7] are its eyes: x forward, z up; change :attr:`pose` to walk."""
+
+    picking = False  # it is told what parts
+
+    def _enter(
+        self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
+        height: float, bus: Bus,
+    ) -> None:  # fmt: skip
+        self.pose = np.asarray(pose, float)
+        hello = Hello(
+            name=self.name, kind=ONLOOKER, scene=self.scene.name, digest=self.model.digest(),
+            index=label_index(self.name), joints=0, seed=self.scene.seed,
+        )  # fmt: skip
+        self.exchanges[self.name] = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
+
+    def sense(self) -> None:
+        """Show the world to whoever wants to see it."""
+        for sense in self.senses:
+            sense(self)
+
+    def send(self, now: float) -> None:
+        """Say where the eyes are, and no more."""
+        here = RobotUpdate(self.name, now, self.pose, np.zeros(6), np.zeros(0), np.zeros(0))
+        self.things.look()
+        self.exchange.send(now, here, read=self.things.read)
+
+
+class Pictures:
+    """What a spectator sees, as files ``view_SECONDS.png``; the last one also with depth and labels.
+
+    Drawn in the tick, so each shows exactly the state it names, and a replay draws the same ones every time; a
+    spectator has no robot that would miss the beat.
+    """
+
+    WIDTH, HEIGHT, ANGLE = 960, 640, 1.2
+    """Size [px] and horizontal field of view [rad]."""
+
+    def __init__(self, spectator: Spectator, folder: pathlib.Path, period: float = 1.0) -> None:
+        """One every ``period`` seconds of simulated time, into a folder that exists."""
+        load_kernels()
+        focal = 0.5 * self.WIDTH / np.tan(0.5 * self.ANGLE)
+        info = CameraInfo(
+            self.WIDTH, self.HEIGHT, focal, focal, 0.5 * (self.WIDTH - 1), 0.5 * (self.HEIGHT - 1), "viewpoint"
+        )
+        sun = spectator.scene.sun.direction()
+        self.folder, self.count = folder, 0
+        self.last: CameraFrame | None = None
+        self._camera = Camera(CameraSpec.load("pinhole"), info, "viewpoint", sun, shadow_period=0.0)
+        self._primitives = Primitives(spectator.model)
+        self._moved = np.zeros(len(spectator.model.tree_first), bool)
+        self._every = max(round(period / spectator.physics.dt), 1)
+        spectator.senses.append(self._see)
+
+    def _see(self, client: Client) -> None:
+        assert isinstance(client, Spectator)
+        physics = client.physics
+        self._moved[physics.plants.awake] = True
+        if physics.tick % self._every == 0:
+            self._draw(client)
+
+    def _draw(self, spectator: Spectator) -> None:
+        view = spectator.physics.view()
+        self._primitives.update(view, np.flatnonzero(self._moved))
+        self._moved[:] = False
+        ahead = frames.rotate(spectator.pose[3:], np.array([1.0, 0.0, 0.0]))
+        eye = picture.looking(spectator.pose[:3], spectator.pose[:3] + ahead)
+        self.last = self._camera.render(self._primitives, eye, view.time)
+        self.count += 1
+        picture.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
+
+    def save(self, spectator: Spectator) -> None:
+        """Draw what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
+        self._draw(spectator)
+        assert self.last is not None
+        picture.save(self.last, self.folder, "")
