@@ -241,3 +241,11 @@ def test_secured_from_certificate_to_client(tmp_path):
 def test_wrong_use(arguments, words, tmp_path):
     refused(vinesim(*arguments, cwd=tmp_path), 2, *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_person_joins_and_goes(tmp_path):
+    ended = vinesim("client", "--role", "human", "--reach", "3", "--seconds", "1", "--out", str(tmp_path), cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["name"].startswith("human-")
+    assert report["time"] == pytest.approx(1.0)

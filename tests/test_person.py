@@ -6,16 +6,25 @@ import dataclasses
 
 import numpy as np
 import pytest
+import seeing
 from touch_scenes import cane
 
 from vinesim import frames
-from vinesim.client.client import Client
+from vinesim.cli.human import before
+from vinesim.client.client import Client, label_index
+from vinesim.client.places import bunch_centres, bunch_in_reach, start_pose
 from vinesim.client.walker import Legs, Walker
 from vinesim.net import poses
 from vinesim.net.bus import MemoryHub
 from vinesim.physics.people import PARTS, standing
 from vinesim.robot.description import Description, load
+from vinesim.sensors.camera import Camera
+from vinesim.sensors.lidar import Lidar, LidarSpec
+from vinesim.sensors.picture import looking
+from vinesim.sensors.primitives import Primitives
+from vinesim.world.generate import generate
 from vinesim.world.grow import assemble
+from vinesim.world.ids import Organ, label
 from vinesim.world.scene import load as load_scene
 from vinesim.world.values import HumanPose
 
@@ -172,6 +181,39 @@ def test_who_is_set_down_elsewhere_is_there_at_once():
     assert x == pytest.approx(there.hips[0], abs=1e-3)
 
 
+def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
+    """F59, F62: points with the label of each lie where it is on its own client."""
+    world = World()
+    anna = world.join("anna", vinebot, frames.pose(np.zeros(3)))
+    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.yaw(2.0)))
+    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.yaw(1.0)))
+    world.run(0.8)
+    view = anna.physics.view()
+    primitives = Primitives(world.model, grass=0.0)
+    primitives.update(view)
+    eye = np.array([0.0, 0.0, 1.3])
+    scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, frames.pose(eye))
+    gaze = looking(eye, np.array([3.0, -0.4, 1.0]))
+    frame = Camera(seeing.IDEAL, seeing.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, gaze)
+    seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
+    for organ, name, at in (
+        (Organ.HUMAN, "eva", eva.physics.rigid.stands("eva")),
+        (Organ.ROBOT, "bert", bert.physics.rigid.stands("bert")),
+    ):
+        mine = label(organ, label_index(name))
+        points = eye + scan.xyz[scan.labels == mine].astype(float)
+        assert len(points) > 50, name
+        assert np.linalg.norm(points[:, :2] - at[:2], axis=1).max() < 0.8
+        here = seen == mine
+        assert here.sum() > 50, name
+        info, depth = frame.info, frame.depth[here].astype(float)
+        rays = np.stack([(columns[here] - info.cx) / info.fx, (rows[here] - info.cy) / info.fy, np.ones(len(depth))], 1)
+        found = gaze[:3] + frames.rotate(gaze[3:], rays * depth[:, None])
+        assert np.linalg.norm(found[:, :2] - at[:2], axis=1).max() < 0.8
+        assert found[:, 2].min() > -0.01
+        assert found[:, 2].max() < 2.2
+
+
 # ---------------------------------------------------------------------- felt
 
 
@@ -292,3 +334,44 @@ def test_an_arm_that_comes_to_a_hand_feels_it(vinebot):
     assert shove.felt()[1] < -3.0, "the hand pushes back"
     np.testing.assert_allclose(shove.felt(), shove.given(), atol=0.05 * np.abs(shove.given()).max())
     assert np.abs(efforts).max() > 1.0
+
+
+# ---------------------------------------------------------------------- plants and what grows on them
+
+
+def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
+    """F74 with a human: held by the hand on one client, it moves on the other, whose copy of the hand holds nothing."""
+    world = World()
+    world.scene = load_scene("demo")
+    world.model = generate(world.scene)
+    stand = start_pose(world.scene, 0)
+    bunch = bunch_in_reach(world.model, stand)
+    body = int(world.model.bunch_body[bunch])
+    centre = bunch_centres(world.model)[bunch]
+    walker = Walker(frames.pose(np.array([*before(centre, stand), 0.0]), stand[3:]))
+    eva = world.join("eva", None, walker.root, walker)
+    aside = frames.compose(stand, frames.pose(np.array([-1.5, 1.0, 0.0])))
+    anna = world.join("anna", vinebot, aside)
+    world.run(0.6)
+    middle = np.array([0.5 * float(world.model.bunch_length[bunch]), 0.0, 0.0])
+    walker.do(
+        walker.face(tuple(centre[:2])), walker.reach("right", lambda: centre), walker.wait(0.3),
+        walker.withdraw("right", 0.4), walker.wait(0.5),
+    )  # fmt: skip
+    for _ in range(400):
+        world.run(DT)
+        if eva.physics.hand("eva", "right").holds is not None:
+            break
+    assert eva.physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    world.run(1.6)
+    for client in world.clients:
+        client.physics.refresh()
+    poses_now = [client.physics.state.body_q[body].astype(float) for client in world.clients]
+    here, there = (pose[:3] + frames.rotate(pose[3:], middle) for pose in poses_now)
+    assert np.linalg.norm(here - centre) > 0.05
+    assert np.linalg.norm(there - here) < 0.02
+    assert anna.exchange.owner(int(world.model.body_tree[body])) == "eva"
+    assert anna.physics.hand("eva", "right").holds is None
+    np.testing.assert_allclose(
+        anna.physics.hand("eva", "right").pose[:3], eva.physics.hand("eva", "right").pose[:3], atol=0.01
+    )

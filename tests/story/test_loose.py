@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
-from loose_world import BOX, BUNCH, World, apart, heard, pose_of, sent
+from loose_world import BOX, BUNCH, World, apart, heard, pose_of, sent, vineyard
 
 from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.physics.people import standing
 from vinesim.world.ids import Kind, Organ, thing_named
+from vinesim.world.values import HumanPose
 
 
 def drive(client: Client, speed: float) -> None:
@@ -330,3 +334,39 @@ def test_a_robot_that_leaves_leaves_behind_what_rode_on_it():
     assert (fact.author, fact.parent, fact.moving) == ("bob", "", False)
     assert fact.pose[2] < 0.05
     np.testing.assert_allclose(fact.pose[:2], deck[:2], atol=0.1)
+
+
+def test_a_person_takes_a_bunch_off_its_vine_carries_it_and_lets_it_fall_for_everybody():
+    """F74, F76 by hand: pulled off, told of while it is carried, silent where it lies."""
+    weak = vineyard.__wrapped__()
+    weak.bunch_pull[:] = 20.0
+    world = World(weak)
+    ada, bob = world.join("ada", 1.0, -2.5), world.join("bob", -1.0, -2.5)
+    hang = weak.forward(weak.joint_settled)[weak.bunch_body[0], :3] - [0.0, 0.0, 0.08]
+    stands, facing = frames.pose([1.65, 0.0, 0.0], frames.yaw(np.pi)), frames.yaw(np.pi)
+
+    def source(time: float) -> HumanPose:
+        come, carry = np.clip((time - 0.5) / 0.5, 0.0, 1.0), np.clip((time - 1.4) / 1.2, 0.0, 1.0)
+        at = hang + np.array([0.075 + 0.25 * (1.0 - come) + 0.1 * carry, -0.8 * carry, -0.2 * carry])
+        return dataclasses.replace(standing(stands), right=frames.pose(at, facing), right_closed=1.1 < time < 2.8)
+
+    eva = Client(
+        world.scene, weak, None, world.hub.bus("eva"), name="eva", pose=stands, source=source, clock=lambda: world.now
+    )
+    eva.physics.wind = None
+    world.clients["eva"] = eva
+    world.run(1.3)
+    assert eva.physics.hand("eva", "right").holds[0] == "plants"
+    world.until(lambda: not eva.physics.state.bunch_attached[0], 1.5)
+    world.run(0.1)
+    for client in (ada, bob):
+        assert not client.physics.state.bunch_attached[0]
+        assert client.exchange.owner(BUNCH(0)) == "eva"
+        assert apart(eva, client, BUNCH(0)) < 0.06
+    world.until(lambda: eva.physics.hand("eva", "right").holds is None, 2.0)
+    world.until(lambda: at_rest(world), 8.0)
+    world.run(0.1)
+    assert pose_of(eva, BUNCH(0))[2] < 0.3
+    for client in (ada, bob):
+        assert client.physics.riding.lies(BUNCH(0))[0] == ""
+        assert apart(eva, client, BUNCH(0)) < 5e-3

@@ -250,7 +250,7 @@ def record(
 def replay(
     file: Annotated[pathlib.Path, typer.Argument(help="A file that vinesim record wrote, whole or cut off.")],
     connect: Annotated[str | None, typer.Option(help="Play it to this server.")] = None,
-    listen: Annotated[str | None, typer.Option(help="Be a server and play it to whoever connects.")] = None,
+    listen: Annotated[str | None, typer.Option(help="Be a server, and play it once somebody is there.")] = None,
     world: Annotated[str, typer.Option(help="Which of the server's worlds.")] = "vineyard",
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Times as fast as it was.")] = 1.0,
     start: Annotated[float, typer.Option("--from", min=0.0, help="Seconds after its beginning to start at.")] = 0.0,

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import pathlib
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,10 +23,11 @@ if TYPE_CHECKING:
 def run(
     *, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None, spawn: int,
     place: tuple[float, float, float] | None, walk: tuple[float, float] | None, reach: int | None, height: float,
-    near: float, device: str, threads: int, seconds: float | None, out: pathlib.Path | None, status: str, **_: Any,
+    near: float, jitter_buffer: float, device: str, threads: int, seconds: float | None, out: pathlib.Path | None,
+    status: str, **_: Any,
 ) -> int:  # fmt: skip
     """Walk, reach for a bunch, hold it and pull at it, let go; until told to stop. Then write report.json."""
-    from vinesim.cli.join import speak
+    from vinesim.cli.join import SWITCH, WrongUse, speak
     from vinesim.client.client import Client
     from vinesim.client.pace import Pace
     from vinesim.client.places import bunch_centres, checked_bunch, placed, start_pose
@@ -34,6 +38,9 @@ def run(
     from vinesim.world.generate import generate
     from vinesim.world.scene import load, reseeded
 
+    if status not in ("text", "json", "none"):
+        raise WrongUse(f"--status {status!r}: give text, json or none")
+    sys.setswitchinterval(SWITCH)
     plan = reseeded(load(scene), seed)
     if place is not None:
         plan, spawn = placed(plan, *place), 0
@@ -51,9 +58,11 @@ def run(
 
             bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
         client = Client(
-            plan, model, None, bus, name=name, pose=start, source=walker, height=height, near=near, device=device,
-            threads=threads,
+            plan, model, None, bus, name=name, pose=start, source=walker, height=height, near=near,
+            jitter_buffer=1e-3 * jitter_buffer, device=device, threads=threads,
+            executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
+        stack.callback(client.leave)
         if walk is not None:
             walker.do(walker.walk(walk))
         if reach is not None:
@@ -68,6 +77,8 @@ def run(
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
+        gc.collect()
+        gc.freeze()  # what lives now lives to the end; the collector need not look at it in a tick
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         limit = None if seconds is None else round(seconds / client.physics.dt)

@@ -63,6 +63,8 @@ def _tell(
             server = stack.enter_context(Server(listen))
             connect = server.endpoint
             print(f"listening on {connect}", flush=True)
+            while not (server.actors or stop.wait(POLL)):  # begin when somebody is there to see it
+                pass
         assert connect is not None
         endpoint = connect
 

@@ -15,7 +15,11 @@ from vinesim.world.values import POINTS, HumanUpdate, RobotUpdate
 ELSEWHERE = 1.0
 """Who is this far [m] from where he was taken to be has been put there: it is shown at once, not blended."""
 
+FAR_SHOWN = 0.1
+"""Of who is far away nothing is heard for 200 ms: what is shown of him is computed anew only so often [s]."""
+
 _BASE = np.arange(3, 7)[None]
+_HIPS = slice(7 * POINTS.index("hips"), 7 * POINTS.index("hips") + 3)
 _TURNS = 7 * np.arange(len(POINTS))[:, None] + _BASE
 
 
@@ -32,7 +36,10 @@ class Actor:
         self.moved_at = -1e9
         self._turns = _TURNS if hello.kind == "human" else _BASE
         """Where in the numbers of a pose its quaternions are [k, 4]."""
+        self._place = _HIPS if hello.kind == "human" else slice(3)
+        """Where the place is by which one sees that it was put elsewhere."""
         self._state = self._rate = self._off = np.zeros(0)
+        self._seen: RobotUpdate | HumanUpdate | None = None
 
     def hear(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
         """Take a newer pose at network ``time``; False if it is not newer."""
@@ -48,7 +55,7 @@ class Actor:
             if len(update.position) != self.joints:
                 raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
         shown = None if self.update is None else self._shown(time)
-        self.update = update
+        self.update, self._seen = update, None
         self._state, self._rate = _numbers(update)
         self._off = np.zeros(0)
         if self._buffer.delay > 0.0:
@@ -57,13 +64,18 @@ class Actor:
             here = self._shown(time)
             turn = shown[self._turns]
             shown[self._turns] = np.copysign(1.0, (turn * here[self._turns]).sum(1, keepdims=True)) * turn
-            if float(np.linalg.norm(shown[:3] - here[:3])) < ELSEWHERE:
+            if float(np.linalg.norm((shown - here)[self._place])) < ELSEWHERE:
                 self._off = shown - here
             self.moved_at = time
         return True
 
     def at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
-        """The pose at network ``time``, to be shown ``now``."""
+        """The pose at network ``time``, to be shown ``now``; of an actor that is not near, at most 100 ms old."""
+        if self._seen is None or self.near is not None or not 0.0 <= now - self._seen.time < FAR_SHOWN:
+            self._seen = self._at(time, now)
+        return self._seen
+
+    def _at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
         heard, shown = self.update, self._shown(time)
         assert heard is not None
         going = 1.0 if time - heard.time <= smooth.EXTRAPOLATION else 0.0

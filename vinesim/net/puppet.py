@@ -54,6 +54,10 @@ def row(count: int = 12, *, apart: float = 1.0) -> Model:
     return assemble(trees, box_pose=boxes, box_size=np.tile([0.4, 0.3, 0.24], (count, 1)), box_mass=np.full(count, 1.0))
 
 
+SILENCE = 1.5
+"""After this [s] without news of a tree the next ones begin a new touch."""
+
+
 class Puppet:
     """The least client: it stands somewhere and swings its arms, touches trees, and believes what it hears."""
 
@@ -93,6 +97,9 @@ class Puppet:
         self.went: dict[str, float] = {}
         self.heard: dict[int, float] = {}
         """When each tree was last heard of, by one's own clock [s]."""
+        self.first: dict[int, float] = {}
+        """When news of each tree last began to come [s]."""
+        self._rested: set[int] = set()
         self.moved: dict[int, np.ndarray] = {}
         """Where others last moved boxes and loose bunches [7]."""
         self.facts: dict[int, dict[str, Any]] = {}
@@ -113,7 +120,10 @@ class Puppet:
         for name in inbox.left:
             self.went[name] = now
         for update in inbox.trees:
+            if now - self.heard.get(update.tree, -np.inf) > SILENCE or update.tree in self._rested:
+                self.first[update.tree] = now
             self.heard[update.tree] = now
+            (self._rested.add if update.resting else self._rested.discard)(update.tree)
         for thing in inbox.things:
             if thing.thing not in self.moved or not np.array_equal(self.moved[thing.thing], thing.pose):
                 self.moved[thing.thing], self.heard[thing.thing] = thing.pose, now
@@ -176,6 +186,7 @@ class Puppet:
             "claim": {thing: list(exchange.claim(thing)) for thing in sorted(exchange.known)},
             "facts": self.facts,
             "heard": self.heard,
+            "first": self.first,
             "released": self.released,
             "poses": {name: getattr(one, "position", one.base_q)[:1].tolist() for name, one in self.robots.items()},
             "counters": dataclasses.asdict(exchange.counters),
