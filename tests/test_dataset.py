@@ -53,11 +53,12 @@ def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """A data set made by two processes."""
+    """A data set made in this process, in one go."""
     out = tmp_path_factory.mktemp("whole") / "set"
-    done = subprocess.run(_command(scene, out, 2), capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert f"{IMAGES} images" in done.stdout
+    plan = Plan(load(scene), 5, "d435", (160, 120))
+    dataset.begin(plan, out)
+    assert list(dataset.draw(plan, out, dataset.missing(out, IMAGES))) == list(range(IMAGES))
+    dataset.finish(out, IMAGES)
     return out
 
 
@@ -90,7 +91,7 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     assert 0 < len(done) < IMAGES
     assert not (out / "annotations.json").exists()
     (out / "images" / ".000001.png.1.part").write_bytes(b"half")  # as a kill may leave it
-    last = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    last = subprocess.run(_command(scene, out, 2), capture_output=True, text=True, timeout=120)
     assert last.returncode == 0, last.stderr
     assert {name: _records(out)[name] for name in done} == done
     assert _files(out) == _files(whole)

@@ -280,8 +280,9 @@ def test_flow_of_a_moved_camera_lands_on_the_same_points(grove) -> None:
     v, u = np.nonzero(shown)
     there = np.round(np.stack([u, v], 1) + shift[v, u]).astype(int)
     points = _points(one, shown)
-    second = _points(two, np.ones(two.depth.shape, bool)).reshape(*two.depth.shape, 3)
-    apart = np.linalg.norm(points - second[there[:, 1], there[:, 0]], axis=1)
+    row, column = there[:, ::-1].T
+    ray = seeing.pixel_rays(NEAR)[row, column] * two.depth[row, column].astype(float)[:, None]
+    apart = np.linalg.norm(points - two.pose[:3] - frames.rotate(two.pose[3:], ray), axis=1)
     pixel = one.depth[v, u] / NEAR.fx
     assert np.median(apart / pixel) < 1.0  # half a pixel each way, more on slanted surfaces
     # closed form for the ground: a homography, in double precision
