@@ -109,13 +109,7 @@ class Visibility:
         self, primitives: Primitives, lens: visibility.Pinhole, nearest: float = 0.0, farthest: float = REACH
     ) -> None:
         """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
-        clusters = len(primitives.cluster_first)
-        if len(self._distance) != clusters:
-            self._distance = wp.empty(clusters, dtype=float, device=self.device)
-        wp.launch(
-            visibility.cull, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
-        )
-        distance = self._distance.numpy()
+        distance = self.distances(primitives, lens)
         seen = np.flatnonzero(distance < float(shapes.FAR))
         self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
         wp.launch(
@@ -134,6 +128,16 @@ class Visibility:
             outputs=[self.primitive, self.depth, self.labels],
             device=self.device,
         )
+
+    def distances(self, primitives: Primitives, lens: visibility.Pinhole) -> np.ndarray:
+        """How near each cluster may come to the eye [cluster] m; :data:`shapes.FAR` if no pixel can see it."""
+        clusters = len(primitives.cluster_first)
+        if len(self._distance) != clusters:
+            self._distance = wp.empty(clusters, dtype=float, device=self.device)
+        wp.launch(
+            visibility.cull, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
+        )
+        return self._distance.numpy()
 
     def alone(self, primitives: Primitives, lens: visibility.Pinhole, clusters: np.ndarray) -> np.ndarray:
         """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""

@@ -13,6 +13,7 @@ import itertools
 import numpy as np
 
 from vinesim import frames
+from vinesim.kernels.shapes import FAR
 from vinesim.sensors import cloud
 from vinesim.sensors.camera import Visibility, pinhole
 from vinesim.sensors.primitives import CONE, SPHEROID, Primitives
@@ -192,8 +193,9 @@ def of_bunches(
     alone, lens = Visibility(info.width, info.height, primitives.device), pinhole(info, seen.pose)
     caster = caster or RayCaster(primitives)
     named = primitives.label[primitives.cluster_first]
-    fruit = np.flatnonzero((named // LABEL_STRIDE == int(Organ.BUNCH)) & primitives.shown())
-    fruit = fruit[_may_be_seen(primitives, seen)[fruit]]
+    fruit = np.flatnonzero(named // LABEL_STRIDE == int(Organ.BUNCH))
+    fruit = fruit[np.isin(named[fruit], named[fruit][alone.distances(primitives, lens)[fruit] < float(FAR)])]
+    fruit = fruit[primitives.shown()[fruit]]
     count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
     posed = [getattr(primitives.shapes, k).numpy() for k in "ab"]
     loose = {one.index: k for k, one in enumerate(view.links) if one.organ == Organ.BUNCH}
@@ -296,13 +298,6 @@ def flow(first: Look, second: Look) -> tuple[np.ndarray, np.ndarray]:
     column, row = near[inside].astype(int).T
     shown[v[inside], u[inside]] = second.primitive[row, column] == primitive[inside]
     return shift, shown
-
-
-def _may_be_seen(primitives: Primitives, seen: Look) -> np.ndarray:
-    """Whether each cluster's ball reaches in front of the camera [cluster]; the picture's edge is left to the draw."""
-    ball = primitives.ball.numpy()
-    ahead = frames.rotate(seen.pose[3:], np.array([0.0, 0.0, 1.0]))
-    return (ball[:, :3] - seen.pose[:3]) @ ahead > -ball[:, 3]
 
 
 def _unhidden(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
