@@ -39,10 +39,22 @@ def free_port():
 
 def test_help_shows_every_command_with_examples():
     top = vinesim("--help").stdout
-    for command in ("demo", "server", "client", "record", "replay", "scene", "bench", "ros", "certs"):
+    for command in (
+        "demo",
+        "server",
+        "client",
+        "record",
+        "replay",
+        "scene",
+        "bench",
+        "ros",
+        "certs",
+        "render",
+        "dataset",
+    ):
         assert command in top
     commands = (["demo"], ["server"], ["client"], ["scene", "show"], ["bench"], ["ros", "build-interfaces"])
-    for command in (*commands, ["certs", "new"], ["record"], ["replay"]):
+    for command in (*commands, ["certs", "new"], ["record"], ["replay"], ["render"], ["dataset"]):
         assert "Examples:" in vinesim(*command, "--help").stdout, command
 
 

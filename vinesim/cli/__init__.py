@@ -298,6 +298,63 @@ def scene_show(
 
 
 @app.command()
+def render(
+    scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
+    at: Annotated[str, typer.Option(help="Where the camera stands, X,Y,Z [m].")],
+    look: Annotated[str, typer.Option(help="The point it looks at, X,Y,Z [m].")],
+    camera: Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")] = "d435",
+    size: Annotated[
+        str | None, typer.Option(help="WxH [px] at the same horizontal field of view; the camera's own unless given.")
+    ] = None,
+    seed: Seed = None,
+    out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its truth.")] = pathlib.Path("render"),
+) -> None:
+    """Draw one picture, and say all that is true of it: ids, masks, boxes, berries, cut points.
+
+    Writes rgb.png, depth.png (16 bits, mm), labels.png (id = R + 256 G + 65536 B), overlay.png, camera.json and
+    truth.json.
+
+    \b
+    Examples:
+      vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7
+      vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
+    """
+    from vinesim.cli.render import run
+
+    raise typer.Exit(run(scene, camera=camera, at=at, look=look, size=size, seed=seed, out=out))
+
+
+@app.command()
+def dataset(
+    images: Annotated[int, typer.Option(min=1, max=999_999, help="How many.")],
+    out: Annotated[pathlib.Path, typer.Option(help="Folder of the data set; one that was begun is gone on with.")],
+    scene: Scene = "demo",
+    seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
+    camera: Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")] = "d435",
+    size: Annotated[
+        str | None, typer.Option(help="WxH [px] at the same horizontal field of view; the camera's own unless given.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Processes; half as many as cores unless given.")
+    ] = None,
+) -> None:
+    """Draw random pictures of random vineyards with their truth: COCO with masks, YOLO, depth, ids, poses.
+
+    Seed of the vines, leaves, varieties, hour and season of the sun and the viewpoint are drawn for you. Killed or
+    stopped, the same command goes on; more images may be asked for later.
+
+    \b
+    Examples:
+      vinesim dataset --images 1000 --out grapes
+      vinesim dataset --images 200 --out vsp --scene vsp --seed 3 --camera pinhole --size 320x240 --workers 4
+    """
+    options = dict(locals())
+    from vinesim.cli.dataset import run
+
+    raise typer.Exit(run(**options))
+
+
+@app.command()
 def bench(
     names: Annotated[list[str], typer.Argument(help="plants, camera, sync; several are run one after the other.")],
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,

@@ -50,7 +50,13 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     @classmethod
     def load(cls, name: str) -> CameraSpec:
         """The spec in a file, or the one of that name in ``data/cameras``."""
-        return specs.load("cameras", name, cls)
+        spec = specs.load("cameras", name, cls)
+        if not 0.0 <= spec.nearest.value < spec.farthest.value:
+            raise specs.SensorError(
+                f"camera {name!r} measures from {spec.nearest.value} to {spec.farthest.value} m, which is no range; "
+                "give 0 <= nearest < farthest"
+            )
+        return spec
 
     def info(self, frame_id: str, scale: float = 1.0) -> CameraInfo:
         """Intrinsics with the principal point in the middle; ``scale`` enlarges the picture."""
@@ -106,28 +112,12 @@ class Visibility:
         clusters = len(primitives.cluster_first)
         if len(self._distance) != clusters:
             self._distance = wp.empty(clusters, dtype=float, device=self.device)
-        if self.device == "cpu":
-            self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
-        else:
-            self.keys.fill_(int(visibility.EMPTY))
         wp.launch(
             visibility.cull, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
         )
         distance = self._distance.numpy()
         seen = np.flatnonzero(distance < float(shapes.FAR))
-        seen = seen[np.argsort(distance[seen], kind="stable")].astype(np.int32)
-        kind = primitives.cluster_kind[seen]
-        lanes = 1 if self.device == "cpu" else 48
-        for kernel, kinds in _RASTER:
-            mine = seen[np.isin(kind, kinds)]
-            if len(mine):
-                wp.launch(
-                    kernel,
-                    (len(mine), lanes),
-                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, lanes],
-                    outputs=[self.keys],
-                    device=self.device,
-                )
+        self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
         wp.launch(
             visibility.resolve,
             self.width * self.height,
@@ -144,6 +134,31 @@ class Visibility:
             outputs=[self.primitive, self.depth, self.labels],
             device=self.device,
         )
+
+    def alone(self, primitives: Primitives, lens: visibility.Pinhole, clusters: np.ndarray) -> np.ndarray:
+        """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
+        self._raster(primitives, lens, clusters)
+        return self.keys.numpy().reshape(self.height, self.width) < int(visibility.EMPTY)
+
+    def _raster(self, primitives: Primitives, lens: visibility.Pinhole, seen: np.ndarray) -> None:
+        """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
+        if self.device == "cpu":
+            self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
+        else:
+            self.keys.fill_(int(visibility.EMPTY))
+        seen = np.asarray(seen, np.int32)
+        kind = primitives.cluster_kind[seen]
+        lanes = 1 if self.device == "cpu" else 48
+        for kernel, kinds in _RASTER:
+            mine = seen[np.isin(kind, kinds)]
+            if len(mine):
+                wp.launch(
+                    kernel,
+                    (len(mine), lanes),
+                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, lanes],
+                    outputs=[self.keys],
+                    device=self.device,
+                )
 
 
 @dataclasses.dataclass

@@ -526,6 +526,14 @@ class Primitives:
         kinds = self.shapes.kind.numpy()
         return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
 
+    def shown(self) -> np.ndarray:
+        """Whether each cluster is there at all [cluster]: what has been picked is not."""
+        return self.ball.numpy()[:, 3] > 0.0
+
+    def carriers(self, primitive: np.ndarray) -> np.ndarray:
+        """Poses [..., 7] m, 1 of what carries some primitives [...]: a plant's body, a link, or the world."""
+        return self._poses[self._carrier.numpy()[primitive]].astype(float)
+
     # -- building
 
     def _build(self, links: tuple[Link, ...]) -> None:

@@ -5,9 +5,47 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from vinesim import frames
 from vinesim.kernels import rays
 from vinesim.sensors.camera import REACH
-from vinesim.sensors.primitives import Primitives
+from vinesim.sensors.primitives import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID, Primitives
+
+
+def enclosing(primitives: Primitives, point: np.ndarray) -> int:
+    """A solid primitive that holds a point [3] m, -1 if none does. Leaves and meshes hold nothing."""
+    point = np.asarray(point, float)
+    reach = primitives.ball.numpy()
+    near = np.flatnonzero(np.linalg.norm(reach[:, :3] - point, axis=1) <= reach[:, 3])
+    if not len(near):
+        return -1
+    first, size = primitives.cluster_first[near], primitives.cluster_size[near]
+    which = np.concatenate([np.arange(f, f + n) for f, n in zip(first, size, strict=True)])
+    kind = np.repeat(primitives.cluster_kind[near], size)
+    a, b, c = (getattr(primitives.shapes, name).numpy()[which].astype(float) for name in "abc")
+    held = np.zeros(len(which), bool)
+    for number in np.unique(kind):
+        mine = kind == number
+        held[mine] = _holds(int(number), a[mine], b[mine], c[mine], point)
+    return int(which[held][0]) if held.any() else -1
+
+
+def _holds(kind: int, a: np.ndarray, b: np.ndarray, c: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Whether primitives [k] of one kind hold a point (vectors as in :mod:`vinesim.kernels.shapes`)."""
+    away = point - a[:, :3]
+    if kind == SPHEROID:
+        along = (away * b[:, :3]).sum(1)
+        return (away**2).sum(1) - along**2 + (along / b[:, 3]) ** 2 < a[:, 3] ** 2
+    if kind in (CONE, CYLINDER):
+        axis = b[:, :3] - a[:, :3]
+        share = (away * axis).sum(1) / (axis**2).sum(1)
+        inner = np.clip(share, 0.0, 1.0)
+        radius = a[:, 3] + (inner * (b[:, 3] - a[:, 3]) if kind == CONE else 0.0)
+        near = np.linalg.norm(away - inner[:, None] * axis, axis=1) < radius
+        return near if kind == CONE else near & (share > 0.0) & (share < 1.0)
+    if kind in (BOX, ELLIPSOID):
+        part = frames.rotate(frames.conjugate(b), away) / np.stack([a[:, 3], c[:, 0], c[:, 1]], 1)
+        return (np.abs(part).max(1) if kind == BOX else np.linalg.norm(part, axis=1)) < 1.0
+    return np.zeros(len(a), bool)
 
 
 class RayCaster:

@@ -169,14 +169,42 @@ def soil() -> np.ndarray:
 SKY_ROWS, SKY_COLUMNS = 512, 1024
 
 
+@functools.cache
+def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
+    """What of the sky no sun changes: the share of cloud, and layers in front of it, each a colour and a share."""
+    height, azimuth = _directions()
+    flat = np.sqrt(1.0 - height**2)
+    far = 0.22 / (height + 0.12)
+    cover = sample(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
+    cloud = _step(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * _step(0.02, 0.2, height) * 0.55
+    turns = azimuth / (2.0 * np.pi)
+    layers = []
+    for tone, base, rise, count in (
+        (np.array([0.36, 0.47, 0.62]), 0.045, 0.085, 2.0),
+        (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
+    ):
+        ridge = base + rise * (sample(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35)
+        layers.append((tone, _step(0.004, -0.004, height - ridge)))
+    crowns = 0.014 + 0.020 * sample(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
+    leafy = sample(turns * 20.0, height * 8.0, slice(2, 3))
+    trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
+    layers.append((trees, _step(0.004, -0.004, height - crowns)))
+    return cloud, tuple(layers)
+
+
+def _directions() -> tuple[np.ndarray, np.ndarray]:
+    """Sine of elevation and azimuth [rad] of the sky's table."""
+    height = (np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2) * np.ones((1, SKY_COLUMNS))
+    return height, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
+
+
 @functools.lru_cache(maxsize=4)
 def sky(sun: tuple[float, float, float]) -> np.ndarray:
     """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
 
     Clear blue with thin clouds, a halo around the sun (unit vector towards it), and hills in the haze.
     """
-    height = (np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2) * np.ones((1, SKY_COLUMNS))
-    azimuth = np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
+    (height, azimuth), (cloud, layers) = _directions(), _scenery()
     flat = np.sqrt(1.0 - height**2)
     x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
     horizon = np.exp(-5.5 * height)[..., None]
@@ -184,26 +212,15 @@ def sky(sun: tuple[float, float, float]) -> np.ndarray:
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
     colour = colour + halo[..., None] * np.array([3.3, 2.95, 2.35])
-    far = 0.22 / (height + 0.12)
-    cover = sample(x * far * 0.5, y * far * 0.5)
-    cloud = _step(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * _step(0.02, 0.2, height) * 0.55
     colour = _mix(colour, np.array([1.35, 1.33, 1.30]), cloud)
-    turns = azimuth / (2.0 * np.pi)
-    for tone, base, rise, count in (
-        (np.array([0.36, 0.47, 0.62]), 0.045, 0.085, 2.0),
-        (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
-    ):
-        ridge = base + rise * (sample(turns * count, np.full_like(turns, 0.13 * count))[..., 0] - 0.35)
-        colour = _mix(colour, tone, _step(0.004, -0.004, height - ridge))
-    crowns = 0.014 + 0.020 * sample(turns * 16.0, np.full_like(turns, 0.71))[..., 1]
-    leafy = sample(turns * 20.0, height * 8.0)[..., 2][..., None]
-    trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
-    return _mix(colour, trees, _step(0.004, -0.004, height - crowns)).astype(np.float32)
+    for tone, share in layers:
+        colour = _mix(colour, tone, share)
+    return colour.astype(np.float32)
 
 
-def sample(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Noise at positions of period 1, bilinear [..., 4]."""
-    table, fx, fy = noise(), (x % 1.0) * SIDE, (y % 1.0) * SIDE
+def sample(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
+    """Noise at positions of period 1, bilinear [..., 4], or some octaves of it."""
+    table, fx, fy = noise()[..., octaves], (x % 1.0) * SIDE, (y % 1.0) * SIDE
     i, j = fx.astype(int) % SIDE, fy.astype(int) % SIDE
     ax, ay = (fx % 1.0)[..., None], (fy % 1.0)[..., None]
     upper = table[j, i] * (1.0 - ax) + table[j, (i + 1) % SIDE] * ax
