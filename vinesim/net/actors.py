@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import zlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -68,6 +69,7 @@ class Actors:
         self._far_pose = bus.publisher(f"a/{me.name}/far")
         bus.subscribe("a/*/far", NEWEST)
         self._pose_due: dict[Publisher, float] = {}
+        self._phase = zlib.crc32(me.name.encode()) % 1024 / 1024.0
         self._pinged, self._pings = _LONG_AGO, 0
 
     def places(self) -> dict[str, np.ndarray]:
@@ -177,8 +179,10 @@ class Actors:
         """My pose: 60 Hz to those who are near, 5 Hz to everybody; encoded once, and only if somebody listens."""
         payload = b""
         for publisher, period in ((self._pose, ACTOR_PERIOD), (self._far_pose, FAR_PERIOD)):
-            due = self._pose_due.get(publisher, now)
-            if now < due - 1e-9:
+            due = self._pose_due.get(publisher)
+            if due is None:  # those who come at once need not speak at once for ever
+                due = now - period * self._phase
+            elif now < due - 1e-9:
                 continue
             self._pose_due[publisher] = max(due, now - period) + period
             if publisher.matching:
