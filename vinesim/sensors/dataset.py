@@ -171,7 +171,8 @@ class Vineyard:
             optical = picture.looking(eye, aim)
             optical[3:] = frames.multiply(optical[3:], roll)
             seen = truth.look(self.primitives, self.info, optical)
-            if (seen.depth < TOO_NEAR).mean() < 0.02 and (seen.labels == label(Organ.BUNCH, bunch)).any():
+            shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
+            if (seen.depth < TOO_NEAR).mean() < 0.02 and shown >= formats.LEAST_PIXELS:
                 return seen
         raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_TRIES} tries")
 
