@@ -8,6 +8,7 @@ import functools
 import mujoco
 import numpy as np
 import pytest
+from weighing import pressed_on_ground
 
 from vinesim import frames
 from vinesim.client import picking, places
@@ -33,19 +34,6 @@ def vineyard(seed: int) -> tuple[Model, Task]:
     plan = reseeded(load_scene("harvest"), seed)
     model = generate(plan)
     return model, next(picking.tasks(model, places.spawn_pose(plan, 0)[:2]))
-
-
-def pressed_on_ground(physics: Physics, box: int) -> float:
-    """Upward force of the ground on a box [N], from MuJoCo's own contacts: its weight, with all that lies in it."""
-    world, data = physics.rigid.world, physics.rigid.data
-    ground, body = world.geom("ground").id, world.body(f"box/{box}").id
-    total = 0.0
-    for i, geoms in enumerate(data.contact.geom):
-        if ground in geoms and body in world.geom_bodyid[geoms]:
-            force = np.zeros(6)
-            mujoco.mj_contactForce(world, data, i, force)
-            total += abs(data.contact.frame[i].reshape(3, 3)[:, 2] @ force[:3])
-    return total
 
 
 def awake(physics: Physics) -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loose_world import Server
 
 from vinesim.net import interest, messages
-from vinesim.net.bus import EVERY, MemoryHub
-from vinesim.net.facts import Facts
+from vinesim.net.bus import MemoryHub
 from vinesim.net.puppet import Puppet, row
 from vinesim.world.ids import Kind, thing
 
@@ -21,27 +19,12 @@ BUNCHES = [thing(Kind.BUNCH, index) for index in range(3)]
 BOXES = [thing(Kind.BOX, index) for index in range(3)]
 
 
-class Keeper:
+class Keeper(Server):
     """The server's part in memory: a clock, and the facts of every cell."""
 
-    def __init__(self, hub: MemoryHub) -> None:
-        self.bus = hub.bus("server")
-        self.facts = Facts()
-        self.bus.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
-        self.bus.subscribe("fact/*/*/*", EVERY)
-        for x in range(-2, 4):
-            for y in range(-2, 3):
-                tell = functools.partial(self._tell, (x, y))
-                self.bus.serve(f"snap/{x}/{y}", tell)
-
-    def _tell(self, cell: tuple[int, int], _: bytes) -> bytes:
-        return messages.encode_facts(self.facts.cell(cell))
-
-    def tick(self) -> None:
-        for key, payload in self.bus.drain():
-            _, x, y, _ = key.split("/")
-            for fact in messages.decode_facts(payload):
-                self.facts.add((int(x), int(y)), fact)
+    def open(self) -> None:
+        super().open()
+        self.bus.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.hub.time))
 
 
 class World:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from weighing import pressed_on_ground
 
 from vinesim import frames
 from vinesim.client import picking, places
 from vinesim.client.client import Client
 from vinesim.net.bus import MemoryHub
-from vinesim.physics.step import Physics
 from vinesim.robot.description import load
 from vinesim.robot.pick import Pick
 from vinesim.world.generate import generate
@@ -20,19 +20,6 @@ from vinesim.world.scene import reseeded
 
 DT = 0.01
 GRAVITY = 9.81
-
-
-def pressed_on_ground(physics: Physics, box: int) -> float:
-    """Upward force of the ground on a box [N], of MuJoCo's own contacts."""
-    world, data = physics.rigid.world, physics.rigid.data
-    ground, body = world.geom("ground").id, world.body(f"box/{box}").id
-    total = 0.0
-    for i, geoms in enumerate(data.contact.geom):
-        if ground in geoms and body in world.geom_bodyid[geoms]:
-            force = np.zeros(6)
-            mujoco.mj_contactForce(world, data, i, force)
-            total += abs(data.contact.frame[i].reshape(3, 3)[:, 2] @ force[:3])
-    return total
 
 
 @pytest.mark.slow

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import gc
-import json
 import os
 import pathlib
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -27,7 +24,7 @@ def run(
     status: str, **_: Any,
 ) -> int:  # fmt: skip
     """Walk, reach for a bunch, hold it and pull at it, let go; until told to stop. Then write report.json."""
-    from vinesim.cli.join import SWITCH, WrongUse, speak
+    from vinesim.cli.join import SWITCH, WrongUse, save_report, speak, tick_until
     from vinesim.client.client import Client
     from vinesim.client.pace import Pace
     from vinesim.client.places import bunch_centres, checked_bunch, placed, start_pose
@@ -77,20 +74,12 @@ def run(
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
-        gc.collect()
-        gc.freeze()  # what lives now lives to the end; the collector need not look at it in a tick
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
-        limit = None if seconds is None else round(seconds / client.physics.dt)
-        while not (stop.is_set() or pace.ticks == limit):
-            pace.begin()
-            client.tick()
-            pace.end()
+        tick_until(stop, client.tick, pace, seconds, client.physics.dt)
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             if client.trace is not None:
                 client.trace.rows().save(out / "trace.npz")
-            (out / "report.json").write_text(json.dumps(reporter.report(), indent=2) + "\n")
+            save_report(out, reporter.report())
     return 0
 
 

@@ -14,7 +14,10 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vinesim.client.pace import Pace
 
 log = logging.getLogger(__name__)
 
@@ -143,16 +146,8 @@ def run(
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
-        gc.collect()
-        gc.freeze()  # what lives now lives to the end; the collector need not look at it in a tick
-        # until here Ctrl-C simply interrupts; from now on it ends the run in order
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
-        limit = None if seconds is None else round(seconds / client.physics.dt)
-        while not (stop.is_set() or pace.ticks == limit or (script is not None and script.done)):
-            pace.begin()
-            client.tick()
-            pace.end()
+        done = (lambda: False) if script is None else (lambda: script.done)
+        tick_until(stop, client.tick, pace, seconds, client.physics.dt, done)
         if out is not None:
             report = reporter.report() | senses.report()
             if script is not None:
@@ -160,10 +155,32 @@ def run(
             senses.save(out)
             if client.trace is not None:
                 client.trace.rows().save(out / "trace.npz")
-            partial = out / "report.json.part"
-            partial.write_text(json.dumps(report, indent=2) + "\n")
-            partial.replace(out / "report.json")
+            save_report(out, report)
     return 0
+
+
+def tick_until(
+    stop: threading.Event, tick: Callable[[], None], pace: Pace, seconds: float | None, dt: float,
+    done: Callable[[], bool] = lambda: False,
+) -> None:  # fmt: skip
+    """Tick in time until told to ``stop`` (Ctrl-C and SIGTERM do), for so many ``seconds``, or until it is ``done``."""
+    gc.collect()
+    gc.freeze()  # what lives now lives to the end; the collector need not look at it in a tick
+    # until here Ctrl-C simply interrupts; from now on it ends the run in order
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    limit = None if seconds is None else round(seconds / dt)
+    while not (stop.is_set() or pace.ticks == limit or done()):
+        pace.begin()
+        tick()
+        pace.end()
+
+
+def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
+    """Write ``report.json``, whole or not at all."""
+    partial = out / "report.json.part"
+    partial.write_text(json.dumps(report, indent=2) + "\n")
+    partial.replace(out / "report.json")
 
 
 def ros_name(name: str) -> str:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import pathlib
-import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-
-STATUS_PERIOD = 1.0
-"""Between two status lines [s]."""
 
 
 def run(
@@ -23,7 +18,7 @@ def run(
     out: pathlib.Path | None, status: str, sensor_hz: float | None, **_: Any,
 ) -> int:  # fmt: skip
     """Look until told to stop; pictures go to ``out``."""
-    from vinesim.cli.join import WrongUse
+    from vinesim.cli.join import WrongUse, speak, tick_until
     from vinesim.client.pace import Pace
     from vinesim.client.places import spawn_pose
     from vinesim.client.spectator import Pictures, Spectator, viewpoint
@@ -55,25 +50,13 @@ def run(
         )  # fmt: skip
         pictures = None if out is None else Pictures(spectator, out, 1.0 / (sensor_hz or 1.0))
         stop = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
         pace = Pace(spectator.physics.dt)
         reporter = Status(spectator, pace)
-        said, limit = 0.0, None if seconds is None else round(seconds / spectator.physics.dt)
-        while not (stop.is_set() or pace.ticks == limit):
-            pace.begin()
-            spectator.tick()
-            pace.end()
-            if status != "none" and pace.elapsed >= said + STATUS_PERIOD:
-                said = pace.elapsed
-                figures = reporter.now()
-                company = ", ".join(figures["others"]) or "nobody"
-                words = f"{figures['time']:7.1f} s  {figures['tick_hz']:6.2f} Hz  awake {figures['awake']:3d}  "
-                words += f"in {figures['bytes_in']} B  out {figures['bytes_out']} B  sees {company}"
-                try:
-                    print(json.dumps(figures) if status == "json" else words, flush=True)
-                except BrokenPipeError:  # whoever listened is gone
-                    break
+        speaker = threading.Thread(target=speak, args=(reporter, lambda _: None, status, stop), name="status")
+        speaker.start()
+        stack.callback(speaker.join)
+        stack.callback(stop.set)
+        tick_until(stop, spectator.tick, pace, seconds, spectator.physics.dt)
         if pictures is not None:
             pictures.save(spectator)
     return 0
