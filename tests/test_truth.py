@@ -8,10 +8,11 @@ import seeing
 
 from vinesim import frames
 from vinesim.sensors import cloud, truth
+from vinesim.sensors.batches import SPHEROID
 from vinesim.sensors.camera import Camera
 from vinesim.sensors.lidar import Lidar, LidarSpec
 from vinesim.sensors.picture import looking
-from vinesim.sensors.primitives import SPHEROID, Primitives, still_view
+from vinesim.sensors.primitives import Primitives, still_view
 from vinesim.world.berries import VARIETIES, berries, piece_of
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import CameraFrame, CameraInfo, Link

@@ -296,6 +296,50 @@ def hit(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> float:
     return t
 
 
+@wp.func
+def normal_at(s: Shapes, i: int, p: wp.vec3) -> wp.vec3:
+    """Outward normal of primitive ``i`` at a point of its surface; of a leaf, its upper side."""
+    kind = s.kind[i]
+    a4 = s.a[i]
+    b4 = s.b[i]
+    c4 = s.c[i]
+    a = xyz(a4)
+    n = wp.vec3(0.0, 0.0, 1.0)
+    if kind == LEAF:
+        bend = s.d[i]
+        rib = xyz(b4)
+        up = xyz(c4)
+        side = wp.cross(rib, up)
+        u = wp.dot(p - a, side) / a4[3]
+        v = wp.dot(p - a, rib) / a4[3]
+        n = side * (-2.0 * bend[0] * u - wp.where(u > 0.0, bend[2], -bend[2])) + rib * (-2.0 * bend[1] * v) + up
+    elif kind == SPHEROID:
+        k = 1.0 / b4[3] - 1.0
+        n = squeeze(squeeze(p - a, xyz(b4), k), xyz(b4), k)
+    elif kind == CONE or kind == CYLINDER:
+        ba = xyz(b4) - a
+        h = wp.dot(p - a, ba) / wp.dot(ba, ba)
+        n = p - a - ba * wp.clamp(h, 0.0, 1.0)
+        if kind == CYLINDER and (h < 1.0e-4 or h > 0.9999):
+            n = ba * wp.where(h < 0.5, -1.0, 1.0)
+    elif kind == TRIANGLE:
+        n = wp.cross(xyz(b4) - a, xyz(c4) - a)
+    else:
+        q = as_quat(b4)
+        e = wp.cw_div(wp.quat_rotate_inv(q, p - a), wp.vec3(a4[3], c4[0], c4[1]))
+        if kind == BOX:
+            m = wp.max(wp.max(wp.abs(e[0]), wp.abs(e[1])), wp.abs(e[2])) * 0.9999
+            n = wp.vec3(
+                wp.where(wp.abs(e[0]) >= m, wp.sign(e[0]), 0.0),
+                wp.where(wp.abs(e[1]) >= m, wp.sign(e[1]), 0.0),
+                wp.where(wp.abs(e[2]) >= m, wp.sign(e[2]), 0.0),
+            )
+        else:
+            n = wp.cw_div(e, wp.vec3(a4[3], c4[0], c4[1]))
+        n = wp.quat_rotate(q, n)
+    return wp.normalize(n)
+
+
 # ---------------------------------------------------------------------------------------------- motion
 
 

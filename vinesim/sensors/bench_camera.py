@@ -16,10 +16,11 @@ import numpy as np
 import trimesh
 
 from vinesim import frames
+from vinesim.sensors.batches import CONE, LEAF, SPHEROID
 from vinesim.sensors.camera import Camera, CameraSpec, Visibility, pinhole
 from vinesim.sensors.lidar import Lidar, LidarSpec
 from vinesim.sensors.picture import looking
-from vinesim.sensors.primitives import CONE, LEAF, SPHEROID, Primitives, still_view
+from vinesim.sensors.primitives import Primitives, still_view
 from vinesim.world.generate import generate
 from vinesim.world.scene import load
 from vinesim.world.values import CameraInfo, Measurement

@@ -16,7 +16,8 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels import shade, shapes, visibility
 from vinesim.sensors import specs
-from vinesim.sensors.primitives import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE, Primitives
+from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
+from vinesim.sensors.primitives import Primitives
 from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import CameraFrame, CameraInfo

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import rays
+from vinesim.kernels import lidar
 from vinesim.sensors import specs
 from vinesim.sensors.primitives import Primitives
 from vinesim.sensors.raycast import RayCaster
@@ -106,7 +106,7 @@ class Lidar:
             len(self.spec.elevation.value) if self.device == "cpu" else 1
         )  # structs are handed to a thread, not to a ray
         wp.launch(
-            rays.sweep,
+            lidar.sweep,
             len(self.offset) // run,
             inputs=[
                 primitives.shapes,

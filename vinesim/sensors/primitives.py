@@ -6,475 +6,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
-import pathlib
 
 import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import shade, shapes
+from vinesim.kernels import materials, shadows, shapes
 from vinesim.sensors import textures
-from vinesim.world import leaves
-from vinesim.world.berries import VARIETIES, berries, piece_of
-from vinesim.world.ids import Organ, label
+from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
+from vinesim.sensors.grounds import fixed, meadow
+from vinesim.sensors.links import rigid
+from vinesim.sensors.vines import bunch_parts, canes, foliage, pieces_of
+from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.state import State
-from vinesim.world.values import Link, Shape, View
+from vinesim.world.values import Link, View
 
 log = logging.getLogger(__name__)
 
-CONE, SPHEROID, LEAF, BOX, ELLIPSOID, CYLINDER, TRIANGLE = (
-    int(k)
-    for k in (
-        shapes.CONE,
-        shapes.SPHEROID,
-        shapes.LEAF,
-        shapes.BOX,
-        shapes.ELLIPSOID,
-        shapes.CYLINDER,
-        shapes.TRIANGLE,
-    )
-)
-KINDS = {
-    "cone": CONE,
-    "spheroid": SPHEROID,
-    "leaf": LEAF,
-    "box": BOX,
-    "ellipsoid": ELLIPSOID,
-    "cylinder": CYLINDER,
-    "triangle": TRIANGLE,
-}
-
 _CLUSTER = 24
 """Most primitives of one cluster."""
-_CELL = 2.5
-"""Side of the squares in which things that stand still are clustered [m]."""
-_PIECE = 0.5
-"""Longest piece of a post or wire [m]."""
-_MESH_FACES = 4000
-"""Most triangles of one mesh; finer ones are simplified."""
-
-_STEM = (0.19, 0.22, 0.075)
-_WOOD = {
-    Organ.POLE: (int(shade.POST), (0.36, 0.33, 0.29)),
-    Organ.WIRE: (int(shade.WIRE), (0.33, 0.34, 0.35)),
-    Organ.TRUNK: (int(shade.BARK), (0.20, 0.15, 0.10)),
-    Organ.ARM: (int(shade.BARK), (0.20, 0.14, 0.09)),
-    Organ.CANE: (int(shade.CANE), (0.30, 0.17, 0.08)),
-    Organ.PEDUNCLE: (int(shade.STEM), _STEM),
-}
-_RIGID = {Organ.BOX: int(shade.PLASTIC), Organ.HUMAN: int(shade.CLOTH)}
-
-
-@dataclasses.dataclass
-class _Batch:
-    """Primitives of one kind in the frames of their carriers; ``group`` never mixes in one cluster."""
-
-    kind: int
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    d: np.ndarray
-    material: np.ndarray
-    tint: np.ndarray
-    organ: np.ndarray
-    label: np.ndarray
-    carrier: np.ndarray
-    group: np.ndarray
-    bunch: int = -1
-
-    def __len__(self) -> int:
-        return len(self.a)
-
-
-def _batch(kind: int, a, *, b=0.0, c=0.0, d=0.0, material, tint, organ, label, carrier, group, bunch=-1) -> _Batch:
-    """A batch with scalars and rows broadcast to the count of ``a`` [n, 4]."""
-    a = np.atleast_2d(np.asarray(a, np.float32))
-    n = len(a)
-    wide = [np.broadcast_to(np.asarray(v, np.float32), (n, 4)) for v in (b, c, d)]
-    flat = [np.broadcast_to(np.asarray(v, np.int32), n) for v in (organ, label, carrier, group)]
-    tint = np.broadcast_to(np.clip(np.asarray(tint, np.float32), 0.004, 1.0), (n, 3))
-    return _Batch(kind, a, *wide, np.broadcast_to(np.asarray(material, np.int32), n), tint, *flat, bunch)
-
-
-def _columns(*parts) -> np.ndarray:
-    """Vectors [n, k] and scalars, one or [n], side by side."""
-    columns = [np.asarray(p, float).reshape(-1, 1) if np.ndim(p) < 2 else np.asarray(p, float) for p in parts]
-    n = max(len(c) for c in columns)
-    return np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in columns], 1)
-
-
-# ---- plants ----------------------------------------------------------------------------------------------------------
-
-
-def _canes(model: Model, still: int) -> _Batch:
-    """One round cone for each piece of cane and peduncle."""
-    bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
-    rng = np.random.default_rng(5)
-    seed = rng.uniform(size=len(model.tree_first))
-    organ, tree = model.body_organ[bodies], model.body_tree[bodies]
-    index = tree.copy()
-    bunch_of = model.bunch_of()[bodies]
-    index = np.where(bunch_of >= 0, bunch_of, index)
-    # shoots ripen from the base: green towards the tip, brown where the wood is thick
-    green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
-    green = np.where(organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
-    tint = (1.0 - green) * np.array(_WOOD[Organ.CANE][1]) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(_STEM)
-    material = np.where(green[:, 0] > 0.5, int(shade.STEM), int(shade.CANE))
-    length = model.body_length[bodies]
-    zero = np.zeros(len(bodies))
-    return _batch(
-        CONE,
-        _columns(zero, zero, zero, model.body_radius[bodies, 0]),
-        b=_columns(length, zero, zero, model.body_radius[bodies, 1]),
-        c=_columns(zero, seed[tree] * 7.0, zero, zero),
-        material=material,
-        tint=tint,
-        organ=organ,
-        label=organ * label(Organ(1), 0) + index,
-        carrier=bodies,
-        group=tree,
-    )
-
-
-def _foliage(model: Model) -> list[_Batch]:
-    """Blades, their petioles, and the nodes from which they grow."""
-    count = len(model.leaf_body)
-    if not count:
-        return []
-    rng = np.random.default_rng(11)
-    shape = leaves.shape_of(np.arange(count))
-    q = model.leaf_pose[:, 3:]
-    rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
-    base, petiole_end, size = model.leaf_base, model.leaf_pose[:, :3], model.leaf_size * textures.leaf_scale(shape)
-    young = rng.uniform(size=(count, 1))
-    tint = np.array([0.042, 0.115, 0.016]) * (0.75 + 0.6 * young) * (1.0 + 0.10 * rng.normal(size=(count, 1)))
-    tint = tint + np.array([0.030, 0.035, 0.0]) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
-    bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
-    body, tree = model.leaf_body, model.body_tree[model.leaf_body]
-    names = label(Organ.LEAF, 0) + tree
-    blade = _batch(
-        LEAF,
-        _columns(petiole_end, size),
-        b=_columns(rib, shape),
-        c=_columns(up, rng.uniform(size=count)),
-        d=_columns(bend, model.leaf_age),
-        material=int(shade.FOLIAGE),
-        tint=tint,
-        organ=int(Organ.LEAF),
-        label=names,
-        carrier=body,
-        group=tree,
-    )
-    petiole = _batch(
-        CONE,
-        _columns(base, 0.0017),
-        b=_columns(petiole_end, 0.0012),
-        material=int(shade.STEM),
-        tint=(0.21, 0.13, 0.06),
-        organ=int(Organ.LEAF),
-        label=names,
-        carrier=body,
-        group=tree,
-    )
-    # a node is 1.45 times as thick as the cane between nodes
-    along = np.clip(base[:, 0] / np.maximum(model.body_length[body], 1e-6), 0.0, 1.0)
-    r = model.body_radius[body, 0] * (1.0 - along) + model.body_radius[body, 1] * along
-    reach = np.array([1.0, 0.0, 0.0]) * r[:, None]
-    axis = base * np.array([1.0, 0.0, 0.0])
-    node = _batch(
-        CONE,
-        _columns(axis - 0.7 * reach, 1.25 * r),
-        b=_columns(axis + 0.4 * reach, 1.45 * r),
-        material=int(shade.CANE),
-        tint=(0.24, 0.15, 0.07),
-        organ=int(Organ.CANE),
-        label=label(Organ.CANE, 0) + tree,
-        carrier=body,
-        group=tree,
-    )
-    return [blade, petiole, node]
-
-
-def _bunch(model: Model, bunch: int, place: np.ndarray, carrier: np.ndarray, group: int) -> list[_Batch]:
-    """Berries and rachis of one bunch, each in its piece: head, first cluster, ... of poses ``place`` [piece, 7] on
-    ``carrier`` [piece]. A bunch without clusters is one piece.
-    """
-    number = int(model.bunch_variety[bunch])
-    variety = VARIETIES[number]
-    one = berries(
-        float(model.bunch_length[bunch]),
-        float(model.bunch_radius[bunch]),
-        int(model.bunch_berries[bunch]),
-        number,
-        int(model.bunch_seed[bunch]),
-    )
-    rng = np.random.default_rng(int(model.bunch_seed[bunch]))
-    n = len(one.radius)
-    colour = np.array(variety.colour) * (1.0 + 0.10 * rng.normal(size=(n, 1)))
-    colour = colour + np.array([0.10, 0.05, 0.01]) * (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(
-        0.5 * rng.normal(size=(n, 1)), 0.0, 1.0
-    )
-    pieces = len(carrier)
-    length = float(model.bunch_length[bunch]) / pieces
-    on_berry = piece_of(one.position, float(model.bunch_length[bunch]), pieces)
-
-    def placed(points: np.ndarray, piece: np.ndarray) -> np.ndarray:
-        """Points [k, 3] of the bunch's frame, as drawn, on their carriers."""
-        along = (length * piece)[:, None] * np.array([1.0, 0.0, 0.0])
-        return place[piece, :3] + frames.rotate(place[piece, 3:], points - along)
-
-    away = np.hypot(*one.position[:, 1:].T)
-    depth = np.clip(0.35 + 0.65 * away / max(np.quantile(away, 0.8), 1e-6), 0.0, 1.0)
-    name = label(Organ.BUNCH, bunch)
-    common = {"organ": int(Organ.BUNCH), "label": name, "group": group, "bunch": bunch}
-    turn = place[on_berry, 3:]
-    crowding = _crowding(one.position, one.radius, one.neighbours)
-    fruit = _batch(
-        SPHEROID,
-        _columns(placed(one.position, on_berry), one.radius),
-        b=_columns(frames.rotate(turn, one.axis), variety.elongation),
-        c=_columns(rng.uniform(size=n), depth, 0.0, 0.0),
-        d=_columns(frames.rotate(turn, crowding[:, :3]), crowding[:, 3]),
-        material=int(shade.BERRY),
-        tint=colour,
-        carrier=carrier[on_berry],
-        **common,
-    )
-    start, end = one.rachis[:, :-1].reshape(-1, 3), one.rachis[:, 1:].reshape(-1, 3)
-    steps = one.rachis.shape[1] - 1
-    taper = np.tile(np.linspace(0.0028, 0.0013, steps), len(one.rachis))
-    middle = piece_of(0.5 * (start + end), float(model.bunch_length[bunch]), pieces)
-    rachis = _batch(
-        CONE,
-        _columns(placed(start, middle), taper),
-        b=_columns(placed(end, middle), 0.9 * taper),
-        material=int(shade.STEM),
-        tint=_STEM,
-        carrier=carrier[middle],
-        **common,
-    )
-    berry_end = one.position - one.axis * (one.radius * variety.elongation * 0.95)[:, None]
-    loose = np.linalg.norm(berry_end - one.foot, axis=1) > 0.002
-    pedicel = _batch(
-        CONE,
-        _columns(placed(one.foot, on_berry), 0.0010)[loose],
-        b=_columns(placed(berry_end, on_berry), 0.0014)[loose],
-        material=int(shade.STEM),
-        tint=_STEM,
-        carrier=carrier[on_berry][loose],
-        **common,
-    )
-    return [b for b in (fruit, rachis, pedicel) if len(b)]
-
-
-def _crowding(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Light that the nearest neighbours take from each berry: share(n) = w + v . n as (v, w) [n, 4].
-
-    A touching sphere of equal size takes (1/4 + 0.85 cos) r^2 / l^2 as seen from the berry's surface.
-    """
-    there = neighbours >= 0
-    apart = position[np.maximum(neighbours, 0)] - position[:, None]
-    distance = np.linalg.norm(apart, axis=2)
-    direction = apart / np.maximum(distance, 1e-9)[..., None]
-    gap = np.maximum(distance - 0.55 * radius[:, None], 0.3 * radius[:, None])
-    weight = np.where(there, np.minimum(radius[np.maximum(neighbours, 0)] ** 2 / gap**2, 1.0), 0.0)
-    return np.concatenate([0.42 * (weight[..., None] * direction).sum(1), 0.07 * weight.sum(1, keepdims=True)], 1)
-
-
-# ---- what stands still -----------------------------------------------------------------------------------------------
-
-
-def _cell_of(position: np.ndarray, first: int) -> np.ndarray:
-    """A group number for each square of the ground [n]."""
-    cell = np.floor(position[:, :2] / _CELL).astype(np.int64)
-    cell -= cell.min(0, initial=0)
-    return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
-
-
-def _fixed(model: Model, still: int) -> _Batch | None:
-    if not len(model.fixed_organ):
-        return None
-    # long wires in pieces: a box around a whole one holds half of the vineyard
-    length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)
-    pieces = np.maximum(np.ceil(length / _PIECE), 1).astype(int)
-    whole = np.repeat(np.arange(len(pieces)), pieces)
-    share = np.arange(len(whole)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    ends = [(share + k)[:, None] / pieces[whole][:, None] for k in (0, 1)]
-    start, end = (model.fixed_start[whole] * (1.0 - s) + model.fixed_end[whole] * s for s in ends)
-    thick, thin = (model.fixed_radius[whole, :1] * (1.0 - s) + model.fixed_radius[whole, 1:] * s for s in ends)
-    organ, index = model.fixed_organ[whole], model.fixed_index[whole]
-    table = {o: _WOOD[Organ(int(o))] for o in np.unique(organ)}
-    material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
-    rng = np.random.default_rng(3)
-    seed = rng.uniform(size=int(index.max()) + 1)[index] * 7.0
-    # bark runs through from piece to piece: distances count from the foot of a post, along a wire
-    along = np.where(
-        np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1),
-        start[:, 2],
-        length[whole] * ends[0][:, 0],
-    )
-    return _batch(
-        CONE,
-        _columns(start, thick),
-        b=_columns(end, thin),
-        c=_columns(along, seed, 0.0, 0.0),
-        material=material,
-        tint=tint,
-        organ=organ,
-        label=organ * label(Organ(1), 0) + index,
-        carrier=still,
-        group=_cell_of((start + end) * 0.5, 0),
-    )
-
-
-def _meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> _Batch | None:
-    """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
-    low, high = low - 3.0, high + 3.0
-    count = int(min(density * np.prod(high - low), 60_000))
-    if count == 0:
-        return None
-    rng = np.random.default_rng(23)
-    spot = low + (high - low) * rng.uniform(size=(count, 2))
-    noise = textures.sample(spot[:, 0] * 0.21, spot[:, 1] * 0.21)
-    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125  # as the ground is coloured
-    spot = spot[green > 0.44 + 0.20 * rng.uniform(size=count)]
-    n = len(spot)
-    herb = rng.uniform(size=n) < 0.12
-    size = np.where(herb, rng.uniform(0.03, 0.06, n), 0.05 + 0.13 * rng.uniform(size=n) ** 1.5)
-    yaw = rng.uniform(0.0, 2.0 * np.pi, n)
-    lean = np.where(herb, rng.uniform(0.5, 1.1, n), rng.normal(0.0, 0.2, n))
-    out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
-    rib = np.sin(lean)[:, None] * out + np.cos(lean)[:, None] * np.array([0.0, 0.0, 1.0])
-    up = np.cos(lean)[:, None] * out - np.sin(lean)[:, None] * np.array([0.0, 0.0, 1.0])
-    root = _columns(spot, np.zeros(n)) + 0.74 * size[:, None] * rib
-    tint = np.array([0.075, 0.12, 0.022]) * rng.uniform(0.6, 1.35, (n, 1))
-    tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
-    bend = _columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
-    return _batch(
-        LEAF,
-        _columns(root, size),
-        b=_columns(rib, np.where(herb, textures.HERB, textures.GRASS)),
-        c=_columns(up, rng.uniform(size=n)),
-        d=bend,
-        material=int(shade.GRASS),
-        tint=tint,
-        organ=int(Organ.GROUND),
-        label=label(Organ.GROUND, 0),
-        carrier=still,
-        group=_cell_of(spot, 0),
-    )
-
-
-def _nothing(still: int) -> _Batch:
-    """A stand-in for a world without plants, far below the ground: no array is ever empty."""
-    return _batch(
-        CONE,
-        [[0.0, 0.0, float(shapes.HIDDEN), 1e-6]],
-        b=[[1e-3, 0.0, float(shapes.HIDDEN), 1e-6]],
-        material=0,
-        tint=0.0,
-        organ=0,
-        label=0,
-        carrier=still,
-        group=0,
-    )
-
-
-# ---- robots, boxes, people -------------------------------------------------------------------------------------------
-
-
-def _pieces(model: Model, bunch: int) -> np.ndarray:
-    """Bodies that carry one bunch's berries [piece]: its own, then its clusters."""
-    first, count = int(model.bunch_cluster[bunch]), int(model.bunch_clusters[bunch])
-    return np.append(model.bunch_body[bunch], np.arange(first, first + count))
-
-
-def _rigid(
-    model: Model, links: tuple[Link, ...], first: int, groups: int, shape: dict[int, np.ndarray]
-) -> list[_Batch]:
-    """Shapes of all links; carriers and groups count on from the given numbers.
-
-    ``shape`` has the poses [piece, 7] of each picked bunch's pieces in its frame.
-    """
-    batches: list[_Batch] = []
-    for k, link in enumerate(links):
-        if link.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
-            place = shape[link.index]
-            mine = _bunch(model, link.index, place, np.full(len(place), first + k), groups + k)
-            batches += [dataclasses.replace(b, bunch=-1) for b in mine]
-            continue
-        material = _RIGID.get(link.organ, int(shade.PAINT))
-        name = label(link.organ, link.index)
-        for piece in link.shapes:
-            common = {
-                "material": material,
-                "tint": np.asarray(piece.rgba[:3]) ** 2.2,
-                "organ": int(link.organ),
-                "label": name,
-                "carrier": first + k,
-                "group": groups + k,
-            }
-            batches.append(_rigid_shape(piece, common))
-    return batches
-
-
-def _rigid_shape(shape: Shape, common: dict) -> _Batch:
-    """One primitive, or the triangles of a mesh, in the frame of its link."""
-    size, pose = shape.size, np.asarray(shape.pose, float)
-    centre, turn = pose[:3], pose[3:]
-    if shape.kind in ("capsule", "cylinder"):
-        half = frames.rotate(turn, np.array([0.0, 0.0, size[1]]))
-        kind = CONE if shape.kind == "capsule" else CYLINDER
-        return _batch(kind, [[*(centre - half), size[0]]], b=[[*(centre + half), size[0]]], **common)
-    if shape.kind == "sphere":
-        return _batch(ELLIPSOID, [[*centre, size[0]]], b=[turn], c=[[size[0], size[0], 0, 0]], **common)
-    if shape.kind in ("ellipsoid", "box"):
-        kind = ELLIPSOID if shape.kind == "ellipsoid" else BOX
-        return _batch(kind, [[*centre, size[0]]], b=[turn], c=[[size[1], size[2], 0, 0]], **common)
-    if shape.kind == "mesh":
-        corners = _triangles(shape.file, tuple(size) if len(size) == 3 else (size[0],) * 3)
-        corners = centre + frames.rotate(turn, corners)
-        a, b, c = (np.concatenate([corners[:, k], np.zeros((len(corners), 1))], 1) for k in range(3))
-        return _batch(TRIANGLE, a, b=b, c=c, **common)
-    raise ValueError(
-        f"shape kind {shape.kind!r} of a link is unknown; use capsule, sphere, ellipsoid, box, cylinder or mesh"
-    )
-
-
-_meshes: dict[tuple[str, tuple[float, ...]], np.ndarray] = {}
-
-
-def _triangles(file: str, scale: tuple[float, ...]) -> np.ndarray:
-    """Corners [face, 3, 3] m of a mesh file, simplified by merging near vertices until it has few enough faces."""
-    key = (file, scale)
-    if key not in _meshes:
-        import trimesh
-
-        if not pathlib.Path(file).is_file():
-            raise ValueError(f"mesh file {file!r} of a link does not exist; give an absolute path")
-        mesh = trimesh.load(file, force="mesh", process=True)
-        vertices, faces = np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces)
-        if np.prod(scale) < 0.0:
-            faces = faces[:, ::-1]
-        extent = float(np.ptp(vertices, axis=0).max(initial=1e-6))
-        cells = 256
-        while len(faces) > _MESH_FACES and cells > 8:
-            spot = np.floor(vertices / extent * cells).astype(np.int64)
-            _, member = np.unique(spot, axis=0, return_inverse=True)
-            member = member.reshape(-1)
-            count = np.bincount(member)
-            merged = np.stack([np.bincount(member, vertices[:, k]) / count for k in range(3)], 1)
-            linked = member[faces]
-            whole = (linked[:, 0] != linked[:, 1]) & (linked[:, 1] != linked[:, 2]) & (linked[:, 0] != linked[:, 2])
-            vertices, faces, cells = merged, linked[whole], int(cells * 0.75)
-        _meshes[key] = vertices[faces].astype(np.float32)
-    return _meshes[key]
-
-
-# ---- all of it -------------------------------------------------------------------------------------------------------
 
 
 class Primitives:
@@ -489,14 +41,14 @@ class Primitives:
         spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
         low, high = (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
         trees = len(model.tree_first)
-        batches = [_canes(model, bodies), *_foliage(model)]
+        batches = [canes(model, bodies), *foliage(model)]
         for bunch, body in enumerate(model.bunch_body):
-            pieces = _pieces(model, bunch)
+            pieces = pieces_of(model, bunch)
             own = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(pieces), 1))
-            batches += _bunch(model, bunch, own, pieces, int(model.body_tree[body]))
+            batches += bunch_parts(model, bunch, own, pieces, int(model.body_tree[body]))
         self._tree_batches = len(batches)
-        batches += [b for b in (_fixed(model, bodies), _meadow(low, high, grass, bodies)) if b is not None]
-        self._plants = [b for b in batches if len(b)] or [_nothing(bodies)]
+        batches += [b for b in (fixed(model, bodies), meadow(low, high, grass, bodies)) if b is not None]
+        self._plants = [b for b in batches if len(b)] or [nothing(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
@@ -538,8 +90,8 @@ class Primitives:
 
     def _build(self, links: tuple[Link, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
-        rigid = _rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links))
-        batches = self._plants + rigid
+        moving = rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links))
+        batches = self._plants + moving
         first_rigid = len(self._plants)
         pieces: dict[str, list[np.ndarray]] = {
             name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
@@ -591,7 +143,7 @@ class Primitives:
             shapes.Shapes(),
             shapes.Shapes(),
             shapes.Clusters(),
-            shade.Looks(),
+            materials.Looks(),
         )
         primitive_kind = np.repeat(self.cluster_kind, self.cluster_size)
         for name in "abcd":
@@ -625,14 +177,14 @@ class Primitives:
         self._poses = poses
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._links = links
-        self.plant_count = total - sum(len(b) for b in rigid)
+        self.plant_count = total - sum(len(b) for b in moving)
         self.built += 1
 
     def _shapes_of_picked(self, links: tuple[Link, ...]) -> dict[int, np.ndarray]:
         """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
         picked = {}
         for bunch in (link.index for link in links if link.organ == Organ.BUNCH):
-            q = np.asarray(self._body_q[_pieces(self.model, bunch)], float)
+            q = np.asarray(self._body_q[pieces_of(self.model, bunch)], float)
             picked[bunch] = self._picked.get(bunch, frames.compose(frames.inverse(q[0]), q))
         self._picked = picked
         return picked
@@ -656,7 +208,7 @@ class Primitives:
             out = wp.zeros(len(points), dtype=float, device=self.device)
             at = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device=self.device)
             wp.launch(
-                shade.see_sky,
+                shadows.see_sky,
                 len(points),
                 inputs=[grid, wp.vec3(*map(float, corner)), float(cell), at],
                 outputs=[out],

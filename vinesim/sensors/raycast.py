@@ -7,8 +7,9 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import rays
+from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID
 from vinesim.sensors.camera import REACH
-from vinesim.sensors.primitives import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID, Primitives
+from vinesim.sensors.primitives import Primitives
 
 
 def enclosing(primitives: Primitives, point: np.ndarray) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from vinesim.kernels import shade
+from vinesim.kernels import shade, shadows
 from vinesim.sensors import textures
 from vinesim.sensors.primitives import Primitives
 
@@ -38,7 +38,7 @@ class _Map:
         self.up = np.cross(self.right, sun)
         self.focus = np.full(3, np.inf)
         self.time, self.version, self.built = -np.inf, -1, -1
-        self.struct = shade.ShadowMap()
+        self.struct = shadows.ShadowMap()
         self.struct.depth = wp.empty(side * side, dtype=float, device=device)
         self.struct.right, self.struct.up, self.struct.sun = _vector(self.right), _vector(self.up), _vector(sun)
         self.struct.texel, self.struct.side = float(texel), side
@@ -75,7 +75,7 @@ class _Map:
         if len(which):
             lanes = _LANES.get(self.device, 32)
             wp.launch(
-                shade.cast_shadows,
+                shadows.cast_shadows,
                 (len(which), lanes),
                 inputs=[
                     primitives.shapes,
@@ -124,7 +124,7 @@ class Sunlight:
 
     def follow(
         self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
-    ) -> tuple[shade.ShadowMap, shade.ShadowMap]:
+    ) -> tuple[shadows.ShadowMap, shadows.ShadowMap]:
         """The fine and the coarse shadow map for a camera at ``eye`` that looks along ``forward``."""
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)

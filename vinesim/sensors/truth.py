@@ -15,8 +15,9 @@ import numpy as np
 from vinesim import frames
 from vinesim.kernels.shapes import FAR
 from vinesim.sensors import cloud
+from vinesim.sensors.batches import CONE, SPHEROID
 from vinesim.sensors.camera import Visibility, pinhole
-from vinesim.sensors.primitives import CONE, SPHEROID, Primitives
+from vinesim.sensors.primitives import Primitives
 from vinesim.sensors.raycast import RayCaster
 from vinesim.world.ids import LABEL_STRIDE, Organ, label
 from vinesim.world.model import Model

@@ -1,0 +1,103 @@
+"""What stands still as primitives: posts, wires, trunks and arms; grass and herbs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.kernels import materials
+from vinesim.sensors import textures
+from vinesim.sensors.batches import CONE, LEAF, Batch, batch, columns
+from vinesim.world.ids import Organ, label
+from vinesim.world.model import Model
+
+_CELL = 2.5
+"""Side of the squares in which things that stand still are clustered [m]."""
+_PIECE = 0.5
+"""Longest piece of a post or wire [m]."""
+_WOOD = {
+    Organ.POLE: (int(materials.POST), (0.36, 0.33, 0.29)),
+    Organ.WIRE: (int(materials.WIRE), (0.33, 0.34, 0.35)),
+    Organ.TRUNK: (int(materials.BARK), (0.20, 0.15, 0.10)),
+    Organ.ARM: (int(materials.BARK), (0.20, 0.14, 0.09)),
+}
+
+
+def _cell_of(position: np.ndarray, first: int) -> np.ndarray:
+    """A group number for each square of the ground [n]."""
+    cell = np.floor(position[:, :2] / _CELL).astype(np.int64)
+    cell -= cell.min(0, initial=0)
+    return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
+
+
+def fixed(model: Model, still: int) -> Batch | None:
+    if not len(model.fixed_organ):
+        return None
+    # long wires in pieces: a box around a whole one holds half of the vineyard
+    length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)
+    pieces = np.maximum(np.ceil(length / _PIECE), 1).astype(int)
+    whole = np.repeat(np.arange(len(pieces)), pieces)
+    share = np.arange(len(whole)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    ends = [(share + k)[:, None] / pieces[whole][:, None] for k in (0, 1)]
+    start, end = (model.fixed_start[whole] * (1.0 - s) + model.fixed_end[whole] * s for s in ends)
+    thick, thin = (model.fixed_radius[whole, :1] * (1.0 - s) + model.fixed_radius[whole, 1:] * s for s in ends)
+    organ, index = model.fixed_organ[whole], model.fixed_index[whole]
+    table = {o: _WOOD[Organ(int(o))] for o in np.unique(organ)}
+    material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
+    rng = np.random.default_rng(3)
+    seed = rng.uniform(size=int(index.max()) + 1)[index] * 7.0
+    # bark runs through from piece to piece: distances count from the foot of a post, along a wire
+    along = np.where(
+        np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1),
+        start[:, 2],
+        length[whole] * ends[0][:, 0],
+    )
+    return batch(
+        CONE,
+        columns(start, thick),
+        b=columns(end, thin),
+        c=columns(along, seed, 0.0, 0.0),
+        material=material,
+        tint=tint,
+        organ=organ,
+        label=organ * label(Organ(1), 0) + index,
+        carrier=still,
+        group=_cell_of((start + end) * 0.5, 0),
+    )
+
+
+def meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> Batch | None:
+    """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
+    low, high = low - 3.0, high + 3.0
+    count = int(min(density * np.prod(high - low), 60_000))
+    if count == 0:
+        return None
+    rng = np.random.default_rng(23)
+    spot = low + (high - low) * rng.uniform(size=(count, 2))
+    noise = textures.sample(spot[:, 0] * 0.21, spot[:, 1] * 0.21)
+    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125  # as the ground is coloured
+    spot = spot[green > 0.44 + 0.20 * rng.uniform(size=count)]
+    n = len(spot)
+    herb = rng.uniform(size=n) < 0.12
+    size = np.where(herb, rng.uniform(0.03, 0.06, n), 0.05 + 0.13 * rng.uniform(size=n) ** 1.5)
+    yaw = rng.uniform(0.0, 2.0 * np.pi, n)
+    lean = np.where(herb, rng.uniform(0.5, 1.1, n), rng.normal(0.0, 0.2, n))
+    out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
+    rib = np.sin(lean)[:, None] * out + np.cos(lean)[:, None] * np.array([0.0, 0.0, 1.0])
+    up = np.cos(lean)[:, None] * out - np.sin(lean)[:, None] * np.array([0.0, 0.0, 1.0])
+    root = columns(spot, np.zeros(n)) + 0.74 * size[:, None] * rib
+    tint = np.array([0.075, 0.12, 0.022]) * rng.uniform(0.6, 1.35, (n, 1))
+    tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
+    bend = columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
+    return batch(
+        LEAF,
+        columns(root, size),
+        b=columns(rib, np.where(herb, textures.HERB, textures.GRASS)),
+        c=columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(materials.GRASS),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=still,
+        group=_cell_of(spot, 0),
+    )
