@@ -402,6 +402,17 @@ class Rigid:
         mujoco.mj_jacBody(self.world, self.data, None, jacobian, body)
         return jacobian @ self.data.qvel @ self.data.xmat[body].reshape(3, 3)
 
+    def overlaps(self) -> list[tuple[str, str, float]]:
+        """Who stood in whom when the tick began, as :meth:`prep` found it: actors or things, and how deep [m]."""
+        m, d = self.world, self.data
+        found = []
+        for contact in d.contact:
+            bodies = [m.geom_bodyid[geom] for geom in contact.geom]
+            pairs = zip(bodies, contact.geom, strict=True)
+            names = [self.owners[body][0] if body in self.owners else m.geom(geom).name for body, geom in pairs]
+            found.append((names[0], names[1], -float(contact.dist)))
+        return found
+
     def refresh(self) -> None:
         """Bring MuJoCo's poses to the state as it is now: after a step they are those of the step's start."""
         if not self._fresh:

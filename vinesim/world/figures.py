@@ -1,4 +1,4 @@
-"""What people and crates look like: parts read from ``data/figures``, as shapes in the frames of the links they ride on.
+"""What people and crates look like: shapes read from ``data/figures``, in the frames of the links that they ride on.
 
 A figure knows nothing of who draws it: a part is a few round cones, ellipsoids, boxes, cylinders and lofts (meshes
 through rings), each with a colour and a surface by name. Bodies that touch are others, and lie in the room of physics.
@@ -16,7 +16,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.world.places import find
 from vinesim.world.reading import DataError, read
-from vinesim.world.values import Mesh, Shape
+from vinesim.world.values import HumanPose, Mesh, Shape
 
 SURFACES = ("paint", "plastic", "cloth", "skin", "rubber", "metal", "straw", "reflex", "glass", "lamp")
 """What a shape can be made of, beside its colour."""
@@ -290,6 +290,71 @@ def smooth(vertices: np.ndarray, faces: np.ndarray, crease: float = float(CREASE
     lost = np.linalg.norm(total, axis=1) < 1e-14
     total[lost] = unit[np.flatnonzero(lost) // 3]
     return frames.normalize(total).reshape(-1, 3, 3)
+
+
+# ---------------------------------------------------------------------- postures
+
+
+class Palm(_Part, frozen=True):
+    """Where a hand is."""
+
+    at: Point
+    """[m]"""
+    along: Point
+    """Where the fingers point."""
+    back: Point
+    """Where the back of the hand faces."""
+    bent: tuple[float, float, float, float, float]
+    """Thumb, index, middle, ring and little finger, 0 to 1."""
+
+
+class Posture(_Part, frozen=True):
+    """How somebody stands, feet about the origin, looking along x [m]."""
+
+    head: Point | None = None
+    tilt: float = 0.0
+    """Of the head [rad], positive looks down."""
+    hips: Point | None = None
+    left: Palm | None = None
+    right: Palm | None = None
+    left_foot: Point | None = None
+    right_foot: Point | None = None
+
+
+class _Postures(_Part, frozen=True):
+    height: float
+    postures: dict[str, Posture]
+
+
+@functools.cache
+def _postures() -> _Postures:
+    return read(find("figures", "postures", ".toml"), _Postures, FigureError)
+
+
+def postures() -> tuple[str, ...]:
+    """Names that :func:`posed` knows."""
+    return tuple(_postures().postures)
+
+
+def posed(standing: HumanPose, name: str, height: float) -> HumanPose:
+    """Somebody of this height [m], who is ``standing`` upright, in a posture of ``data/figures/postures.toml``."""
+    file = _postures()
+    if name not in file.postures:
+        raise FigureError(f"posture {name!r} is unknown; give one of: {', '.join(file.postures)}")
+    scale, one, usual = height / file.height, file.postures[name], file.postures["stand"]
+    points = {}
+    for point in ("head", "hips", "left_foot", "right_foot"):
+        if at := getattr(one, point) or getattr(usual, point):
+            points[point] = frames.compose(standing.root, frames.pose(scale * np.array(at)))
+    nod = frames.pose(np.zeros(3), frames.exp(np.array([0.0, one.tilt, 0.0])))
+    points["head"] = frames.compose(points.get("head", standing.head), nod)
+    for side in ("left", "right"):
+        palm = getattr(one, side) or getattr(usual, side)
+        if palm:
+            turn = frames.aligned(np.array(palm.along), np.array(palm.back))
+            points[side] = frames.compose(standing.root, frames.pose(scale * np.array(palm.at), turn))
+            points[f"{side}_fingers"] = palm.bent
+    return dataclasses.replace(standing, **points)
 
 
 # ---------------------------------------------------------------------- crates
