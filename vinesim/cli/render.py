@@ -38,7 +38,7 @@ def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: 
     pose = picture.looking(eye, target)
     seen = truth.look(primitives, info, pose)
     truths = truth.of_bunches(primitives, view, seen)
-    frame = Camera(spec, info, "camera", plan.sun.direction(), taps=16, shadow_period=0.0).render(primitives, pose)
+    frame = Camera(spec, info, "camera", plan.sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
         "depth": picture.depth_millimetres(frame.depth),
