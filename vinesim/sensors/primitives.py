@@ -35,7 +35,7 @@ class Primitives:
     def __init__(
         self, model: Model, *, grass: float = 90.0, device: str = "cpu", ripeness: Ripeness | None = None
     ) -> None:
-        """``grass``: tufts per square metre around the vines, 0 for bare ground; ``ripeness``: all is ripe unless given."""
+        """``grass``: tufts a square metre around the vines, 0: bare ground; ``ripeness``: all is ripe without."""
         self.model, self.device, self._ripeness = model, device, ripeness
         bodies = len(model.body_mass)
         self._still = bodies
