@@ -15,7 +15,7 @@ from vinesim import frames
 from vinesim.kernels import materials, shadows, shapes
 from vinesim.sensors import textures
 from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
-from vinesim.sensors.grounds import fixed, meadow, rows_of
+from vinesim.sensors.grounds import fixed, litter, meadow, rows_of
 from vinesim.sensors.links import rigid
 from vinesim.sensors.vines import bunch_parts, canes, foliage, pieces_of
 from vinesim.world.ids import Organ
@@ -33,7 +33,7 @@ class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.shapes`)."""
 
     def __init__(self, model: Model, *, grass: float = 90.0, device: str = "cpu") -> None:
-        """``grass``: tufts per square metre around the vines, 0 for bare ground."""
+        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves."""
         self.model, self.device = model, device
         bodies = len(model.body_mass)
         self._still = bodies
@@ -47,9 +47,11 @@ class Primitives:
             own = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(pieces), 1))
             batches += bunch_parts(model, bunch, own, pieces, int(model.body_tree[body]))
         self._tree_batches = len(batches)
-        batches += [
-            b for b in (fixed(model, bodies), meadow(rows_of(model), low, high, grass, bodies)) if b is not None
-        ]
+        around = [fixed(model, bodies)]
+        if grass > 0.0:
+            age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
+            around += [meadow(rows_of(model), low, high, grass, bodies), litter(low, high, age, bodies)]
+        batches += [b for b in around if b is not None]
         self._plants = [b for b in batches if len(b)] or [nothing(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
