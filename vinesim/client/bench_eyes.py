@@ -1,4 +1,4 @@
-"""``vinesim bench eyes``: the 100 Hz tick of a robot in real time, with somebody looking through its camera or nobody."""
+"""``vinesim bench eyes``: the 100 Hz tick of a robot in real time, while its camera is looked through and while not."""
 
 from __future__ import annotations
 
