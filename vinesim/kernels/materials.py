@@ -32,6 +32,11 @@ SKIN = wp.constant(9)
 PAINT = wp.constant(10)
 GRASS = wp.constant(11)
 LAMP = wp.constant(12)
+RUBBER = wp.constant(13)
+METAL = wp.constant(14)
+STRAW = wp.constant(15)
+REFLEX = wp.constant(16)
+GLASS = wp.constant(17)
 
 
 @wp.struct
@@ -300,6 +305,36 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
 
 
 @wp.func
+def unpacked(code: float) -> wp.vec3:
+    """A unit vector from one float: octahedral, two times eleven bits, plus one."""
+    k = int(code) - 1
+    x = float(k % 2047) * (2.0 / 2046.0) - 1.0
+    y = float(k / 2047) * (2.0 / 2046.0) - 1.0
+    z = 1.0 - wp.abs(x) - wp.abs(y)
+    fold = wp.max(-z, 0.0)
+    return wp.normalize(wp.vec3(x - wp.where(x >= 0.0, fold, -fold), y - wp.where(y >= 0.0, fold, -fold), z))
+
+
+@wp.func
+def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
+    """Normal at ``p`` of the smooth surface that a triangle stands for, mixed from those of its corners."""
+    a4 = g.a[i]
+    b4 = g.b[i]
+    c4 = g.c[i]
+    ab = xyz(b4) - xyz(a4)
+    ac = xyz(c4) - xyz(a4)
+    ap = p - xyz(a4)
+    n = wp.cross(ab, ac)
+    if a4[3] > 0.0:
+        whole = wp.dot(n, n)
+        v = wp.clamp(wp.dot(wp.cross(ap, ac), n) / whole, 0.0, 1.0)
+        w = wp.clamp(wp.dot(wp.cross(ab, ap), n) / whole, 0.0, 1.0)
+        mixed = unpacked(a4[3]) * (1.0 - v - w) + unpacked(b4[3]) * v + unpacked(c4[3]) * w
+        n = wp.quat_rotate(as_quat(g.d[i]), mixed)
+    return wp.normalize(n)
+
+
+@wp.func
 def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
     kind = g.kind[i]
     a4 = g.a[i]
@@ -332,7 +367,8 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
     elif kind == SPHEROID:
         n = wp.normalize(p - a)
     elif kind == TRIANGLE:
-        n = wp.normalize(wp.cross(xyz(b4) - a, xyz(c4) - a))
+        n = smooth_normal(g, i, p)
+        grain = wp.quat_rotate_inv(as_quat(g.d[i]), p)
     else:
         q = as_quat(b4)
         grain = wp.quat_rotate_inv(q, p - a)
@@ -401,6 +437,29 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
         s.mirror = 0.4
     elif material == LAMP:
         s.glow = 3.0
+    elif material == RUBBER:
+        s.gloss = 0.03
+        s.polish = 8.0
+    elif material == METAL:
+        s.albedo = tint * 0.55
+        s.gloss = 0.45
+        s.polish = 40.0
+        s.mirror = 0.7
+    elif material == STRAW:
+        if near:
+            t = texel_of(looks.noise, grain[0] * 9.0 + grain[2] * 5.0, grain[1] * 9.0 - grain[2] * 5.0)
+            s.albedo = tint * (0.70 + 0.5 * t[3])
+            s.normal = wp.normalize(n + wp.vec3(t[3] - 0.5, t[2] - 0.5, 0.0) * 0.5)
+        s.through = tint * 0.25
+        s.gloss = 0.02
+    elif material == REFLEX:
+        s.gloss = 0.12
+        s.polish = 20.0
+        s.mirror = 0.5
+    elif material == GLASS:
+        s.gloss = 0.05
+        s.polish = 250.0
+        s.mirror = 1.0
     elif material == STEM:
         s.through = tint * 0.3
     if material != WIRE:

@@ -113,7 +113,7 @@ def shine(
     """Light that leaves a surface at ``p`` against the unit ray ``d``."""
     n = s.normal
     plain = s.plain
-    if kind >= 0 and wp.dot(plain, d) > 0.0:
+    if kind == LEAF and wp.dot(plain, d) > 0.0:
         n = -n
         plain = -plain
     ndl = wp.dot(n, light.sun)
