@@ -29,7 +29,7 @@ WALL, MASS = 0.012, 1.6
 CLEAR = 0.01
 """[m] Whoever stands deeper than this in something else stands in it."""
 FALL, REST, TRIES = 25, 100, 3
-"""[tick] between two bunches that fall into a crate, for the heap to settle; how often what rolls out is put back."""
+"""[tick] between bunches that fall into a crate; for the heap to settle; how often what rolled out is put back."""
 
 
 class NoRoom(ValueError):

@@ -167,10 +167,10 @@ def ground_surface(looks: Looks, p: wp.vec3, pixel: float, slant: float) -> Surf
         0.38, 0.60, 0.55 * coarse[0] + 0.2 * coarse[2] + 0.25 * sod + sown(looks.rows, p[1]) * inside * blur
     )
     beyond = smoothstep(0.35, 0.65, fields[1])
-    green = wp.min(green * 0.85 + 0.35 * (1.0 - inside) * beyond, 0.92)
+    green = wp.min(green * 0.85 + (0.22 + 0.45 * beyond) * (1.0 - inside), 0.92)
     earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
     turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
-    turf = mix(turf, wp.vec3(0.060, 0.085, 0.022), (1.0 - inside) * smoothstep(0.4, 0.6, fields[2]))
+    turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
     s.albedo = mix(earth, turf, green) * (0.8 + 0.4 * coarse[1])
     s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
     s.gloss = 0.0

@@ -7,6 +7,7 @@ import numpy as np
 from vinesim.kernels import materials
 from vinesim.sensors import textures
 from vinesim.sensors.batches import CONE, LEAF, Batch, batch, columns
+from vinesim.world import leaves
 from vinesim.world.ids import Organ, label
 from vinesim.world.model import Model
 
@@ -79,6 +80,38 @@ def _sown(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
     away = np.abs(lane - np.round(lane)) * rows[1]
     track = np.abs(away - 0.5 * rows[1] + 0.7)
     return 0.16 - 0.26 * textures.smoothstep(0.65, 0.25, away) - 0.14 * textures.smoothstep(0.22, 0.08, track)
+
+
+def litter(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch | None:
+    """Fallen leaves, more of them when many leaves are old: ``age`` is the mean of :attr:`Model.leaf_age`."""
+    low, high = low - 1.0, high + 1.0
+    n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
+    if n == 0:
+        return None
+    rng = np.random.default_rng(29)
+    spot = low + (high - low) * rng.uniform(size=(n, 2))
+    turn, tilt = rng.uniform(0.0, 2.0 * np.pi, n), rng.normal(0.0, 0.15, n)
+    rib = np.stack([np.cos(turn), np.sin(turn), tilt], 1) / np.hypot(1.0, tilt)[:, None]
+    up = np.cross(rib, np.stack([np.sin(turn), -np.cos(turn), rng.normal(0.0, 0.15, n)], 1))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    dry = rng.uniform(size=(n, 1))
+    tint = (1.0 - dry) * np.array([0.30, 0.24, 0.05]) + dry * np.array([0.17, 0.10, 0.045])
+    bend = columns(
+        rng.normal(0.0, 0.25, n), rng.normal(0.0, 0.25, n), rng.uniform(-0.2, 0.4, n), rng.uniform(0.8, 1.0, n)
+    )
+    return batch(
+        LEAF,
+        columns(spot, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
+        b=columns(rib, leaves.shape_of(np.arange(n))),
+        c=columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(materials.FOLIAGE),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=still,
+        group=_cell_of(spot, 0),
+    )
 
 
 def meadow(rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, still: int) -> Batch | None:

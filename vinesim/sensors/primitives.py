@@ -15,7 +15,7 @@ from vinesim import frames
 from vinesim.kernels import materials, shadows, shapes
 from vinesim.sensors import textures
 from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
-from vinesim.sensors.grounds import fixed, meadow, rows_of
+from vinesim.sensors.grounds import fixed, litter, meadow, rows_of
 from vinesim.sensors.links import rigid
 from vinesim.sensors.vines import Ripeness, bunches, canes, foliage, pieces_of
 from vinesim.world.ids import Organ
@@ -35,7 +35,9 @@ class Primitives:
     def __init__(
         self, model: Model, *, grass: float = 90.0, device: str = "cpu", ripeness: Ripeness | None = None
     ) -> None:
-        """``grass``: tufts a square metre around the vines, 0: bare ground; ``ripeness``: all is ripe without."""
+        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
+        the fruit: all of it is ripe unless given.
+        """
         self.model, self.device, self._ripeness = model, device, ripeness
         bodies = len(model.body_mass)
         self._still = bodies
@@ -48,9 +50,11 @@ class Primitives:
         pieces = [pieces_of(model, bunch) for bunch in every]
         batches += bunches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
         self._tree_batches = len(batches)
-        batches += [
-            b for b in (fixed(model, bodies), meadow(rows_of(model), low, high, grass, bodies)) if b is not None
-        ]
+        around = [fixed(model, bodies)]
+        if grass > 0.0:
+            age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
+            around += [meadow(rows_of(model), low, high, grass, bodies), litter(low, high, age, bodies)]
+        batches += [b for b in around if b is not None]
         self._plants = [b for b in batches if len(b)] or [nothing(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
