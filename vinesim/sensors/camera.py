@@ -196,7 +196,7 @@ class Quality:
 
 QUALITIES = {
     "fast": Quality(taps=0, block=2, samples=1, fine=1),
-    "full": Quality(taps=6, block=1, samples=1, fine=1),
+    "full": Quality(taps=0, block=1, samples=1, fine=1),
     "still": Quality(taps=12, block=2, samples=2, fine=2),
 }
 """``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
