@@ -19,9 +19,13 @@ from vinesim.kernels.shapes import (
     hit_cone,
     hit_cylinder,
     hit_leaf,
+    hit_sheet,
+    inside_outline,
     hit_sphere,
     hit_triangle,
-    leaf_heights,
+    leaf_bulge,
+    leaf_extent,
+    leaf_height,
     squeeze,
     xyz,
 )
@@ -35,8 +39,14 @@ UNBOUND = wp.constant(1.0e6)
 """A tangent beyond any picture."""
 CLOSE = wp.constant(0.05)
 """Nearer than this [m] bounds are taken from spheres, which know no plane."""
+RUN = wp.constant(64)
+"""Pixels of a row that are taken at once; loops over them are written so that LLVM takes eight at a time."""
 SMOOTH_SIZE = wp.constant(120.0)
 """From this size in pixels on a leaf's outline is interpolated between texels."""
+
+
+Depths = wp.types.vector(length=64, dtype=wp.float32)
+"""Scratch for one run of pixels."""
 
 
 @wp.struct
@@ -65,10 +75,16 @@ def ray_of(lens: Pinhole, x: int, y: int) -> wp.vec3:
 
 
 @wp.func
+def key_of(t: float, i: int) -> wp.int64:
+    """What a hit is kept as: the least is the nearest."""
+    return (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i)
+
+
+@wp.func
 def keep(pixel: int, t: float, i: int, reach: float, keys_out: wp.array(dtype=wp.int64)):
     """Enter a hit."""
     if t < reach:
-        wp.atomic_min(keys_out, pixel, (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i))
+        wp.atomic_min(keys_out, pixel, key_of(t, i))
 
 
 @wp.func
@@ -258,6 +274,7 @@ def raster_leaves(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         size = a4[3]
@@ -269,8 +286,7 @@ def raster_leaves(
             rib = lens.turn * xyz(b4)
             up = lens.turn * xyz(shapes.c[i])
             side = wp.cross(rib, up)
-            heights = leaf_heights(bend)
-            # octagon around the outline at the lowest and the highest level: bounds of x, y, x + y, x - y
+            # octagon around the picture of the blade: bounds of x, y, x + y, x - y
             x_low = float(UNBOUND)
             x_high = -float(UNBOUND)
             y_low = float(UNBOUND)
@@ -280,11 +296,13 @@ def raster_leaves(
             dif_low = float(UNBOUND)
             dif_high = -float(UNBOUND)
             z_low = float(FAR)
+            bulge = leaf_bulge(shapes.hull, number, bend)
             for n in range(8):
                 corner = shapes.hull[number, n]
-                flat = p + (side * corner[0] + rib * corner[1]) * size
+                height = leaf_height(bend, corner[0], corner[1])
+                flat = p + (side * corner[0] + rib * corner[1] + up * (height - bulge[1])) * size
                 for m in range(2):
-                    q = flat + up * (heights[m] * size)
+                    q = flat + up * (float(m) * (bulge[0] + bulge[1]) * size)
                     z_low = wp.min(z_low, q[2])
                     k_z = 1.0 / wp.max(q[2], 0.01)
                     qx = q[0] * k_z * lens.fx + lens.cx
@@ -311,6 +329,7 @@ def raster_leaves(
                 smooth = wp.int32(0)
                 if size * lens.fx > p[2] * SMOOTH_SIZE:
                     smooth = 1
+                extent = leaf_extent(shapes.hull, number)
                 nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)
                 for y in range(box[2], box[3]):
                     x0 = box[0]
@@ -320,16 +339,30 @@ def raster_leaves(
                         x0 = wp.max(x0, int(wp.max(wp.max(sum_low - fy, dif_low + fy) - 0.01, 0.0)))
                         x1 = wp.min(x1, int(wp.max(wp.min(sum_high - fy, dif_high + fy) + 1.01, 0.0)))
                     row = dz + dy * fy
-                    for x in range(x0, x1):
-                        at = y * lens.width + x
-                        if keys_out[at] > nearest:
-                            keep(
-                                at,
-                                hit_leaf(shapes.outline, number, bend, eye, row + dx * float(x), smooth),
-                                i,
-                                lens.reach,
-                                keys_out,
-                            )
+                    at = y * lens.width
+                    while x0 < x1 and keys_out[at + x0] <= nearest:
+                        x0 += 1
+                    while x0 < x1 and keys_out[at + x1 - 1] <= nearest:
+                        x1 -= 1
+                    for start in range(x0, x1, RUN):
+                        n = wp.min(x1 - start, RUN)
+                        whole = (n + 7) // 8 * 8
+                        x = wp.int32(0)
+                        while x < whole:
+                            depths[x] = hit_sheet(bend, extent, eye, row + dx * float(start + x))
+                            x += 1
+                        for k in range(n):
+                            t = depths[k]
+                            if t < lens.reach:
+                                ray = row + dx * float(start + k)
+                                if t < 0.0:
+                                    t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
+                                    keep(at + start + k, t, i, lens.reach, keys_out)
+                                elif key_of(t, i) < keys_out[at + start + k]:
+                                    u = eye[0] + t * ray[0]
+                                    v = eye[1] + t * ray[1]
+                                    if inside_outline(shapes.outline, number, u, v, smooth):
+                                        keep(at + start + k, t, i, lens.reach, keys_out)
 
 
 @wp.kernel
