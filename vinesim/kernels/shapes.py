@@ -109,7 +109,7 @@ def hit_sphere(centre: wp.vec3, r: float, d: wp.vec3) -> float:
 
 @wp.func
 def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
-    """First hit of a ray from the origin with the hull of two spheres (Quilez, "round cone")."""
+    """First hit of a ray from the origin with the hull of two spheres (Quilez, "round cone"), without a branch."""
     ba = b - a
     slope = ra - rb
     dd = wp.dot(d, d)
@@ -128,30 +128,21 @@ def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
     k1 = d2 * m3 - m1 * m2 + m2 * slope * ra
     k0 = d2 * m5 - m1 * m1 + m1 * slope * ra * 2.0 - m0 * ra * ra
     h = k1 * k1 - k0 * k2
-    best = FAR
-    side = wp.int32(0)
-    if d2 > 0.0 and h >= 0.0:
-        root = wp.sqrt(h)
-        if k2 > 0.0:
-            t = (-root - k1) / k2
-            y = m1 - ra * slope + t * m2
-            if y > 0.0 and y < d2:
-                best = t + shift
-                side = 1
-        elif k2 < 0.0:  # steeper than the slope, as when looking along the axis: either root may be the first hit
-            for k in range(2):
-                t = (wp.where(k == 0, root, -root) - k1) / k2
-                y = m1 - ra * slope + t * m2
-                if y > 0.0 and y < d2 and t + shift > 0.0:
-                    best = wp.min(best, t + shift)
-    if side == 0:
-        h1 = m3 * m3 - dd * (m5 - ra * ra)
-        if h1 > 0.0:
-            best = (-m3 - wp.sqrt(h1)) / dd + shift
-        m6 = wp.dot(ob, d)
-        h2 = m6 * m6 - dd * (wp.dot(ob, ob) - rb * rb)
-        if h2 > 0.0:
-            best = wp.min(best, (-m6 - wp.sqrt(h2)) / dd + shift)
+    root = wp.sqrt(wp.max(h, 0.0))
+    per = 1.0 / wp.where(wp.abs(k2) > TINY, k2, TINY)
+    t1 = (-root - k1) * per
+    t2 = (root - k1) * per
+    y1 = m1 - ra * slope + t1 * m2
+    y2 = m1 - ra * slope + t2 * m2
+    wide = d2 > 0.0 and h >= 0.0  # neither sphere holds the other, and the ray meets the infinite cone
+    steep = k2 < 0.0  # than the slope, as when looking along the axis: either root may be the first hit
+    best = wp.where(wide and y1 > 0.0 and y1 < d2 and (t1 + shift > 0.0 or not steep), t1 + shift, FAR)
+    best = wp.min(best, wp.where(wide and steep and y2 > 0.0 and y2 < d2 and t2 + shift > 0.0, t2 + shift, FAR))
+    h1 = m3 * m3 - dd * (m5 - ra * ra)
+    best = wp.min(best, wp.where(h1 > 0.0, (-m3 - wp.sqrt(wp.max(h1, 0.0))) / dd + shift, FAR))
+    m6 = wp.dot(ob, d)
+    h2 = m6 * m6 - dd * (wp.dot(ob, ob) - rb * rb)
+    best = wp.min(best, wp.where(h2 > 0.0, (-m6 - wp.sqrt(wp.max(h2, 0.0))) / dd + shift, FAR))
     return wp.where(best > 0.0, best, FAR)
 
 
@@ -232,7 +223,9 @@ def leaf_extent(hull: wp.array2d(dtype=wp.vec2), number: int) -> wp.vec3:
     """Largest |u|, lowest and highest v of an outline: corners 1 and 5 of its octagon lie at the sides, 3 and 7 at the
     ends.
     """
-    return wp.vec3(wp.max(wp.abs(hull[number, 1][0]), wp.abs(hull[number, 5][0])), hull[number, 3][1], hull[number, 7][1])
+    return wp.vec3(
+        wp.max(wp.abs(hull[number, 1][0]), wp.abs(hull[number, 5][0])), hull[number, 3][1], hull[number, 7][1]
+    )
 
 
 @wp.func

@@ -20,9 +20,9 @@ from vinesim.kernels.shapes import (
     hit_cylinder,
     hit_leaf,
     hit_sheet,
-    inside_outline,
     hit_sphere,
     hit_triangle,
+    inside_outline,
     leaf_bulge,
     leaf_extent,
     leaf_height,
@@ -47,6 +47,9 @@ SMOOTH_SIZE = wp.constant(120.0)
 
 Depths = wp.types.vector(length=64, dtype=wp.float32)
 """Scratch for one run of pixels."""
+
+
+Pixels = wp.types.vector(length=64, dtype=wp.int32)
 
 
 @wp.struct
@@ -205,6 +208,9 @@ def raster_cones(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    xs = Pixels()
+    ys = Pixels()
+    depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
@@ -242,20 +248,37 @@ def raster_cones(
             banded = clear and wp.min(ca[2], cb[2]) - r > 0.01 and wp.abs(yb - ya) > 2.0
             per_row = wp.where(banded, 1.0 / (yb - ya), 0.0)
             nearest = wp.int64(int(wp.max(wp.min(a[2], b[2]) - r, 0.0) * 1.0e6)) << wp.int64(32)
-            for y in range(box[2], box[3]):
-                x0 = box[0]
-                x1 = box[1]
-                if banded:
-                    s = (float(y) - half_y - ya) * per_row
-                    e = (float(y) + half_y - ya) * per_row
-                    xs = xa + (xb - xa) * wp.clamp(s, 0.0, 1.0)
-                    xe = xa + (xb - xa) * wp.clamp(e, 0.0, 1.0)
-                    x0 = wp.max(x0, int(wp.max(wp.min(xs, xe) - half_x, 0.0)))
-                    x1 = wp.min(x1, int(wp.max(wp.max(xs, xe) + half_x + 1.0, 0.0)))
-                for x in range(x0, x1):
-                    at = y * lens.width + x
-                    if keys_out[at] > nearest:
-                        keep(at, hit_cone(a, a4[3], b, b4[3], ray_of(lens, x, y)), i, lens.reach, keys_out)
+            x = wp.int32(0)
+            y = box[2] - 1
+            last = wp.int32(0)
+            while y < box[3]:
+                n = wp.int32(0)
+                while n < RUN and y < box[3]:
+                    if x < last:
+                        if keys_out[y * lens.width + x] > nearest:
+                            xs[n] = x
+                            ys[n] = y
+                            n += 1
+                        x += 1
+                    else:
+                        y += 1
+                        x = box[0]
+                        last = box[1]
+                        if banded:
+                            s = (float(y) - half_y - ya) * per_row
+                            e = (float(y) + half_y - ya) * per_row
+                            xs_ = xa + (xb - xa) * wp.clamp(s, 0.0, 1.0)
+                            xe = xa + (xb - xa) * wp.clamp(e, 0.0, 1.0)
+                            x = wp.max(x, int(wp.max(wp.min(xs_, xe) - half_x, 0.0)))
+                            last = wp.min(last, int(wp.max(wp.max(xs_, xe) + half_x + 1.0, 0.0)))
+                        last = wp.where(y < box[3], last, 0)
+                whole = (n + 7) // 8 * 8
+                m = wp.int32(0)
+                while m < whole:
+                    depths[m] = hit_cone(a, a4[3], b, b4[3], ray_of(lens, xs[m], ys[m]))
+                    m += 1
+                for m in range(n):
+                    keep(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
 
 
 @wp.kernel
@@ -493,10 +516,9 @@ def ground_depth(lens: Pinhole, x: int, y: int) -> float:
     """Depth at which a pixel's ray meets the ground, z = 0."""
     d = ray_of(lens, x, y)
     fall = lens.turn[0, 2] * d[0] + lens.turn[1, 2] * d[1] + lens.turn[2, 2]
-    t = FAR
-    if fall < -1.0e-6 and lens.eye[2] > 0.0:
-        t = -lens.eye[2] / fall
-    return wp.where(t < lens.reach, t, FAR)
+    meets = fall < -1.0e-6 and lens.eye[2] > 0.0
+    t = -lens.eye[2] / wp.where(meets, fall, -1.0)
+    return wp.where(meets and t < lens.reach, t, FAR)
 
 
 @wp.kernel
@@ -511,28 +533,27 @@ def resolve(
     farthest: float,
     too_near: float,
     too_far: float,
+    run: int,
     # out
     primitive_out: wp.array(dtype=wp.int32),
     depth_out: wp.array(dtype=wp.float32),
     labels_out: wp.array(dtype=wp.int32),
 ):
-    """One thread reads one pixel's key into depth [m], label and primitive (-1 sky, -2 ground)."""
-    pixel = wp.tid()
-    key = keys[pixel]
-    t = ground_depth(lens, pixel % lens.width, pixel // lens.width)
-    i = wp.where(t < FAR, -2, -1)
-    name = wp.where(t < FAR, ground_label, 0)
-    if key < EMPTY:
-        z = float(key >> wp.int64(32)) * 1.0e-6
-        if z < t:
-            t = z
-            i = int(key & LOW)
-            name = label[i]
-    primitive_out[pixel] = i
-    labels_out[pixel] = name
-    depth = t
-    if t < nearest:
-        depth = too_near
-    if t > farthest:
-        depth = too_far
-    depth_out[pixel] = depth
+    """One thread reads ``run`` pixels' keys into depth [m], label and primitive (-1 sky, -2 ground)."""
+    first = wp.tid() * run
+    column = first % lens.width
+    row = first // lens.width
+    for pixel in range(first, first + run):
+        key = keys[pixel]
+        t = ground_depth(lens, column + pixel - first, row)
+        i = wp.where(t < FAR, -2, -1)
+        name = wp.where(t < FAR, ground_label, 0)
+        if key < EMPTY:
+            z = float(key >> wp.int64(32)) * 1.0e-6
+            if z < t:
+                t = z
+                i = int(key & LOW)
+                name = label[i]
+        primitive_out[pixel] = i
+        labels_out[pixel] = name
+        depth_out[pixel] = wp.where(t < nearest, too_near, wp.where(t > farthest, too_far, t))
