@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
+from vinesim.kernels import shapes, sweep, visibility
 from vinesim.sensors.camera import REACH
 from vinesim.sensors.primitives import Primitives
-from vinesim.sensors.raycast import RayCaster
 
 
 class Sweep:
@@ -35,7 +35,21 @@ class Sweep:
         """To the nearest hit [column * row] m; 1e30 where nothing is met."""
         self.primitive = wp.full(columns * self.rows, -1, dtype=wp.int32, device=device)
         """What was met [column * row]: -2 the ground, -1 nothing."""
-        self._caster: RayCaster | None = None
+        self._keys = wp.empty(columns * self.rows, dtype=wp.int64, device=device)
+        self._distance = wp.empty(0, dtype=float, device=device)
+        order = np.argsort(elevation, kind="stable")
+        tangent = np.clip(np.tan(elevation[order]), -1.0e6, 1.0e6).astype(np.float32)
+        slot = ((tangent / (1.0 + np.abs(tangent)) + 1.0) * (0.5 * sweep.SLOTS - 0.01)).astype(int)
+        head = sweep.Head()
+        head.tangent, head.azimuth = (
+            wp.array(v.astype(np.float32), dtype=float, device=device) for v in (tangent, azimuth[order])
+        )
+        head.number = wp.array(order.astype(np.int32), device=device)
+        # one slot early: the division above may round otherwise than a kernel's
+        slots = np.searchsorted(slot, np.arange(sweep.SLOTS) - 1).astype(np.int32)
+        head.slots = wp.array(slots, device=device)
+        head.direction, head.step = self.direction, self.step
+        self._head = head
 
     def hits(
         self, primitives: Primitives, pose: np.ndarray, first: int = 0, count: int | None = None, reach: float = REACH
@@ -45,12 +59,34 @@ class Sweep:
         Fills that part of :attr:`distance` and :attr:`primitive`, and returns it [count, row].
         """
         count = self.columns - first if count is None else count
-        if self._caster is None or self._caster.primitives is not primitives:
-            self._caster = RayCaster(primitives)
         part = slice(first * self.rows, (first + count) * self.rows)
-        rays = frames.rotate(frames.normalize(pose[3:]), self.direction.numpy()[part].astype(float))
-        distance, primitive = self._caster.cast(pose[:3], rays, reach)
-        self.distance.numpy()[part] = np.where(np.isfinite(distance), distance, 1.0e30)
-        self.primitive.numpy()[part] = primitive
+        head = self._head
+        head.eye = wp.vec3(*map(float, pose[:3]))
+        head.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+        head.first, head.end, head.reach = first, first + count, float(reach)
+        self._keys[part].fill_(int(visibility.EMPTY))
+        clusters = len(primitives.cluster_first)
+        if len(self._distance) != clusters:
+            self._distance = wp.empty(clusters, dtype=float, device=self.device)
+        wp.launch(sweep.cull, clusters, inputs=[primitives.ball, head], outputs=[self._distance], device=self.device)
+        distance = self._distance.numpy()
+        seen = np.flatnonzero(distance < float(shapes.FAR))
+        seen = seen[np.argsort(distance[seen], kind="stable")].astype(np.int32)
+        lanes = 1 if self.device == "cpu" else 24
+        wp.launch(
+            sweep.raster,
+            (len(seen), lanes),
+            inputs=[primitives.shapes, primitives.clusters, wp.array(seen, device=self.device), head, lanes],
+            outputs=[self._keys],
+            device=self.device,
+        )
+        run = self.rows if self.device == "cpu" else 1
+        wp.launch(
+            sweep.resolve,
+            count * self.rows // run,
+            inputs=[self._keys, head, run],
+            outputs=[self.distance, self.primitive],
+            device=self.device,
+        )
         shape = (count, self.rows)
-        return self.distance.numpy()[part].reshape(shape), self.primitive.numpy()[part].reshape(shape)
+        return self.distance[part].numpy().reshape(shape), self.primitive[part].numpy().reshape(shape)

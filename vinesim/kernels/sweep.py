@@ -1,0 +1,285 @@
+"""What the rays of a spinning head meet first: primitives rasterised into its grid of azimuths and elevations.
+
+A primitive is bound by balls: one, or several along a cone or cylinder. A ball reaches over a range of elevations, which
+picks rows, and over a range of azimuths, which picks columns; the rays found are tested eight at a time and kept as a
+camera's pixels are (:mod:`vinesim.kernels.visibility`).
+"""
+
+import warp as wp
+
+from vinesim.kernels.shapes import (
+    BOX,
+    CONE,
+    CYLINDER,
+    ELLIPSOID,
+    FAR,
+    LEAF,
+    SPHEROID,
+    TRIANGLE,
+    Clusters,
+    Shapes,
+    hit,
+    hit_cone,
+    hit_leaf,
+    hit_sheet,
+    hit_sphere,
+    inside_outline,
+    leaf_extent,
+    leaf_heights,
+    squeeze,
+    xyz,
+)
+from vinesim.kernels.visibility import EMPTY, LOW, RUN, Depths, Pixels, keep, tangents
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+SLOTS = wp.constant(1024)
+"""Into so many parts the way from straight down to straight up is cut to find rows."""
+PIECE = wp.constant(0.02)
+"""A slender thing is bound by balls about this far apart [rad]."""
+
+
+@wp.struct
+class Head:
+    """Where the head is, its rows in the order of elevation, and which columns are fired."""
+
+    eye: wp.vec3
+    turn: wp.mat33
+    """Rows: forward, left, up, in the world."""
+    tangent: wp.array(dtype=wp.float32)
+    """Of the elevation [row]."""
+    azimuth: wp.array(dtype=wp.float32)
+    """Of the ray in column 0 [row] rad."""
+    number: wp.array(dtype=wp.int32)
+    """Place within a column [row]."""
+    slots: wp.array(dtype=wp.int32)
+    """First row in each slot or above it [slot]."""
+    direction: wp.array(dtype=wp.vec3)
+    """Unit vectors in the head's frame [column * row]."""
+    step: float
+    """From column to column [rad]."""
+    first: int
+    end: int
+    reach: float
+
+
+@wp.func
+def slot_of(tangent: float) -> int:
+    """Where an elevation lies between straight down and straight up."""
+    return int((tangent / (1.0 + wp.abs(tangent)) + 1.0) * (0.5 * float(SLOTS) - 0.01))
+
+
+@wp.func
+def first_row(head: Head, tangent: float) -> int:
+    """First row that is not below an elevation."""
+    row = head.slots[slot_of(tangent)]
+    while row < head.tangent.shape[0] and head.tangent[row] < tangent:
+        row += 1
+    return row
+
+
+@wp.func
+def half_angle(r: float, away: float) -> float:
+    """An upper bound of asin(r / away), pi where the circle goes round the origin."""
+    s = r / wp.max(away, r)
+    return wp.where(s < 0.9999, s + 0.5708 * s * s * s, 3.1416)
+
+
+@wp.kernel
+def cull(
+    # in
+    ball: wp.array(dtype=wp.vec4),
+    head: Head,
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+):
+    """One thread tells how near one cluster may come to the head, or FAR if no ray can meet it."""
+    i = wp.tid()
+    r = ball[i][3]
+    p = head.turn * (xyz(ball[i]) - head.eye)
+    around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+    high = tangents(p[2], around, r)
+    row = first_row(head, high[0])
+    seen = r > 0.0 and wp.length(p) - r < head.reach and row < head.tangent.shape[0]
+    distance = FAR
+    if seen:
+        if head.tangent[row] <= high[1]:
+            distance = wp.max(wp.length(p) - r, 0.0)
+    distance_out[i] = distance
+
+
+@wp.kernel
+def raster(
+    # model
+    shapes: Shapes,
+    clusters: Clusters,
+    # in
+    visible: wp.array(dtype=wp.int32),
+    head: Head,
+    lanes: int,
+    # out
+    keys_out: wp.array(dtype=wp.int64),
+):
+    """One thread enters every ``lanes``-th primitive of one cluster."""
+    k, lane = wp.tid()
+    cluster = visible[k]
+    kind = clusters.kind[cluster]
+    first = clusters.first[cluster]
+    rows = head.tangent.shape[0]
+    period = 6.2831853 / wp.abs(head.step)
+    spots = Pixels()
+    depths = Depths()
+    for i in range(first + lane, first + clusters.size[cluster], lanes):
+        a4 = shapes.a[i]
+        b4 = shapes.b[i]
+        a = head.turn * (xyz(a4) - head.eye)
+        b = a
+        r = a4[3]
+        pieces = wp.int32(1)
+        if kind == SPHEROID:
+            r *= wp.max(b4[3], 1.0)
+        elif kind == LEAF:
+            rib = head.turn * xyz(b4)
+            up = head.turn * xyz(shapes.c[i])
+            heights = leaf_heights(shapes.d[i])
+            extent = leaf_extent(shapes.hull, int(b4[3]))
+            middle = 0.5 * (extent[1] + extent[2])
+            high = 0.5 * (heights[1] - heights[0])
+            flat = float(0.0)
+            for n in range(8):
+                flat = wp.max(flat, wp.length(shapes.hull[int(b4[3]), n] - wp.vec2(0.0, middle)))
+            a += (rib * middle + up * (0.5 * (heights[0] + heights[1]))) * r
+            b = a
+            r *= wp.sqrt(flat * flat + high * high)
+        elif kind == CONE or kind == CYLINDER:
+            b = head.turn * (xyz(b4) - head.eye)
+            r = wp.max(r, wp.where(kind == CONE, b4[3], 0.0))
+            long = wp.length(b - a)
+            along = wp.clamp(-wp.dot(a, b - a) / wp.max(long * long, 1.0e-12), 0.0, 1.0)
+            away = wp.length(a + (b - a) * along)
+            pieces = wp.clamp(int(long / wp.max(3.0 * r, PIECE * away)) + 1, 1, 1000)
+            r += 0.5 * long / float(pieces)
+        elif kind == TRIANGLE:
+            q = head.turn * (xyz(b4) - head.eye)
+            s = head.turn * (xyz(shapes.c[i]) - head.eye)
+            middle_of = (a + q + s) / 3.0
+            r = wp.max(wp.max(wp.length(a - middle_of), wp.length(q - middle_of)), wp.length(s - middle_of)) * 1.001
+            a = middle_of
+            b = a
+        elif kind == BOX:
+            r = wp.length(wp.vec3(r, shapes.c[i][0], shapes.c[i][1]))
+        elif kind == ELLIPSOID:
+            r = wp.max(wp.max(r, shapes.c[i][0]), shapes.c[i][1])
+        for piece in range(pieces):
+            p = a + (b - a) * ((float(piece) + 0.5) / float(pieces))
+            around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+            span = tangents(p[2], around, r)
+            row = first_row(head, span[0]) - 1
+            more = row + 1 < rows
+            if more:
+                more = head.tangent[row + 1] <= span[1]
+            if more:
+                azimuth = wp.atan2(p[1], p[0])
+                half = wp.min((half_angle(r, around) + 1.0e-5) / wp.abs(head.step), 0.5 * period)
+                nearest = wp.int64(int(wp.max(wp.length(p) - r, 0.0) * 1.0e6)) << wp.int64(32)
+                column = wp.int32(0)
+                last = wp.int32(0)
+                begin = float(head.end)
+                while more:
+                    n = wp.int32(0)
+                    while n < RUN and more:
+                        if column < last:
+                            at = column * rows + head.number[row]
+                            if keys_out[at] > nearest:
+                                spots[n] = at
+                                n += 1
+                            column += 1
+                        else:
+                            # the same row one turn further, or the next row
+                            begin += period
+                            if begin >= float(head.end):
+                                row += 1
+                                more = row < rows
+                                if more:
+                                    more = head.tangent[row] <= span[1]
+                                if more:
+                                    begin = (azimuth - head.azimuth[row]) / head.step - half
+                                    begin += wp.ceil((float(head.first) - begin - 2.0 * half) / period) * period
+                            if more:
+                                column = wp.max(int(wp.ceil(begin)), head.first)
+                                last = wp.min(int(wp.floor(begin + 2.0 * half)) + 1, head.end)
+                    whole = (n + 7) // 8 * 8
+                    m = wp.int32(0)
+                    if kind == SPHEROID:
+                        axis = head.turn * xyz(b4)
+                        stretch = 1.0 / b4[3] - 1.0
+                        centre = squeeze(p, axis, stretch)
+                        while m < whole:
+                            depths[m] = hit_sphere(centre, a4[3], squeeze(head.direction[spots[m]], axis, stretch))
+                            m += 1
+                    elif kind == CONE:
+                        while m < whole:
+                            depths[m] = hit_cone(a, a4[3], b, b4[3], head.direction[spots[m]])
+                            m += 1
+                    elif kind == LEAF:
+                        bend = shapes.d[i]
+                        number = int(b4[3])
+                        base = head.turn * (xyz(a4) - head.eye)
+                        rib = head.turn * xyz(b4)
+                        up = head.turn * xyz(shapes.c[i])
+                        side = wp.cross(rib, up)
+                        per = 1.0 / a4[3]
+                        eye = wp.vec3(-wp.dot(base, side), -wp.dot(base, rib), -wp.dot(base, up)) * per
+                        extent = leaf_extent(shapes.hull, number)
+                        while m < whole:
+                            d = head.direction[spots[m]] * per
+                            ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
+                            depths[m] = hit_sheet(bend, extent, eye, ray)
+                            m += 1
+                        for m in range(n):
+                            t = depths[m]
+                            d = head.direction[spots[m]] * per
+                            ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
+                            if t < 0.0:
+                                depths[m] = hit_leaf(shapes.outline, number, bend, eye, ray, 0)
+                            elif t < head.reach:
+                                u = eye[0] + t * ray[0]
+                                v = eye[1] + t * ray[1]
+                                if not inside_outline(shapes.outline, number, u, v, 0):
+                                    depths[m] = FAR
+                    else:
+                        back = wp.transpose(head.turn)
+                        for m in range(n):
+                            depths[m] = hit(shapes, i, head.eye, back * head.direction[spots[m]], 0)
+                    for m in range(n):
+                        keep(spots[m], depths[m], i, head.reach, keys_out)
+
+
+@wp.kernel
+def resolve(
+    # in
+    keys: wp.array(dtype=wp.int64),
+    head: Head,
+    run: int,
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+    primitive_out: wp.array(dtype=wp.int32),
+):
+    """One thread reads the keys of ``run`` rays into distance [m] and primitive (-1 nothing, -2 the ground)."""
+    up = wp.vec3(head.turn[0, 2], head.turn[1, 2], head.turn[2, 2])
+    first = head.first * head.tangent.shape[0] + wp.tid() * run
+    for at in range(first, first + run):
+        t = head.reach
+        i = wp.int32(-1)
+        fall = wp.dot(up, head.direction[at])
+        if fall < -1.0e-6 and head.eye[2] > 0.0 and -head.eye[2] / fall < t:
+            t = -head.eye[2] / fall
+            i = -2
+        key = keys[at]
+        if key < EMPTY:
+            z = float(key >> wp.int64(32)) * 1.0e-6
+            if z < t:
+                t = z
+                i = int(key & LOW)
+        distance_out[at] = wp.where(i == -1, FAR, t)
+        primitive_out[at] = i
