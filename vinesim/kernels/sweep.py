@@ -58,6 +58,10 @@ class Head:
     """Unit vectors in the head's frame [column * row]."""
     step: float
     """From column to column [rad]."""
+    middle: wp.vec2
+    """Forward and left component of the middle of the azimuths that are fired."""
+    within: wp.vec2
+    """Cosine and sine of how far they reach to either side; cosine -1 for all around."""
     first: int
     end: int
     reach: float
@@ -85,6 +89,19 @@ def half_angle(r: float, away: float) -> float:
     return wp.where(s < 0.9999, s + 0.5708 * s * s * s, 3.1416)
 
 
+@wp.func
+def meets(head: Head, p: wp.vec3, r: float) -> int:
+    """1 if a ray that is fired may meet a ball, 0 if surely none does. Without a branch."""
+    flat2 = p[0] * p[0] + p[1] * p[1]
+    flat = wp.sqrt(flat2)
+    span = tangents(p[2], flat, r)
+    rows = head.slots[slot_of(span[1]) + 2] - head.slots[slot_of(span[0])]
+    free = flat2 - r * r
+    ahead = p[0] * head.middle[0] + p[1] * head.middle[1]
+    inside = free <= 0.0 or ahead >= head.within[0] * wp.sqrt(wp.max(free, 0.0)) - head.within[1] * r
+    return wp.where(rows > 0 and (inside or head.within[0] <= -1.0), 1, 0)
+
+
 @wp.kernel
 def cull(
     # in
@@ -97,15 +114,9 @@ def cull(
     i = wp.tid()
     r = ball[i][3]
     p = head.turn * (xyz(ball[i]) - head.eye)
-    around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
-    high = tangents(p[2], around, r)
-    row = first_row(head, high[0])
-    seen = r > 0.0 and wp.length(p) - r < head.reach and row < head.tangent.shape[0]
-    distance = FAR
-    if seen:
-        if head.tangent[row] <= high[1]:
-            distance = wp.max(wp.length(p) - r, 0.0)
-    distance_out[i] = distance
+    away = wp.length(p) - r
+    seen = r > 0.0 and away < head.reach and meets(head, p, r) == 1
+    distance_out[i] = wp.where(seen, wp.max(away, 0.0), FAR)
 
 
 @wp.kernel
@@ -113,6 +124,8 @@ def raster(
     # model
     shapes: Shapes,
     clusters: Clusters,
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
     # in
     visible: wp.array(dtype=wp.int32),
     head: Head,
@@ -129,7 +142,20 @@ def raster(
     period = 6.2831853 / wp.abs(head.step)
     spots = Pixels()
     depths = Depths()
-    for i in range(first + lane, first + clusters.size[cluster], lanes):
+    size = clusters.size[cluster]
+    # most primitives of far clusters lie between two rows
+    found = Pixels()
+    n = wp.int32(0)
+    while n < (size + 7) // 8 * 8:
+        i = first + wp.min(n, size - 1)
+        lo = lower[i]
+        hi = upper[i]
+        found[n] = meets(head, head.turn * ((lo + hi) * 0.5 - head.eye), wp.length(hi - lo) * 0.5)
+        n += 1
+    for member in range(lane, size, lanes):
+        if found[member] == 0:
+            continue
+        i = first + member
         a4 = shapes.a[i]
         b4 = shapes.b[i]
         a = head.turn * (xyz(a4) - head.eye)

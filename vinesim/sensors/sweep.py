@@ -46,10 +46,11 @@ class Sweep:
         )
         head.number = wp.array(order.astype(np.int32), device=device)
         # one slot early: the division above may round otherwise than a kernel's
-        slots = np.searchsorted(slot, np.arange(sweep.SLOTS) - 1).astype(np.int32)
+        slots = np.searchsorted(slot, np.arange(sweep.SLOTS + 3) - 1).astype(np.int32)
         head.slots = wp.array(slots, device=device)
         head.direction, head.step = self.direction, self.step
         self._head = head
+        self._fan = azimuth.min(), azimuth.max()
 
     def hits(
         self, primitives: Primitives, pose: np.ndarray, first: int = 0, count: int | None = None, reach: float = REACH
@@ -64,6 +65,11 @@ class Sweep:
         head.eye = wp.vec3(*map(float, pose[:3]))
         head.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
         head.first, head.end, head.reach = first, first + count, float(reach)
+        low, high = self._fan
+        turn = 0.5 * (low + high) + (first + 0.5 * (count - 1)) * self.step
+        reaches = 0.5 * (high - low + abs(self.step) * count) + 1e-4
+        head.middle = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
+        head.within = wp.vec2(float(np.cos(reaches)), float(np.sin(reaches))) if reaches < 1.5 else wp.vec2(-1.0, 0.0)
         self._keys[part].fill_(int(visibility.EMPTY))
         clusters = len(primitives.cluster_first)
         if len(self._distance) != clusters:
@@ -76,7 +82,15 @@ class Sweep:
         wp.launch(
             sweep.raster,
             (len(seen), lanes),
-            inputs=[primitives.shapes, primitives.clusters, wp.array(seen, device=self.device), head, lanes],
+            inputs=[
+                primitives.shapes,
+                primitives.clusters,
+                primitives.lower,
+                primitives.upper,
+                wp.array(seen, device=self.device),
+                head,
+                lanes,
+            ],
             outputs=[self._keys],
             device=self.device,
         )
