@@ -54,8 +54,8 @@ class Head:
     """Place within a column [row]."""
     slots: wp.array(dtype=wp.int32)
     """First row in each slot or above it [slot]."""
-    direction: wp.array(dtype=wp.vec3)
-    """Unit vectors in the head's frame [column * row]."""
+    direction: wp.array2d(dtype=wp.float32)
+    """Unit vectors in the head's frame [column * row, 3]."""
     step: float
     """From column to column [rad]."""
     middle: wp.vec2
@@ -65,6 +65,12 @@ class Head:
     first: int
     end: int
     reach: float
+
+
+@wp.func
+def fired(head: Head, at: int) -> wp.vec3:
+    """One ray; read number by number, for LLVM makes nothing of eight vectors."""
+    return wp.vec3(head.direction[at, 0], head.direction[at, 1], head.direction[at, 2])
 
 
 @wp.func
@@ -124,8 +130,8 @@ def raster(
     # model
     shapes: Shapes,
     clusters: Clusters,
-    lower: wp.array(dtype=wp.vec3),
-    upper: wp.array(dtype=wp.vec3),
+    lower: wp.array2d(dtype=wp.float32),
+    upper: wp.array2d(dtype=wp.float32),
     # in
     visible: wp.array(dtype=wp.int32),
     head: Head,
@@ -148,8 +154,8 @@ def raster(
     n = wp.int32(0)
     while n < (size + 7) // 8 * 8:
         i = first + wp.min(n, size - 1)
-        lo = lower[i]
-        hi = upper[i]
+        lo = wp.vec3(lower[i, 0], lower[i, 1], lower[i, 2])
+        hi = wp.vec3(upper[i, 0], upper[i, 1], upper[i, 2])
         found[n] = meets(head, head.turn * ((lo + hi) * 0.5 - head.eye), wp.length(hi - lo) * 0.5)
         n += 1
     for member in range(lane, size, lanes):
@@ -241,11 +247,11 @@ def raster(
                         stretch = 1.0 / b4[3] - 1.0
                         centre = squeeze(p, axis, stretch)
                         while m < whole:
-                            depths[m] = hit_sphere(centre, a4[3], squeeze(head.direction[spots[m]], axis, stretch))
+                            depths[m] = hit_sphere(centre, a4[3], squeeze(fired(head, spots[m]), axis, stretch))
                             m += 1
                     elif kind == CONE:
                         while m < whole:
-                            depths[m] = hit_cone(a, a4[3], b, b4[3], head.direction[spots[m]])
+                            depths[m] = hit_cone(a, a4[3], b, b4[3], fired(head, spots[m]))
                             m += 1
                     elif kind == LEAF:
                         bend = shapes.d[i]
@@ -258,13 +264,13 @@ def raster(
                         eye = wp.vec3(-wp.dot(base, side), -wp.dot(base, rib), -wp.dot(base, up)) * per
                         extent = leaf_extent(shapes.hull, number)
                         while m < whole:
-                            d = head.direction[spots[m]] * per
+                            d = fired(head, spots[m]) * per
                             ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
                             depths[m] = hit_sheet(bend, extent, eye, ray)
                             m += 1
                         for m in range(n):
                             t = depths[m]
-                            d = head.direction[spots[m]] * per
+                            d = fired(head, spots[m]) * per
                             ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
                             if t < 0.0:
                                 depths[m] = hit_leaf(shapes.outline, number, bend, eye, ray, 0)
@@ -276,7 +282,7 @@ def raster(
                     else:
                         back = wp.transpose(head.turn)
                         for m in range(n):
-                            depths[m] = hit(shapes, i, head.eye, back * head.direction[spots[m]], 0)
+                            depths[m] = hit(shapes, i, head.eye, back * fired(head, spots[m]), 0)
                     for m in range(n):
                         keep(spots[m], depths[m], i, head.reach, keys_out)
 
@@ -297,7 +303,7 @@ def resolve(
     for at in range(first, first + run):
         t = head.reach
         i = wp.int32(-1)
-        fall = wp.dot(up, head.direction[at])
+        fall = wp.dot(up, fired(head, at))
         if fall < -1.0e-6 and head.eye[2] > 0.0 and -head.eye[2] / fall < t:
             t = -head.eye[2] / fall
             i = -2

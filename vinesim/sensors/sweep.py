@@ -16,6 +16,11 @@ from vinesim.sensors.camera import REACH
 from vinesim.sensors.primitives import Primitives
 
 
+def _numbers(vectors: wp.array) -> wp.array:
+    """The same memory [n, 3] as numbers."""
+    return wp.array(ptr=vectors.ptr, shape=(len(vectors), 3), dtype=float, device=vectors.device, copy=False)
+
+
 class Sweep:
     """The rays of one revolution, and what they met when they were fired last."""
 
@@ -48,7 +53,7 @@ class Sweep:
         # one slot early: the division above may round otherwise than a kernel's
         slots = np.searchsorted(slot, np.arange(sweep.SLOTS + 3) - 1).astype(np.int32)
         head.slots = wp.array(slots, device=device)
-        head.direction, head.step = self.direction, self.step
+        head.direction, head.step = _numbers(self.direction), self.step
         self._head = head
         self._fan = azimuth.min(), azimuth.max()
 
@@ -85,8 +90,8 @@ class Sweep:
             inputs=[
                 primitives.shapes,
                 primitives.clusters,
-                primitives.lower,
-                primitives.upper,
+                _numbers(primitives.lower),
+                _numbers(primitives.upper),
                 wp.array(seen, device=self.device),
                 head,
                 lanes,
