@@ -127,9 +127,10 @@ class Visibility:
         distance = self.distances(primitives, lens)
         seen = np.flatnonzero(distance < float(shapes.FAR))
         self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
             visibility.resolve,
-            self.width * self.height,
+            self.width * self.height // run,
             inputs=[
                 primitives.labels,
                 self.keys,
@@ -139,6 +140,7 @@ class Visibility:
                 float(farthest),
                 -float("inf"),
                 float("inf"),
+                run,
             ],
             outputs=[self.primitive, self.depth, self.labels],
             device=self.device,
@@ -196,7 +198,7 @@ class Quality:
 
 QUALITIES = {
     "fast": Quality(taps=0, block=2, samples=1, fine=1),
-    "full": Quality(taps=6, block=1, samples=1, fine=1),
+    "full": Quality(taps=0, block=1, samples=1, fine=1),
     "still": Quality(taps=12, block=2, samples=2, fine=2),
 }
 """``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
