@@ -9,7 +9,7 @@ import numpy as np
 
 
 def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: int | None, out: pathlib.Path) -> int:
-    """Draw it and write ``rgb``, ``depth``, ``labels``, ``overlay`` PNGs, ``camera.json`` and ``truth.json``."""
+    """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera`` and ``truth`` JSON."""
     from vinesim.cli.join import WrongUse
     from vinesim.sensors import formats, picture, truth
     from vinesim.sensors.camera import Camera, CameraSpec
@@ -41,7 +41,8 @@ def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: 
     frame = Camera(spec, info, "camera", plan.sun.direction(), taps=16, shadow_period=0.0).render(primitives, pose)
     images = {
         "rgb": frame.rgb,
-        "depth": picture.depth_millimetres(frame.depth),
+        "depth": picture.depth_millimetres(frame.exact_depth),
+        "measured": picture.depth_millimetres(frame.depth),
         "labels": formats.ids(frame.labels),
         "overlay": formats.overlay(frame.rgb, truths),
     }

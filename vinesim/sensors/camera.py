@@ -1,7 +1,7 @@
-"""RGB-D cameras: exact depth and labels, and a picture.
+"""RGB-D cameras: a picture, labels, exact depth, and depth as the sensor measures it.
 
 Depth follows REP-118: metres along the optical axis; -Inf nearer than the sensor can measure, +Inf farther than it can,
-which includes the open sky; NaN is kept for a pixel that should have measured and did not (noise models).
+which includes the open sky; NaN for a pixel that should have measured and did not (:mod:`vinesim.sensors.stereo`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from vinesim.kernels import shade, shapes, visibility
 from vinesim.sensors import specs
 from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
 from vinesim.sensors.primitives import Primitives
+from vinesim.sensors.stereo import Stereo, StereoSpec
 from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import CameraFrame, CameraInfo
@@ -38,15 +39,17 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """One kind of camera (``data/cameras``)."""
 
     model: str
-    width: Annotated[Number, "px"]
-    height: Annotated[Number, "px"]
-    fx: Annotated[Number, "px"]
-    fy: Annotated[Number, "px"]
-    nearest: Annotated[Number, "m"]
+    width: Annotated[Number, "px", (1.0, 8192.0)]
+    height: Annotated[Number, "px", (1.0, 8192.0)]
+    fx: Annotated[Number, "px", (1.0, 1e6)]
+    fy: Annotated[Number, "px", (1.0, 1e6)]
+    nearest: Annotated[Number, "m", (0.0, 1000.0)]
     """Smallest depth that is measured."""
-    farthest: Annotated[Number, "m"]
+    farthest: Annotated[Number, "m", (0.0, 1000.0)]
     """Largest depth that is measured."""
-    rate: Annotated[Number, "Hz"]
+    rate: Annotated[Number, "Hz", (0.01, 1000.0)]
+    stereo: StereoSpec | None = None
+    """How depth is measured; exactly unless given."""
 
     @classmethod
     def load(cls, name: str) -> CameraSpec:
@@ -58,6 +61,12 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
                 "give 0 <= nearest < farthest"
             )
         return spec
+
+    def ideal(self) -> CameraSpec:
+        """The same camera if it measured exactly and from anywhere."""
+        number = msgspec.structs.replace
+        near, far = number(self.nearest, value=0.0), number(self.farthest, value=1000.0)
+        return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None)
 
     def info(self, frame_id: str, scale: float = 1.0) -> CameraInfo:
         """Intrinsics with the principal point in the middle; ``scale`` enlarges the picture."""
@@ -179,9 +188,14 @@ class Camera:
     shadow_period: float = 0.2
     """Moving things get new shadows this often [s]; 0 for every frame."""
     device: str = "cpu"
+    seed: int = 0
+    image: int = 0
+    """Number of the next image. What the sensor measures follows from (seed, name, this)."""
 
     def __post_init__(self) -> None:
         self.visibility = Visibility(self.info.width, self.info.height, self.device)
+        reach = self.spec.nearest.value, self.spec.farthest.value
+        self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, Visibility, self.device)
         self._sunlight = Sunlight(self.sun, taps=self.taps, period=self.shadow_period, device=self.device)
         self._rgb = wp.empty((self.info.width * self.info.height, 3), dtype=wp.uint8, device=self.device)
 
@@ -195,7 +209,7 @@ class Camera:
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
         seen = self.visibility
-        seen.draw(primitives, lens, self.spec.nearest.value, self.spec.farthest.value)
+        seen.draw(primitives, lens)
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
         run = self.info.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
@@ -217,12 +231,21 @@ class Camera:
             device=self.device,
         )
         shape = (self.info.height, self.info.width)
+        exact = seen.depth.numpy().reshape(shape).copy()
+        if self._stereo:
+            dice = specs.dice(self.seed, self.name, self.image)
+            depth = self._stereo.measure(primitives, lens, seen.depth, self._rgb, dice)
+        else:
+            too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
+            depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
+        self.image += 1
         return CameraFrame(
             time=float(time),
             name=self.name,
             info=self.info,
             pose=pose,
             rgb=self._rgb.numpy().reshape(*shape, 3).copy(),
-            depth=seen.depth.numpy().reshape(shape).copy(),
+            depth=depth,
             labels=seen.labels.numpy().reshape(shape).copy(),
+            exact_depth=exact,
         )

@@ -42,7 +42,7 @@ TOO_NEAR = 0.15
 LATITUDE = np.radians(41.6)
 """Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
 _TRIES = 60
-_FOLDERS = ("images", "labels", "depth", "ids", "berries", "records")
+_FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 
 
 class DatasetError(SensorError):
@@ -121,7 +121,9 @@ class Vineyard:
         hour, sun = _daylight(rng)
         seen = self._look(rng)
         truths = truth.of_bunches(self.primitives, self.view, seen, self.caster)
-        camera = Camera(self.spec, self.info, "camera", sun, taps=16, shadow_period=0.0)
+        camera = Camera(
+            self.spec, self.info, "camera", sun, taps=16, shadow_period=0.0, seed=self.plan.seed, image=image
+        )
         frame = camera.render(self.primitives, seen.pose)
         bunches = formats.record(truths, self.info)
         name = f"{image:06d}"
@@ -141,7 +143,8 @@ class Vineyard:
         }
         images = {
             "images": frame.rgb,
-            "depth": picture.depth_millimetres(frame.depth),
+            "depth": picture.depth_millimetres(frame.exact_depth),
+            "measured": picture.depth_millimetres(frame.depth),
             "ids": formats.ids(frame.labels),
             "berries": formats.berry_ids(seen),
         }

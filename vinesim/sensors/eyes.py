@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from vinesim.kernels import lidar, shade, shadows, shapes, visibility
+from vinesim.kernels import lidar, shade, shadows, shapes, stereo, visibility
 from vinesim.sensors.camera import Camera
 from vinesim.sensors.lidar import Lidar
 from vinesim.sensors.primitives import Primitives
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 def load_kernels() -> None:
     """Compile what pictures and scans need, or read it from the cache, before anybody waits for one."""
-    for module in (lidar, shade, shadows, shapes, visibility):
+    for module in (lidar, shade, shadows, shapes, stereo, visibility):
         wp.load_module(module, device="cpu")
 
 

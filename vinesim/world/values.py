@@ -348,6 +348,8 @@ class CameraFrame:
     """[height, width] float32 m along z; NaN no return, -Inf too near, +Inf too far (REP-118)."""
     labels: np.ndarray
     """[height, width] int32, :func:`vinesim.world.ids.label`; 0 is nothing."""
+    exact_depth: np.ndarray | None = None
+    """[height, width] float32 m along z, whatever the sensor can measure: no noise, no gaps; +Inf for the sky."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
