@@ -9,7 +9,7 @@ import numpy as np
 
 
 def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: int | None, out: pathlib.Path) -> int:
-    """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera`` and ``truth`` JSON."""
+    """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.cli.join import WrongUse
     from vinesim.sensors import formats, picture, truth
     from vinesim.sensors.camera import Camera, CameraSpec

@@ -95,7 +95,7 @@ def camera() -> Iterator[Measurement]:
     pose = looking(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
     seen, lens = Visibility(info.width, info.height), pinhole(info, pose)
     eye = Camera(spec, info)
-    lidar = Lidar(LidarSpec.load("vlp16"))
+    lidar = Lidar(LidarSpec.load("vlp16").ideal())
     stand = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
     trees = np.unique(model.body_tree[model.bunch_body])[:20]
     awake = dataclasses.replace(view, moved=trees)

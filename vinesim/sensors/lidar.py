@@ -1,50 +1,75 @@
-"""Spinning lidars: firing times and angles from a table, exact ranges, intensity by matter and angle.
+"""Spinning lidars: firing times and angles from a table, beams with a width, echoes, and what is reported.
 
-One revolution is taken at one instant of the world: nothing moves while the head turns. Ranges carry no noise yet.
+Each shot is a handful of rays over the beam's footprint. What they meet closer together along the beam than the pulse
+is long comes back as one echo, whose range lies in between: mixed returns at the edges of leaves. Points are raw, as
+drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
+
+Two halves, so that either can be exchanged: ``hits`` tells what each ray meets, :meth:`Lidar.fire` what is reported.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+import dataclasses
+from typing import Annotated, Literal, Protocol
 
 import msgspec
 import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import lidar
+from vinesim.kernels import lidar, rays
 from vinesim.sensors import specs
 from vinesim.sensors.primitives import Primitives
 from vinesim.sensors.raycast import RayCaster
+from vinesim.sensors.specs import Numbers
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import LidarScan
 from vinesim.world.vine import Number
 
-
-class Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sourced list of numbers."""
-
-    value: tuple[float, ...]
-    unit: str
-    grade: str
-    source: str
+MOST_RAYS = 8
+"""Of one shot."""
+_RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 
 class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One kind of lidar (``data/lidars``)."""
 
     model: str
-    elevation: Annotated[Numbers, "deg"]
+    elevation: Annotated[Numbers, "deg", (-90.0, 90.0)]
     """By laser, in the order of firing."""
-    laser_period: Annotated[Number, "s"]
+    azimuth: Annotated[Numbers, "deg", (-180.0, 180.0)] | None = None
+    """By laser: how far it looks counter-clockwise of the head."""
+    laser_period: Annotated[Number, "s", (0.0, 0.01)]
     """Between two lasers."""
-    firing_period: Annotated[Number, "s"]
+    firing_period: Annotated[Number, "s", (1e-6, 0.1)]
     """Between two firings of all lasers."""
-    rate: Annotated[Number, "Hz"]
+    rate: Annotated[Number, "Hz", (0.1, 200.0)]
     """Revolutions a second."""
-    nearest: Annotated[Number, "m"]
-    farthest: Annotated[Number, "m"]
-    reflectance: dict[str, Number]
+    nearest: Annotated[Number, "m", (0.0, 100.0)]
+    farthest: Annotated[Number, "m", (0.1, 500.0)]
+    rays: Annotated[Number, "1", (1, MOST_RAYS)]
+    """Of one shot."""
+    aperture: Annotated[Numbers, "m", (0.0, 0.1)]
+    """Width and height of the beam where it leaves."""
+    divergence: Annotated[Numbers, "mrad", (0.0, 50.0)]
+    """How fast they grow: full angles, to 1/e^2 of the middle's power."""
+    merge: Annotated[Number, "m", (0.0, 10.0)]
+    """Surfaces closer than this along the beam come back as one echo."""
+    separation: Annotated[Number, "m", (0.0, 10.0)]
+    """Two returns of one shot lie at least so far apart."""
+    returns: Literal["strongest", "last", "dual"] = "strongest"
+    """Which echoes of a shot are reported; ``dual``: the strongest and the last, or the two strongest."""
+    noise: Annotated[Number, "m", (0.0, 1.0)]
+    """Standard deviation of the range of a strong echo."""
+    weak_noise: Annotated[Number, "m", (0.0, 1.0)]
+    """The same of the weakest echo; between them it falls with the root of the signal."""
+    step: Annotated[Number, "m", (0.0, 1.0)]
+    """Between two ranges that can be told."""
+    weakest: Annotated[Number, "1/m^2", (0.0, 1.0)]
+    """Signal from which on an echo is noticed: reflectance, times the cosine, over the square of the range."""
+    flicker: Annotated[Number, "1", (0.0, 2.0)]
+    """Standard deviation of the signal's logarithm from shot to shot."""
+    reflectance: dict[str, Annotated[Number, "1"]]
     """Diffuse, by organ in lower case."""
 
     @classmethod
@@ -57,37 +82,139 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
             raise specs.SensorError(
                 f"{name}: reflectance.{wrong} is missing or unknown; give one for each of {', '.join(sorted(organs))}"
             )
+        for what, organ in spec.reflectance.items():
+            if not 0.0 <= organ.value <= 10.0:
+                raise specs.SensorError(f"{name}: reflectance.{what} is {organ.value:g}; give 0 to 10")
+        if not spec.nearest.value < spec.farthest.value:
+            raise specs.SensorError(
+                f"{name}: measures from {spec.nearest.value} to {spec.farthest.value} m, which is no range; "
+                "give nearest < farthest"
+            )
+        lasers = len(spec.elevation.value)
+        for field, needed in (("azimuth", lasers), ("aperture", 2), ("divergence", 2)):
+            found = getattr(spec, field)
+            if found is not None and len(found.value) != needed:
+                raise specs.SensorError(f"{name}: {field} has {len(found.value)} values; give {needed}")
+        if not lasers or spec.firing_period.value * spec.rate.value > 0.5:
+            raise specs.SensorError(
+                f"{name}: fires {lasers} lasers less than twice a turn; give a shorter firing_period"
+            )
         return spec
+
+    def ideal(self) -> LidarSpec:
+        """The same table of firings with thin beams that measure exactly, however weak the echo."""
+
+        def but(number: Number, value: float) -> Number:
+            return msgspec.structs.replace(number, value=value)
+
+        thin = {
+            name: msgspec.structs.replace(getattr(self, name), value=(0.0, 0.0)) for name in ("aperture", "divergence")
+        }
+        exact = {name: but(getattr(self, name), 0.0) for name in ("noise", "weak_noise", "step", "weakest", "flicker")}
+        return msgspec.structs.replace(self, rays=but(self.rays, 1), returns="strongest", **thin, **exact)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Rays:
+    """The rays of some shots, each shot's in a row."""
+
+    origin: wp.array
+    """[ray] m, world"""
+    direction: wp.array
+    """[ray] unit vectors, world"""
+    poses: np.ndarray
+    """[firing, 7] of the lidar: all rays of a firing start near its origin."""
+    first: int
+    """First firing of the revolution."""
+    reach: float
+    """How far they go [m]."""
+
+
+class Hits(Protocol):
+    """What each ray meets."""
+
+    def __call__(self, primitives: Primitives, shots: Rays, distance: wp.array, primitive: wp.array) -> None:
+        """Fill ``distance`` [ray] m and ``primitive`` [ray] (-2 ground, -1 nothing) of what each ray meets first."""
+        ...
+
+
+class Cast:
+    """Hits by the bounding volume hierarchy."""
+
+    def __init__(self) -> None:
+        self._caster: RayCaster | None = None
+
+    def __call__(self, primitives: Primitives, shots: Rays, distance: wp.array, primitive: wp.array) -> None:
+        """See :class:`Hits`."""
+        if self._caster is None or self._caster.primitives is not primitives:
+            self._caster = RayCaster(primitives)
+        wp.launch(
+            rays.cast,
+            len(shots.origin),
+            inputs=[primitives.shapes, self._caster.hierarchies(), shots.origin, shots.direction, shots.reach],
+            outputs=[distance, primitive],
+            device=primitives.device,
+        )
 
 
 class Lidar:
-    """One lidar: a table of firings, and the rays' way through the vineyard."""
+    """One lidar: a table of firings, and what it reports of one revolution."""
 
-    def __init__(self, spec: LidarSpec, name: str = "lidar", frame_id: str = "lidar", device: str = "cpu") -> None:
-        self.spec, self.name, self.frame_id, self.device = spec, name, frame_id, device
-        lasers = len(spec.elevation.value)
-        firings = round(1.0 / (spec.rate.value * spec.firing_period.value))
-        within = np.arange(lasers) * spec.laser_period.value
-        offset = np.arange(firings)[:, None] * spec.firing_period.value + within
+    def __init__(
+        self,
+        spec: LidarSpec,
+        name: str = "lidar",
+        frame_id: str = "lidar",
+        device: str = "cpu",
+        *,
+        seed: int = 0,
+        hits: Hits | None = None,
+    ) -> None:
+        """Noise follows from (``seed``, ``name``, number of the revolution); ``hits`` unless given is :class:`Cast`."""
+        self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
+        self.hits = hits or Cast()
+        self.number = 0
+        """Of the present revolution."""
+        self.lasers = len(spec.elevation.value)
+        self.firings = round(1.0 / (spec.rate.value * spec.firing_period.value))
+        """Of one revolution."""
+        within = np.arange(self.lasers) * spec.laser_period.value
+        offset = np.arange(self.firings)[:, None] * spec.firing_period.value + within
         self.offset = offset.ravel().astype(np.float32)
         """Time of each shot after the first [shot] s."""
         # the head turns clockwise seen from above; the first shot looks forward
-        azimuth = -2.0 * np.pi * spec.rate.value * offset.ravel()
+        beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
+        azimuth = (beside - 2.0 * np.pi * spec.rate.value * offset).ravel()
         elevation = np.radians(spec.elevation.value)
         order = np.argsort(np.argsort(elevation, kind="stable"), kind="stable")
-        self.ring = np.tile(order, firings).astype(np.uint16)
+        self.ring = np.tile(order, self.firings).astype(np.uint16)
         """[shot], 0 for the lowest laser."""
+        self._azimuth, self._elevation = (
+            wp.array(v.astype(np.float32), dtype=float, device=device) for v in (azimuth, elevation)
+        )
+        self._head, self._receiver = self._structs()
+        rays_of_all, kept = len(self.offset) * self._head.rays, 2 if spec.returns == "dual" else 1
+        self._origin, self._direction = (wp.empty(rays_of_all, dtype=wp.vec3, device=device) for _ in range(2))
+        self._distance = wp.empty(rays_of_all, dtype=float, device=device)
+        self._primitive = wp.empty(rays_of_all, dtype=wp.int32, device=device)
+        self._luck = wp.zeros((len(self.offset), 3), dtype=float, device=device)
+        self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
+        self._intensity = wp.zeros((len(self.offset), kept), dtype=float, device=device)
+        self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
+
+    def _structs(self) -> tuple[lidar.Head, lidar.Receiver]:
+        spec, head, receiver = self.spec, lidar.Head(), lidar.Receiver()
+        head.elevation, head.azimuth, head.rays = self._elevation, self._azimuth, round(spec.rays.value)
+        head.aperture = wp.vec2(*(0.5 * v for v in spec.aperture.value))
+        head.divergence = wp.vec2(*(0.5e-3 * v for v in spec.divergence.value))
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
             reflectance[Organ[organ.upper()]] = number.value
-        count = len(self.offset)
-        self._azimuth, self._elevation, self._reflectance = (
-            wp.array(v.astype(np.float32), dtype=float, device=device) for v in (azimuth, elevation, reflectance)
-        )
-        self._xyz = wp.empty(count, dtype=wp.vec3, device=device)
-        self._intensity = wp.empty(count, dtype=float, device=device)
-        self._label = wp.empty(count, dtype=wp.int32, device=device)
-        self._caster: RayCaster | None = None
+        receiver.reflectance = wp.array(reflectance, dtype=float, device=self.device)
+        receiver.returns = _RETURNS[spec.returns]
+        for name in ("nearest", "farthest", "merge", "separation", "noise", "weak_noise", "step", "weakest", "flicker"):
+            setattr(receiver, name, float(getattr(spec, name).value))
+        return head, receiver
 
     @property
     def rate(self) -> float:
@@ -95,47 +222,68 @@ class Lidar:
         return self.spec.rate.value
 
     def scan(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> LidarScan:
-        """One revolution from ``pose`` [7], the lidar in the world (x forward, z up)."""
-        if self._caster is None or self._caster.primitives is not primitives:
-            self._caster = RayCaster(primitives)
+        """One revolution from ``pose`` [7], the lidar in the world (x forward, z up), while nothing moves."""
         pose = np.array(pose, float)
-        if not np.isfinite(pose).all():
-            raise ValueError(f"lidar {self.name!r} has the pose {pose.tolist()}; give finite numbers")
-        turn = frames.normalize(pose[3:])
-        run = (
-            len(self.spec.elevation.value) if self.device == "cpu" else 1
-        )  # structs are handed to a thread, not to a ray
+        self.begin()
+        self.fire(primitives, 0, np.broadcast_to(pose, (self.firings, 7)))
+        return self.finish(pose, time)
+
+    def begin(self) -> None:
+        """A new revolution."""
+        luck = specs.dice(self.seed, self.name, self.number).standard_normal((len(self.offset), 3), np.float32)
+        self._luck.assign(luck)
+
+    def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
+        """Firings from ``first`` on, one for each pose [firing, 7] of the lidar."""
+        poses = np.array(poses, float)
+        if not np.isfinite(poses).all():
+            wrong = poses[~np.isfinite(poses).all(1)][0]
+            raise ValueError(f"lidar {self.name!r} has the pose {wrong.tolist()}; give finite numbers")
+        poses[:, 3:] = frames.normalize(poses[:, 3:])
+        shots, start = len(poses) * self.lasers, first * self.lasers
+        count = shots * self._head.rays
+        origin, direction = self._origin[:count], self._direction[:count]
+        distance, primitive = self._distance[:count], self._primitive[:count]
+        at = wp.array(poses.astype(np.float32), dtype=wp.transform, device=self.device)
+        wp.launch(lidar.fire, count, inputs=[self._head, start, at], outputs=[origin, direction], device=self.device)
+        shots_out = Rays(origin, direction, poses, first, self.spec.farthest.value)
+        self.hits(primitives, shots_out, distance, primitive)
         wp.launch(
-            lidar.sweep,
-            len(self.offset) // run,
+            lidar.receive,
+            shots,
             inputs=[
                 primitives.shapes,
                 primitives.labels,
                 primitives.organs,
-                self._reflectance,
-                self._elevation,
-                self._caster.hierarchies(),
-                wp.transform(*map(float, pose[:3]), *map(float, turn)),
-                self._azimuth,
+                self._head,
+                self._receiver,
+                start,
+                origin,
+                direction,
+                distance,
+                primitive,
                 label(Organ.GROUND, 0),
                 int(Organ.GROUND),
-                self.spec.nearest.value,
-                self.spec.farthest.value,
-                run,
+                self._luck,
             ],
             outputs=[self._xyz, self._intensity, self._label],
             device=self.device,
         )
+
+    def finish(self, pose: np.ndarray, time: float) -> LidarScan:
+        """What was reported since :meth:`begin`; ``pose`` [7] and ``time`` [s] of the first firing."""
         labels = self._label.numpy()
-        back = labels >= 0
+        shot, which = np.nonzero(labels >= 0)
+        self.number += 1
         return LidarScan(
             time=float(time),
             name=self.name,
             frame_id=self.frame_id,
-            pose=pose,
-            xyz=self._xyz.numpy()[back],
-            intensity=self._intensity.numpy()[back],
-            ring=self.ring[back],
-            offset=self.offset[back],
-            labels=labels[back],
+            pose=np.array(pose, float),
+            xyz=self._xyz.numpy()[shot, which],
+            intensity=self._intensity.numpy()[shot, which],
+            ring=self.ring[shot],
+            offset=self.offset[shot],
+            labels=labels[shot, which],
+            returned=(which + 1).astype(np.uint8) if self.spec.returns == "dual" else None,
         )

@@ -1,4 +1,4 @@
-"""Sensor data files: every number with unit, grade and source; wrong units and absurd values are refused in one line."""
+"""Sensor data files: every number with unit, grade and source; wrong units, absurd values: refused in one line."""
 
 from __future__ import annotations
 
