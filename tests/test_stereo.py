@@ -39,9 +39,8 @@ def _but(**values: float) -> CameraSpec:
 
 def _repainted(frame: CameraFrame, primitives, camera: Camera, rgb: np.ndarray) -> np.ndarray:
     """What ``camera`` measures of a frame if the picture were another one [height, width, 3]."""
-    camera._rgb.assign(rgb.reshape(-1, 3))
-    lens, seen = pinhole(camera.info, frame.pose), camera.visibility
-    return camera._stereo.measure(primitives, lens, seen.depth, camera._rgb, specs.dice(0, "camera", 0))
+    lens = pinhole(camera.info, frame.pose)
+    return camera._stereo.measure(primitives, lens, frame.exact_depth, rgb, specs.dice(0, "camera", 0))
 
 
 @pytest.mark.parametrize("depth", [0.4, 0.8, 1.5, 2.5])

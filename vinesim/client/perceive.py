@@ -20,6 +20,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.mailbox import Mailbox, poller
 from vinesim.robot.description import Description
+from vinesim.sensors.sunlight import SunPath
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -42,7 +43,7 @@ class Setup:
     name: str
     model: Model
     description: Description
-    sun: tuple[float, float, float]
+    sun: SunPath
     namespace: str
     ros: bool
     keep_pictures: bool
@@ -139,7 +140,7 @@ class _Perception:
         seed = zlib.crc32(setup.name.encode())  # no two robots have the same noise
         for i, place in enumerate(setup.description.cameras):
             spec = CameraSpec.load(place.type)
-            camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, seed=seed)
+            camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, quality="fast", seed=seed)
             wanted = self._wanted(place.name, always=setup.keep_pictures and i == 0)
             mounts.append(Mount(camera, self._deliver_camera, wanted, setup.sensor_hz))
         for place in setup.description.lidars:

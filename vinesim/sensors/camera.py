@@ -17,9 +17,10 @@ from vinesim import frames
 from vinesim.kernels import shade, shapes, visibility
 from vinesim.sensors import specs
 from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
+from vinesim.sensors.exposure import Exposure
 from vinesim.sensors.primitives import Primitives
 from vinesim.sensors.stereo import Stereo, StereoSpec
-from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight
+from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight, SunPath
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import CameraFrame, CameraInfo
 from vinesim.world.vine import Number
@@ -102,6 +103,19 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> visibility.Pinhole:
     return lens
 
 
+def finer(info: CameraInfo, samples: int) -> CameraInfo:
+    """Intrinsics of the same view with ``samples`` squared pixels for each one."""
+    return dataclasses.replace(
+        info,
+        width=info.width * samples,
+        height=info.height * samples,
+        fx=info.fx * samples,
+        fy=info.fy * samples,
+        cx=samples * (info.cx + 0.5) - 0.5,
+        cy=samples * (info.cy + 0.5) - 0.5,
+    )
+
+
 class Visibility:
     """Nearest primitive of every pixel; the buffers of one camera."""
 
@@ -122,9 +136,10 @@ class Visibility:
         distance = self.distances(primitives, lens)
         seen = np.flatnonzero(distance < float(shapes.FAR))
         self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
             visibility.resolve,
-            self.width * self.height,
+            self.width * self.height // run,
             inputs=[
                 primitives.labels,
                 self.keys,
@@ -134,6 +149,7 @@ class Visibility:
                 float(farthest),
                 -float("inf"),
                 float("inf"),
+                run,
             ],
             outputs=[self.primitive, self.depth, self.labels],
             device=self.device,
@@ -175,6 +191,28 @@ class Visibility:
                 )
 
 
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """How much a picture may cost. Depth and labels are the same in all."""
+
+    taps: int
+    """Shadow samples a pixel; 0: a small smooth filter."""
+    block: int
+    """Pixels, squared, in which one primitive is lit once."""
+    samples: int
+    """Samples, squared, of one pixel's colour."""
+    fine: int
+    """Divides the texels of the shadow map nearby."""
+
+
+QUALITIES = {
+    "fast": Quality(taps=0, block=2, samples=1, fine=1),
+    "full": Quality(taps=0, block=1, samples=1, fine=1),
+    "still": Quality(taps=12, block=2, samples=2, fine=2),
+}
+"""``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
+
+
 @dataclasses.dataclass
 class Camera:
     """One RGB-D camera."""
@@ -182,22 +220,35 @@ class Camera:
     spec: CameraSpec
     info: CameraInfo
     name: str = "camera"
-    sun: tuple[float, float, float] = DEFAULT_SUN
-    taps: int = 4
-    """Shadow samples a pixel: 4 live, 16 for pictures."""
-    shadow_period: float = 0.2
-    """Moving things get new shadows this often [s]; 0 for every frame."""
+    sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
+    """Towards the sun, or where it is when."""
+    quality: str = "full"
+    """One of :data:`QUALITIES`."""
+    shadow_period: float | None = None
+    """Moving things get new shadows this often [s]; 0 for every frame; 0.2 unless given, 0 for stills."""
+    exposure: float | None = None
+    """Fixed; automatic unless given. 0.75 suits a sunny noon."""
     device: str = "cpu"
     seed: int = 0
     image: int = 0
     """Number of the next image. What the sensor measures follows from (seed, name, this)."""
 
     def __post_init__(self) -> None:
-        self.visibility = Visibility(self.info.width, self.info.height, self.device)
+        if self.quality not in QUALITIES:
+            raise ValueError(f"camera {self.name!r} has the quality {self.quality!r}; give {', '.join(QUALITIES)}")
+        self._quality = quality = QUALITIES[self.quality]
+        width, height, samples = self.info.width, self.info.height, quality.samples
+        period = self.shadow_period
+        if period is None:
+            period = 0.0 if self.quality == "still" else 0.2
+        self.visibility = Visibility(width, height, self.device)
+        self._samples = self.visibility
+        if samples > 1:
+            self._samples = Visibility(width * samples, height * samples, self.device)
+        self._sunlight = Sunlight(self.sun, taps=quality.taps, period=period, fine=quality.fine, device=self.device)
+        self._exposure = Exposure(width, height, samples, self.exposure, self.device)
         reach = self.spec.nearest.value, self.spec.farthest.value
         self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, Visibility, self.device)
-        self._sunlight = Sunlight(self.sun, taps=self.taps, period=self.shadow_period, device=self.device)
-        self._rgb = wp.empty((self.info.width * self.info.height, 3), dtype=wp.uint8, device=self.device)
 
     @property
     def rate(self) -> float:
@@ -210,31 +261,10 @@ class Camera:
         lens = pinhole(self.info, pose)
         seen = self.visibility
         seen.draw(primitives, lens)
-        forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
-        near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
-        run = self.info.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
-        wp.launch(
-            shade.shade,
-            self.info.width * self.info.height // run,
-            inputs=[
-                primitives.shapes,
-                primitives.looks,
-                self._sunlight.light,
-                near,
-                far,
-                lens,
-                seen.primitive,
-                seen.keys,
-                run,
-            ],
-            outputs=[self._rgb],
-            device=self.device,
-        )
         shape = (self.info.height, self.info.width)
-        exact = seen.depth.numpy().reshape(shape).copy()
+        rgb, exact = self._picture(primitives, lens, pose, time), seen.depth.numpy().reshape(shape).copy()
         if self._stereo:
-            dice = specs.dice(self.seed, self.name, self.image)
-            depth = self._stereo.measure(primitives, lens, seen.depth, self._rgb, dice)
+            depth = self._stereo.measure(primitives, lens, exact, rgb, specs.dice(self.seed, self.name, self.image))
         else:
             too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
@@ -244,8 +274,39 @@ class Camera:
             name=self.name,
             info=self.info,
             pose=pose,
-            rgb=self._rgb.numpy().reshape(*shape, 3).copy(),
+            rgb=rgb,
             depth=depth,
             labels=seen.labels.numpy().reshape(shape).copy(),
             exact_depth=exact,
         )
+
+    def _picture(self, primitives: Primitives, lens: visibility.Pinhole, pose: np.ndarray, time: float) -> np.ndarray:
+        """Colour [height, width, 3] uint8 of what :attr:`visibility` has found."""
+        seen, quality = self._samples, self._quality
+        if quality.samples > 1:
+            lens = pinhole(finer(self.info, quality.samples), pose)
+            seen.draw(primitives, lens)
+        forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
+        near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
+        across, down = (-(-n // quality.block) for n in (seen.width, seen.height))
+        run = across if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        wp.launch(
+            shade.shade,
+            across * down // run,
+            inputs=[
+                primitives.shapes,
+                primitives.looks,
+                self._sunlight.light,
+                near,
+                far,
+                lens,
+                seen.primitive,
+                seen.keys,
+                quality.block,
+                run,
+            ],
+            outputs=[self._exposure.radiance],
+            device=self.device,
+        )
+        self._exposure.halo(primitives, seen.primitive)
+        return self._exposure.develop(self._sunlight.balance, time)

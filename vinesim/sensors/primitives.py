@@ -15,9 +15,9 @@ from vinesim import frames
 from vinesim.kernels import materials, shadows, shapes
 from vinesim.sensors import textures
 from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
-from vinesim.sensors.grounds import fixed, meadow
+from vinesim.sensors.grounds import fixed, litter, meadow, rows_of
 from vinesim.sensors.links import rigid
-from vinesim.sensors.vines import bunch_parts, canes, foliage, pieces_of
+from vinesim.sensors.vines import Ripeness, bunches, canes, foliage, pieces_of
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -32,9 +32,13 @@ _CLUSTER = 24
 class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.shapes`)."""
 
-    def __init__(self, model: Model, *, grass: float = 14.0, device: str = "cpu") -> None:
-        """``grass``: tufts per square metre around the vines, 0 for bare ground."""
-        self.model, self.device = model, device
+    def __init__(
+        self, model: Model, *, grass: float = 90.0, device: str = "cpu", ripeness: Ripeness | None = None
+    ) -> None:
+        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
+        the fruit: all of it is ripe unless given.
+        """
+        self.model, self.device, self._ripeness = model, device, ripeness
         bodies = len(model.body_mass)
         self._still = bodies
         """Carrier of what stands still; links follow it."""
@@ -42,12 +46,15 @@ class Primitives:
         low, high = (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
         trees = len(model.tree_first)
         batches = [canes(model, bodies), *foliage(model)]
-        for bunch, body in enumerate(model.bunch_body):
-            pieces = pieces_of(model, bunch)
-            own = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(pieces), 1))
-            batches += bunch_parts(model, bunch, own, pieces, int(model.body_tree[body]))
+        every = np.arange(len(model.bunch_body))
+        pieces = [pieces_of(model, bunch) for bunch in every]
+        batches += bunches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
         self._tree_batches = len(batches)
-        batches += [b for b in (fixed(model, bodies), meadow(low, high, grass, bodies)) if b is not None]
+        around = [fixed(model, bodies)]
+        if grass > 0.0:
+            age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
+            around += [meadow(rows_of(model), low, high, grass, bodies), litter(low, high, age, bodies)]
+        batches += [b for b in around if b is not None]
         self._plants = [b for b in batches if len(b)] or [nothing(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
@@ -90,18 +97,18 @@ class Primitives:
 
     def _build(self, links: tuple[Link, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
-        moving = rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links))
+        moving = rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links), self._ripeness)
         batches = self._plants + moving
         first_rigid = len(self._plants)
         pieces: dict[str, list[np.ndarray]] = {
             name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
         }
-        kinds, firsts, sizes, owners, bunches, rigids = [], [], [], [], [], []
+        kinds, firsts, sizes, owners, of_bunch, rigids = [], [], [], [], [], []
         total = 0
         for number, batch in enumerate(batches):
-            order = np.argsort(batch.group, kind="stable")
-            group = batch.group[order]
-            starts = np.flatnonzero(np.r_[True, group[1:] != group[:-1]])
+            order = np.lexsort((batch.bunch, batch.group))
+            group, bunch = batch.group[order], batch.bunch[order]
+            starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])
             runs = np.diff(np.r_[starts, len(group)])
             parts = (runs + _CLUSTER - 1) // _CLUSTER
             inner = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
@@ -112,7 +119,7 @@ class Primitives:
             sizes.append(size)
             kinds.append(np.full(len(first), batch.kind))
             owners.append(np.full(len(first), -1) if still or number >= first_rigid else group[first])
-            bunches.append(np.full(len(first), batch.bunch))
+            of_bunch.append(bunch[first])
             rigids.append(np.full(len(first), number >= first_rigid))
             for name, pile in pieces.items():
                 pile.append(getattr(batch, name)[order])
@@ -122,7 +129,7 @@ class Primitives:
             whole["c"][: len(self._baked_c)] = self._baked_c
         self.label, self.organ = whole["label"].astype(np.int32), whole["organ"].astype(np.int32)
         self.cluster_first, self.cluster_size, self.cluster_kind, self._owner, self._cluster_bunch = (
-            np.concatenate(x).astype(np.int32) for x in (firsts, sizes, kinds, owners, bunches)
+            np.concatenate(x).astype(np.int32) for x in (firsts, sizes, kinds, owners, of_bunch)
         )
         self.rigid_clusters = np.flatnonzero(np.concatenate(rigids))
         self.cluster_version = np.zeros(len(self.cluster_first), np.int64)
@@ -164,11 +171,13 @@ class Primitives:
             array(whole["material"].astype(np.int32), wp.int32),
             array(whole["tint"], wp.vec3),
         )
+        self.lamps = np.flatnonzero(whole["material"] == int(materials.LAMP))
+        """Primitives that shine."""
         sky = np.full(total, 0.7, np.float32)
         if self.built:
             known = self._sky[: min(len(self._sky), total)]
             sky[: len(known)] = known
-            for name in ("blade", "noise", "soil", "ground_sky", "ground_x", "ground_y", "ground_cell"):
+            for name in ("blade", "noise", "soil", "rows", "ground_sky", "ground_x", "ground_y", "ground_cell"):
                 setattr(self.looks, name, getattr(self._baked, name))
         self.looks.sky = array(sky, float)
         poses = np.zeros((self._still + 1 + len(links), 7), np.float32)
@@ -228,6 +237,7 @@ class Primitives:
         x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
         ground = seen(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1)).reshape(x.shape)
         looks = self.looks
+        looks.rows = wp.vec2(*rows_of(self.model))
         looks.ground_sky = wp.array(ground, dtype=float, device=self.device)
         looks.ground_x, looks.ground_y, looks.ground_cell = float(low[0]), float(low[1]), float(step)
         looks.blade, looks.noise, looks.soil = (

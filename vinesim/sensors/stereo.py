@@ -104,11 +104,11 @@ class Stereo:
         self,
         primitives: Primitives,
         lens: visibility.Pinhole,
-        depth: wp.array,
-        rgb: wp.array,
+        depth: np.ndarray,
+        rgb: np.ndarray,
         dice: np.random.Generator,
     ) -> np.ndarray:
-        """Measured depth [height, width] m where ``depth`` [pixel] m is true and looks like ``rgb`` [pixel, 3]."""
+        """Measured depth [height, width] m where ``depth`` [height, width] m is true and ``rgb`` what it looks like."""
         second = self._view(lens)
         self._second.draw(primitives, second)
         self._luck.assign(self._throw(dice))
@@ -121,9 +121,9 @@ class Stereo:
                 self._struct,
                 lens,
                 second,
-                depth,
+                wp.array(depth.ravel(), dtype=float, device=self.device),
                 self._second.depth,
-                rgb,
+                wp.array(rgb.reshape(-1, 3), dtype=wp.uint8, device=self.device),
                 self._luck,
                 run,
             ],
