@@ -119,7 +119,7 @@ def test_a_late_thread_fires_from_where_the_lidar_was() -> None:
     scan = inbox.frames[0]
     mine = scan.labels == label(Organ.ROBOT, 0)
     assert mine.sum() > 1000
-    assert scan.xyz[mine, 0] + 2.0 * (scan.time + scan.offset[mine]) == pytest.approx(6.0, abs=1e-4)
+    assert scan.xyz[mine, 0] + 2.0 * (scan.time + scan.offset[mine]) == pytest.approx(6.0, abs=2e-3)
 
 
 def test_trees_that_moved_in_skipped_views_are_taken_over() -> None:

@@ -210,7 +210,7 @@ def test_what_fills_a_part_of_the_beam_is_dimmer() -> None:
 def test_range_noise_and_steps() -> None:
     spec = LidarSpec.load("vlp16")
     wall = seeing.world(seeing.thing(seeing.shape("box", 0.05, 30.0, 30.0, at=(4.05, 0.0, 1.0))))[0]
-    real, ideal = Lidar(_but(merge=0.0)).scan(wall, AT), Lidar(spec.ideal()).scan(wall, AT)
+    real, ideal = Lidar(_but(rays=1)).scan(wall, AT), Lidar(spec.ideal()).scan(wall, AT)
     head_on = [s.xyz[:, 0] / np.linalg.norm(s.xyz, axis=1) > 0.95 for s in (real, ideal)]
     error = np.linalg.norm(real.xyz[head_on[0]], axis=1) - np.linalg.norm(ideal.xyz[head_on[1]], axis=1)
     assert len(error) > 2000
@@ -278,7 +278,7 @@ def test_a_lidar_of_64_beams() -> None:
             "firing_period = { value = 0.0",
             r"firing_period is 0 s; give 1e-06 to 0\.1",
         ),
-        ("rays = { value = 5", "rays = { value = 900", r"rays is 900 1; give 1 to 8"),
+        ("rays = { value = 7", "rays = { value = 900", r"rays is 900 1; give 1 to 8"),
         ("farthest = { value = 100.0", "farthest = { value = 0.2", "which is no range; give nearest < farthest"),
         ("value = [3.0, 1.5]", "value = [3.0]", "divergence has 1 values; give 2"),
         ('returns = "strongest"', 'returns = "loudest"', "returns is 'loudest'; give one of: dual, last, strongest"),

@@ -1,4 +1,4 @@
-"""Laser shots: the rays of their beams as the head turns, and what comes back of them."""
+"""What comes back of a laser shot, and what a lidar makes of it."""
 
 import warp as wp
 
@@ -8,30 +8,14 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 Beam = wp.types.vector(length=8, dtype=wp.float32)
 """One number for each ray of a shot; an echo is (signal, range, brightness, which ray shows most of it)."""
-RING = wp.constant(0.677)
-"""Of a Gaussian beam's 1/e^2 radius: outside its inner fifth of energy, half of the rest lies within this."""
-
-
-@wp.struct
-class Head:
-    """How a lidar's head fires (:class:`vinesim.sensors.lidar.LidarSpec`)."""
-
-    elevation: wp.array(dtype=wp.float32)
-    """[laser] rad"""
-    azimuth: wp.array(dtype=wp.float32)
-    """[shot] rad, counter-clockwise from ahead."""
-    rays: int
-    """Of one shot: its middle, the others on a ring."""
-    aperture: wp.vec2
-    """Radii of the beam where it leaves, across and up [m]."""
-    divergence: wp.vec2
-    """How fast they grow [rad]."""
 
 
 @wp.struct
 class Receiver:
     """What a lidar makes of what comes back."""
 
+    rays: int
+    """Of one shot, the first one in its middle."""
     reflectance: wp.array(dtype=wp.float32)
     """[organ]"""
     nearest: float
@@ -45,46 +29,6 @@ class Receiver:
     step: float
     weakest: float
     flicker: float
-
-
-@wp.func
-def aim(elevation: float, azimuth: float) -> wp.vec3:
-    """Unit vector in the lidar's frame."""
-    return wp.vec3(wp.cos(elevation) * wp.cos(azimuth), wp.cos(elevation) * wp.sin(azimuth), wp.sin(elevation))
-
-
-@wp.kernel
-def fire(
-    # model
-    head: Head,
-    # in
-    first: int,
-    poses: wp.array(dtype=wp.transform),
-    # out
-    origin_out: wp.array(dtype=wp.vec3),
-    direction_out: wp.array(dtype=wp.vec3),
-):
-    """One thread lets one ray of one shot go, from where its firing finds the lidar; shots count from ``first``."""
-    ray = wp.tid()
-    lasers = head.elevation.shape[0]
-    shot = ray // head.rays
-    k = ray % head.rays
-    pose = poses[shot // lasers]
-    e = head.elevation[(first + shot) % lasers]
-    a = head.azimuth[first + shot]
-    across = wp.vec3(-wp.sin(a), wp.cos(a), 0.0)
-    up = wp.vec3(-wp.sin(e) * wp.cos(a), -wp.sin(e) * wp.sin(a), wp.cos(e))
-    turn = wp.float32(0.0)
-    out = wp.float32(0.0)
-    if k > 0:
-        turn = (float(k) - 0.5) * 2.0 * wp.pi / float(head.rays - 1)
-        out = RING
-    u = out * wp.cos(turn)
-    v = out * wp.sin(turn)
-    start = across * (u * head.aperture[0]) + up * (v * head.aperture[1])
-    d = wp.normalize(aim(e, a) + across * (u * head.divergence[0]) + up * (v * head.divergence[1]))
-    origin_out[ray] = wp.transform_point(pose, start)
-    direction_out[ray] = wp.transform_vector(pose, d)
 
 
 @wp.func
@@ -113,11 +57,10 @@ def receive(
     shapes: Shapes,
     label: wp.array(dtype=wp.int32),
     organ: wp.array(dtype=wp.int32),
-    head: Head,
     receiver: Receiver,
     # in
     first: int,
-    origin: wp.array(dtype=wp.vec3),
+    pose: wp.transform,
     direction: wp.array(dtype=wp.vec3),
     distance: wp.array(dtype=wp.float32),
     primitive: wp.array(dtype=wp.int32),
@@ -130,24 +73,24 @@ def receive(
     label_out: wp.array2d(dtype=wp.int32),
 ):
     """One thread makes one or two returns of one shot's rays; label -1 where there is none."""
-    i = wp.tid()
-    shot = first + i
-    rays = head.rays
+    shot = first + wp.tid()
+    rays = receiver.rays
     t = Beam()
     bright = Beam()
     name = Beam()  # which ray, sorted with the others
     count = wp.int32(0)
     for k in range(rays):
-        ray = i * rays + k
+        ray = shot * rays + k
         it = primitive[ray]
         r = distance[ray]
         if it != -1 and r >= receiver.nearest and r <= receiver.farthest:
             n = wp.vec3(0.0, 0.0, 1.0)
             matter = ground_organ
             if it >= 0:
-                n = normal_at(shapes, it, origin[ray] + direction[ray] * r)
+                n = normal_at(shapes, it, wp.transform_point(pose, direction[ray] * r))
                 matter = organ[it]
-            light = receiver.reflectance[matter] * wp.abs(wp.dot(n, direction[ray])) / float(rays)
+            slant = wp.abs(wp.dot(n, wp.transform_vector(pose, direction[ray])))
+            light = receiver.reflectance[matter] * slant / float(rays)
             # insert by range
             j = count
             while j > 0 and t[j - 1] > r:
@@ -188,7 +131,7 @@ def receive(
                 strongest = last
             elif signal > second[0]:
                 second = last
-    d = aim(head.elevation[shot % head.elevation.shape[0]], head.azimuth[shot])
+    d = direction[shot * rays]
     echo = strongest
     if receiver.returns == 1:
         echo = last

@@ -173,6 +173,5 @@ def _camera_rays(info: CameraInfo, pose: np.ndarray) -> np.ndarray:
 
 def _lidar_rays(lidar: Lidar, pose: np.ndarray) -> np.ndarray:
     """Origins and directions [shot, 6] of one revolution."""
-    e, a = np.resize(lidar._elevation.numpy(), len(lidar.offset)), lidar._azimuth.numpy()
-    d = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
+    d = lidar.grid.direction.numpy()
     return np.concatenate([np.broadcast_to(pose[:3], d.shape), d], -1).astype(np.float32)

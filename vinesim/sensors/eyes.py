@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from vinesim.kernels import lidar, rays, shade, shadows, shapes, stereo, visibility
+from vinesim.kernels import lidar, shade, shadows, shapes, stereo, sweep, visibility
 from vinesim.sensors.camera import Camera
 from vinesim.sensors.lidar import Lidar
 from vinesim.sensors.primitives import Primitives
@@ -34,7 +34,7 @@ _STANDS = 1024
 
 def load_kernels() -> None:
     """Compile what pictures and scans need, or read it from the cache, before anybody waits for one."""
-    for module in (lidar, rays, shade, shadows, shapes, stereo, visibility):
+    for module in (lidar, shade, shadows, shapes, stereo, sweep, visibility):
         wp.load_module(module, device="cpu")
 
 

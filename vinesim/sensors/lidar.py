@@ -4,12 +4,12 @@ Each shot is a handful of rays over the beam's footprint. What they meet closer 
 is long comes back as one echo, whose range lies in between: mixed returns at the edges of leaves. Points are raw, as
 drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
 
-Two halves, so that either can be exchanged: ``hits`` tells what each ray meets, :meth:`Lidar.fire` what is reported.
+Two halves, so that either can be exchanged: a :class:`Grid` tells what rays meet, a :class:`Lidar` what is reported.
 """
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 from typing import Annotated, Literal, Protocol
 
 import msgspec
@@ -17,17 +17,21 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import lidar, rays
+from vinesim.kernels import lidar
 from vinesim.sensors import specs
 from vinesim.sensors.primitives import Primitives
-from vinesim.sensors.raycast import RayCaster
 from vinesim.sensors.specs import Numbers
+from vinesim.sensors.sweep import Sweep
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import LidarScan
 from vinesim.world.vine import Number
 
 MOST_RAYS = 8
 """Of one shot."""
+FOOTPRINT_AT = 3.0
+"""All rays leave from one point; beams are as wide as in life at this range [m], thinner nearer, wider beyond."""
+NEARLY_STILL, NEARLY_STRAIGHT = 2e-3, 1e-3
+"""Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place."""
 _RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 
@@ -114,47 +118,19 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return msgspec.structs.replace(self, rays=but(self.rays, 1), returns="strongest", **thin, **exact)
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Rays:
-    """The rays of some shots, each shot's in a row."""
+class Grid(Protocol):
+    """What the rays of a turning head meet; :class:`vinesim.sensors.sweep.Sweep` unless another one is given."""
 
-    origin: wp.array
-    """[ray] m, world"""
     direction: wp.array
-    """[ray] unit vectors, world"""
-    poses: np.ndarray
-    """[firing, 7] of the lidar: all rays of a firing start near its origin."""
-    first: int
-    """First firing of the revolution."""
-    reach: float
-    """How far they go [m]."""
+    """[column * row] unit vectors in the head's frame."""
+    distance: wp.array
+    """[column * row] m"""
+    primitive: wp.array
+    """[column * row], -2 the ground, -1 nothing."""
 
-
-class Hits(Protocol):
-    """What each ray meets."""
-
-    def __call__(self, primitives: Primitives, shots: Rays, distance: wp.array, primitive: wp.array) -> None:
-        """Fill ``distance`` [ray] m and ``primitive`` [ray] (-2 ground, -1 nothing) of what each ray meets first."""
+    def hits(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
+        """Fill distances and primitives of ``count`` columns from ``first`` on, with the head at ``pose`` [7]."""
         ...
-
-
-class Cast:
-    """Hits by the bounding volume hierarchy."""
-
-    def __init__(self) -> None:
-        self._caster: RayCaster | None = None
-
-    def __call__(self, primitives: Primitives, shots: Rays, distance: wp.array, primitive: wp.array) -> None:
-        """See :class:`Hits`."""
-        if self._caster is None or self._caster.primitives is not primitives:
-            self._caster = RayCaster(primitives)
-        wp.launch(
-            rays.cast,
-            len(shots.origin),
-            inputs=[primitives.shapes, self._caster.hierarchies(), shots.origin, shots.direction, shots.reach],
-            outputs=[distance, primitive],
-            device=primitives.device,
-        )
 
 
 class Lidar:
@@ -168,11 +144,13 @@ class Lidar:
         device: str = "cpu",
         *,
         seed: int = 0,
-        hits: Hits | None = None,
+        grid: Callable[[np.ndarray, np.ndarray, float, int, str], Grid] = Sweep,
     ) -> None:
-        """Noise follows from (``seed``, ``name``, number of the revolution); ``hits`` unless given is :class:`Cast`."""
+        """Noise follows from (``seed``, ``name``, number of the revolution).
+
+        ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits: see :class:`Sweep`.
+        """
         self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
-        self.hits = hits or Cast()
         self.number = 0
         """Of the present revolution."""
         self.lasers = len(spec.elevation.value)
@@ -182,39 +160,51 @@ class Lidar:
         offset = np.arange(self.firings)[:, None] * spec.firing_period.value + within
         self.offset = offset.ravel().astype(np.float32)
         """Time of each shot after the first [shot] s."""
-        # the head turns clockwise seen from above; the first shot looks forward
-        beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
-        azimuth = (beside - 2.0 * np.pi * spec.rate.value * offset).ravel()
         elevation = np.radians(spec.elevation.value)
         order = np.argsort(np.argsort(elevation, kind="stable"), kind="stable")
         self.ring = np.tile(order, self.firings).astype(np.uint16)
         """[shot], 0 for the lowest laser."""
-        self._azimuth, self._elevation = (
-            wp.array(v.astype(np.float32), dtype=float, device=device) for v in (azimuth, elevation)
+        # the head turns clockwise seen from above; the first shot looks forward
+        beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
+        azimuth = beside - 2.0 * np.pi * spec.rate.value * within
+        across, up = self._footprint()
+        self.grid = grid(
+            (elevation[:, None] + up).ravel(),
+            (azimuth[:, None] + across / np.maximum(np.cos(elevation[:, None]), 0.01)).ravel(),
+            -2.0 * np.pi * spec.rate.value * spec.firing_period.value,
+            self.firings,
+            device,
         )
-        self._head, self._receiver = self._structs()
-        rays_of_all, kept = len(self.offset) * self._head.rays, 2 if spec.returns == "dual" else 1
-        self._origin, self._direction = (wp.empty(rays_of_all, dtype=wp.vec3, device=device) for _ in range(2))
-        self._distance = wp.empty(rays_of_all, dtype=float, device=device)
-        self._primitive = wp.empty(rays_of_all, dtype=wp.int32, device=device)
+        """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
+        self._receiver = self._made_of()
+        kept = 2 if spec.returns == "dual" else 1
         self._luck = wp.zeros((len(self.offset), 3), dtype=float, device=device)
         self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
         self._intensity = wp.zeros((len(self.offset), kept), dtype=float, device=device)
         self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
 
-    def _structs(self) -> tuple[lidar.Head, lidar.Receiver]:
-        spec, head, receiver = self.spec, lidar.Head(), lidar.Receiver()
-        head.elevation, head.azimuth, head.rays = self._elevation, self._azimuth, round(spec.rays.value)
-        head.aperture = wp.vec2(*(0.5 * v for v in spec.aperture.value))
-        head.divergence = wp.vec2(*(0.5e-3 * v for v in spec.divergence.value))
+    def _footprint(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where in its beam each ray of a shot lies, across and up [ray] rad: one in the middle, the others on a ring.
+
+        Each stands for an equal share of a Gaussian beam's energy.
+        """
+        count = round(self.spec.rays.value)
+        ring = np.sqrt(-0.5 * np.log(0.5 * (1.0 - 1.0 / count))) if count > 1 else 0.0
+        turn = (np.arange(count - 1) + 0.5) * 2.0 * np.pi / max(count - 1, 1)
+        sizes = zip(self.spec.aperture.value, self.spec.divergence.value, strict=True)
+        wide, high = (0.5 * leaving / FOOTPRINT_AT + 0.5e-3 * growing for leaving, growing in sizes)
+        return tuple(np.append(0.0, ring * size * wave(turn)) for size, wave in ((wide, np.cos), (high, np.sin)))
+
+    def _made_of(self) -> lidar.Receiver:
+        spec, receiver = self.spec, lidar.Receiver()
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
             reflectance[Organ[organ.upper()]] = number.value
         receiver.reflectance = wp.array(reflectance, dtype=float, device=self.device)
-        receiver.returns = _RETURNS[spec.returns]
+        receiver.rays, receiver.returns = round(spec.rays.value), _RETURNS[spec.returns]
         for name in ("nearest", "farthest", "merge", "separation", "noise", "weak_noise", "step", "weakest", "flicker"):
             setattr(receiver, name, float(getattr(spec, name).value))
-        return head, receiver
+        return receiver
 
     @property
     def rate(self) -> float:
@@ -240,28 +230,35 @@ class Lidar:
             wrong = poses[~np.isfinite(poses).all(1)][0]
             raise ValueError(f"lidar {self.name!r} has the pose {wrong.tolist()}; give finite numbers")
         poses[:, 3:] = frames.normalize(poses[:, 3:])
-        shots, start = len(poses) * self.lasers, first * self.lasers
-        count = shots * self._head.rays
-        origin, direction = self._origin[:count], self._direction[:count]
-        distance, primitive = self._distance[:count], self._primitive[:count]
-        at = wp.array(poses.astype(np.float32), dtype=wp.transform, device=self.device)
-        wp.launch(lidar.fire, count, inputs=[self._head, start, at], outputs=[origin, direction], device=self.device)
-        shots_out = Rays(origin, direction, poses, first, self.spec.farthest.value)
-        self.hits(primitives, shots_out, distance, primitive)
+        together = self._together(poses)
+        for start in range(0, len(poses), together):
+            part = poses[start : start + together]
+            self._fire(primitives, first + start, len(part), part[len(part) // 2])
+
+    def _together(self, poses: np.ndarray) -> int:
+        """How many firings may be taken from one place, so slowly does the lidar move."""
+        if len(poses) < 2:
+            return 1
+        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / NEARLY_STILL
+        turn = 2.0 * np.linalg.norm(np.diff(poses[:, 3:], axis=0), axis=1).max() / NEARLY_STRAIGHT
+        return max(int(1.0 / max(way, turn, 1e-6)), 1)
+
+    def _fire(self, primitives: Primitives, first: int, count: int, pose: np.ndarray) -> None:
+        grid = self.grid
+        grid.hits(primitives, pose, first, count, self.spec.farthest.value)
         wp.launch(
             lidar.receive,
-            shots,
+            count * self.lasers,
             inputs=[
                 primitives.shapes,
                 primitives.labels,
                 primitives.organs,
-                self._head,
                 self._receiver,
-                start,
-                origin,
-                direction,
-                distance,
-                primitive,
+                first * self.lasers,
+                wp.transform(*map(float, pose)),
+                grid.direction,
+                grid.distance,
+                grid.primitive,
                 label(Organ.GROUND, 0),
                 int(Organ.GROUND),
                 self._luck,
