@@ -256,7 +256,7 @@ def _render(out: pathlib.Path, **changed) -> int:
 
 def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
     assert _render(tmp_path / "shot") == 0
-    names = {"rgb.png", "depth.png", "labels.png", "overlay.png", "camera.json", "truth.json"}
+    names = {"rgb.png", "depth.png", "measured.png", "labels.png", "overlay.png", "camera.json", "truth.json"}
     assert {p.name for p in (tmp_path / "shot").iterdir()} == names
     camera = json.loads((tmp_path / "shot/camera.json").read_text())
     assert camera["k"][0] == camera["k"][4] == pytest.approx(617.0 / 4)
@@ -330,6 +330,6 @@ def test_a_camera_of_absurd_resolution_is_refused(tmp_path: pathlib.Path) -> Non
 
 def test_a_camera_without_range_is_refused(tmp_path: pathlib.Path) -> None:
     text = (pathlib.Path(dataset.__file__).parents[2] / "data/cameras/d435.toml").read_text()
-    (tmp_path / "blind.toml").write_text(text.replace("nearest = { value = 0.175", "nearest = { value = 10.0"))
+    (tmp_path / "blind.toml").write_text(text.replace("nearest = { value = 0.158", "nearest = { value = 10.0"))
     with pytest.raises(SensorError, match="no range"):
         _render(tmp_path / "shot", camera=str(tmp_path / "blind.toml"))

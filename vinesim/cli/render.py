@@ -26,7 +26,7 @@ def run(
     people: Sequence[str] = (),
     crates: Sequence[str] = (),
 ) -> int:
-    """Draw it and write ``rgb``, ``depth``, ``labels``, ``overlay`` PNGs, ``camera.json`` and ``truth.json``."""
+    """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.cli.join import WrongUse
     from vinesim.sensors import formats, picture, truth
     from vinesim.sensors.camera import Camera, CameraSpec
@@ -59,7 +59,8 @@ def run(
     frame = Camera(spec, info, "camera", plan.sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
-        "depth": picture.depth_millimetres(frame.depth),
+        "depth": picture.depth_millimetres(frame.exact_depth),
+        "measured": picture.depth_millimetres(frame.depth),
         "labels": formats.ids(frame.labels),
         "overlay": formats.overlay(frame.rgb, truths),
     }

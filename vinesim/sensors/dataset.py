@@ -48,7 +48,7 @@ LATITUDE = np.radians(41.6)
 SEEN = 0.01
 """Share of the pixels that show somebody or something else than the vineyard, where something happens."""
 _TRIES, _SOCIABLE = 60, 30
-_FOLDERS = ("images", "labels", "depth", "ids", "berries", "records")
+_FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 
 
 class DatasetError(SensorError):
@@ -139,7 +139,7 @@ class Vineyard:
         view, near, happens = self._happening(image)
         seen = self._look(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
         truths = truth.of_bunches(self.primitives, view, seen, self.caster)
-        camera = Camera(self.spec, self.info, "camera", sun, quality="still")
+        camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image=image)
         frame = camera.render(self.primitives, seen.pose)
         bunches = formats.record(truths, self.info, self.ripeness.bunch)
         happens["actors"] = formats.actors(happens.get("actors", []), seen.labels)
@@ -161,7 +161,8 @@ class Vineyard:
         }
         images = {
             "images": frame.rgb,
-            "depth": picture.depth_millimetres(frame.depth),
+            "depth": picture.depth_millimetres(frame.exact_depth),
+            "measured": picture.depth_millimetres(frame.depth),
             "ids": formats.ids(frame.labels),
             "berries": formats.berry_ids(seen),
         }
