@@ -8,7 +8,9 @@ import seeing
 import trimesh
 
 from vinesim import frames
+from vinesim.sensors.batches import SPHEROID
 from vinesim.sensors.primitives import Primitives, still_view
+from vinesim.sensors.vines import Ripeness
 from vinesim.world.berries import berries
 from vinesim.world.ids import Organ, label
 
@@ -217,3 +219,35 @@ def test_a_second_build_is_the_same_to_the_bit(model, primitives) -> None:
     for name in "abcd":
         assert np.array_equal(getattr(primitives.shapes, name).numpy(), getattr(other.shapes, name).numpy())
     assert np.array_equal(primitives.looks.sky.numpy(), other.looks.sky.numpy())
+
+
+def test_fruit_ripens_from_green_to_its_variety() -> None:
+    """Quite ripe is what there is without ripeness; half ripe lies between green and ripe, berry by berry."""
+    model = seeing.demo()
+    count = len(model.bunch_body)
+    looks = {}
+    for share in (None, 1.0, 0.5, 0.0):
+        ripeness = None if share is None else Ripeness(np.full(count, share), 3)
+        primitives = Primitives(model, grass=0.0, ripeness=ripeness)
+        berry = primitives.shapes.kind.numpy() == SPHEROID
+        looks[share] = primitives.looks.tint.numpy()[berry], primitives.shapes.a.numpy()[berry, 3]
+    assert all(np.array_equal(a, b) for a, b in zip(looks[None], looks[1.0], strict=True))
+    ripe, half, green = (looks[share][0] for share in (1.0, 0.5, 0.0))
+    assert np.ptp(green, axis=0).max() < 0.06
+    assert (green[:, 1] > 1.5 * green[:, 0]).all()
+    between = (half - green) / np.where(np.abs(ripe - green) > 0.02, ripe - green, np.nan)
+    assert np.nanmin(between) > -1e-3
+    assert np.nanmax(between) < 1.0 + 1e-3
+    assert 0.35 < np.nanmean(between) < 0.6
+    assert np.nanstd(between) > 0.1
+    size = looks[0.0][1] / looks[1.0][1]
+    shot = size < 0.5
+    assert 0.02 < shot.mean() < 0.10
+    assert np.allclose(size[~shot], 0.91, atol=0.011)
+
+
+def test_most_bunches_of_a_random_vineyard_are_ripe_and_some_are_green() -> None:
+    drawn = Ripeness.random(4000, 5)
+    assert np.array_equal(drawn.bunch, Ripeness.random(4000, 5).bunch)
+    assert 0.6 < np.median(drawn.bunch) < 0.95
+    assert 0.05 < (drawn.bunch < 0.4).mean() < 0.3

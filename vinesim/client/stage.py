@@ -14,8 +14,10 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.people import standing
+from vinesim.physics.rigid import Rigid
 from vinesim.physics.step import Physics
 from vinesim.robot import description
+from vinesim.sensors.primitives import still_view
 from vinesim.world import figures
 from vinesim.world.berries import VARIETIES
 from vinesim.world.ids import Organ, label
@@ -86,7 +88,12 @@ class Stage:
 
     def set(self, model: Model) -> View:
         """The vineyard with all of it at rest; :class:`NoRoom` if two would stand in each other."""
-        return self.enter(Physics(self.furnished(model)))
+        furnished = self.furnished(model)
+        if any(crate.fill > 0.0 for crate in self.crates):
+            return self.enter(Physics(furnished))
+        rigid = Rigid(furnished)  # plants that nobody picks from need not be ready to move
+        self._admit(rigid)
+        return still_view(model, rigid.links(), rigid.link_q())
 
     def furnished(self, model: Model) -> Model:
         """The same vineyard with the crates after its own boxes."""
@@ -103,14 +110,18 @@ class Stage:
         """In a world that is furnished: fill the crates, then let everybody in."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             heap(physics, number, crate)
+        self._admit(physics.rigid)
+        return physics.view()
+
+    def _admit(self, rigid: Rigid) -> None:
+        """Let robots and people in."""
         for index, one in enumerate(self.robots):
             pose = _at(one.x, one.y, one.yaw)
-            physics.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
+            rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
             pose = figures.posed(standing(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
-            physics.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
-        _apart(physics)
-        return physics.view()
+            rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
+        _apart(rigid)
 
     def told(self, model: Model) -> list[dict]:
         """Everything that is set down in a vineyard, as JSON: label, kind, where."""
@@ -186,21 +197,20 @@ def _top(physics: Physics, bunch: int) -> float:
     return float(_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 
-def _fall(rigid, ticks: int) -> None:
+def _fall(rigid: Rigid, ticks: int) -> None:
     """Let loose things fall, without the plants."""
     for _ in range(ticks):
         rigid.prep()
         rigid.finish()
 
 
-def _apart(physics: Physics) -> None:
+def _apart(rigid: Rigid) -> None:
     """:class:`NoRoom` if whoever has come stands in somebody or something."""
-    rigid = physics.rigid
     rigid.prep()
     for names in rigid.overlaps():
         one, other = sorted(names[:2], key=rigid.actors.__contains__, reverse=True)
         if names[2] > CLEAR and one in rigid.actors:
             kind, _, number = other.partition("/")
             if kind == "fixed":
-                other = Organ(int(physics.model.fixed_organ[int(number)])).name.lower()
+                other = Organ(int(rigid.model.fixed_organ[int(number)])).name.lower()
             raise NoRoom(f"{one} stands {100.0 * names[2]:.0f} cm deep in {other}; move one of them")
