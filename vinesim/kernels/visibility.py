@@ -167,6 +167,9 @@ def raster_spheroids(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    xs = Pixels()
+    ys = Pixels()
+    depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
@@ -179,17 +182,26 @@ def raster_spheroids(
                 stretch = 1.0 / b4[3] - 1.0
                 centre = squeeze(p, axis, stretch)
                 nearest = wp.int64(int(wp.max(p[2] - r, 0.0) * 1.0e6)) << wp.int64(32)
-                for y in range(box[2], box[3]):
-                    for x in range(box[0], box[1]):
-                        at = y * lens.width + x
-                        if keys_out[at] > nearest:
-                            keep(
-                                at,
-                                hit_sphere(centre, a4[3], squeeze(ray_of(lens, x, y), axis, stretch)),
-                                i,
-                                lens.reach,
-                                keys_out,
-                            )
+                x = box[0]
+                y = box[2]
+                while y < box[3]:
+                    n = wp.int32(0)
+                    while n < RUN and y < box[3]:
+                        if keys_out[y * lens.width + x] > nearest:
+                            xs[n] = x
+                            ys[n] = y
+                            n += 1
+                        x += 1
+                        if x == box[1]:
+                            x = box[0]
+                            y += 1
+                    whole = (n + 7) // 8 * 8
+                    m = wp.int32(0)
+                    while m < whole:
+                        depths[m] = hit_sphere(centre, a4[3], squeeze(ray_of(lens, xs[m], ys[m]), axis, stretch))
+                        m += 1
+                    for m in range(n):
+                        keep(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
 
 
 @wp.kernel
@@ -297,6 +309,8 @@ def raster_leaves(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    xs = Pixels()
+    ys = Pixels()
     depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
@@ -354,38 +368,45 @@ def raster_leaves(
                     smooth = 1
                 extent = leaf_extent(shapes.hull, number)
                 nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)
-                for y in range(box[2], box[3]):
-                    x0 = box[0]
-                    x1 = box[1]
-                    fy = float(y)
-                    if not crossing:
-                        x0 = wp.max(x0, int(wp.max(wp.max(sum_low - fy, dif_low + fy) - 0.01, 0.0)))
-                        x1 = wp.min(x1, int(wp.max(wp.min(sum_high - fy, dif_high + fy) + 1.01, 0.0)))
-                    row = dz + dy * fy
-                    at = y * lens.width
-                    while x0 < x1 and keys_out[at + x0] <= nearest:
-                        x0 += 1
-                    while x0 < x1 and keys_out[at + x1 - 1] <= nearest:
-                        x1 -= 1
-                    for start in range(x0, x1, RUN):
-                        n = wp.min(x1 - start, RUN)
-                        whole = (n + 7) // 8 * 8
-                        x = wp.int32(0)
-                        while x < whole:
-                            depths[x] = hit_sheet(bend, extent, eye, row + dx * float(start + x))
+                x = wp.int32(0)
+                y = box[2] - 1
+                last = wp.int32(0)
+                while y < box[3]:
+                    n = wp.int32(0)
+                    while n < RUN and y < box[3]:
+                        if x < last:
+                            if keys_out[y * lens.width + x] > nearest:
+                                xs[n] = x
+                                ys[n] = y
+                                n += 1
                             x += 1
-                        for k in range(n):
-                            t = depths[k]
-                            if t < lens.reach:
-                                ray = row + dx * float(start + k)
-                                if t < 0.0:
-                                    t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
-                                    keep(at + start + k, t, i, lens.reach, keys_out)
-                                elif key_of(t, i) < keys_out[at + start + k]:
-                                    u = eye[0] + t * ray[0]
-                                    v = eye[1] + t * ray[1]
-                                    if inside_outline(shapes.outline, number, u, v, smooth):
-                                        keep(at + start + k, t, i, lens.reach, keys_out)
+                        else:
+                            y += 1
+                            x = box[0]
+                            last = box[1]
+                            fy = float(y)
+                            if not crossing:
+                                x = wp.max(x, int(wp.max(wp.max(sum_low - fy, dif_low + fy) - 0.01, 0.0)))
+                                last = wp.min(last, int(wp.max(wp.min(sum_high - fy, dif_high + fy) + 1.01, 0.0)))
+                            last = wp.where(y < box[3], last, 0)
+                    whole = (n + 7) // 8 * 8
+                    m = wp.int32(0)
+                    while m < whole:
+                        depths[m] = hit_sheet(bend, extent, eye, dz + dx * float(xs[m]) + dy * float(ys[m]))
+                        m += 1
+                    for k in range(n):
+                        t = depths[k]
+                        if t < lens.reach:
+                            at = ys[k] * lens.width + xs[k]
+                            ray = dz + dx * float(xs[k]) + dy * float(ys[k])
+                            if t < 0.0:
+                                t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
+                                keep(at, t, i, lens.reach, keys_out)
+                            elif key_of(t, i) < keys_out[at]:
+                                u = eye[0] + t * ray[0]
+                                v = eye[1] + t * ray[1]
+                                if inside_outline(shapes.outline, number, u, v, smooth):
+                                    keep(at, t, i, lens.reach, keys_out)
 
 
 @wp.kernel
