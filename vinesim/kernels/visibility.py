@@ -245,20 +245,27 @@ def raster_cones(
                 if b[2] < cut and a[2] > cut:
                     cb = a + ba * ((cut - a[2]) / ba[2])
             bound = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
-            fa = ball_bound(lens, ca, r)
-            fb = ball_bound(lens, cb, r)
+            fa = ball_bound(lens, ca, wp.where(a[2] < cut, r, a4[3]))
+            fb = ball_bound(lens, cb, wp.where(b[2] < cut, r, b4[3]))
             if clear:
                 bound = wp.vec4(wp.min(fa[0], fb[0]), wp.max(fa[1], fb[1]), wp.min(fa[2], fb[2]), wp.max(fa[3], fb[3]))
             box = pixels(lens, bound)
-            # In one row a slanted cone covers only a band: the hull of the bounds of its two ends.
+            # In one row a slanted cone covers only a band around the line between the pictures of its ends, as wide as
+            # these ellipses reach across it: support^2 = (n_x h_x)^2 + (n_y h_y)^2 + 2 n_x n_y h_x h_y correlation.
             ya = 0.5 * (fa[2] + fa[3])
             yb = 0.5 * (fb[2] + fb[3])
             xa = 0.5 * (fa[0] + fa[1])
             xb = 0.5 * (fb[0] + fb[1])
             half_x = 0.5 * wp.max(fa[1] - fa[0], fb[1] - fb[0]) + 0.01
             half_y = 0.5 * wp.max(fa[3] - fa[2], fb[3] - fb[2]) + 0.01
-            banded = clear and wp.min(ca[2], cb[2]) - r > 0.01 and wp.abs(yb - ya) > 2.0
-            per_row = wp.where(banded, 1.0 / (yb - ya), 0.0)
+            banded = clear and wp.min(ca[2], cb[2]) > 1.5 * r + 0.01 and wp.abs(yb - ya) > 2.0
+            slope = (xb - xa) / wp.where(banded, yb - ya, 1.0)
+            tilt = wp.max(
+                wp.abs(ca[0] * ca[1]) / wp.max(ca[2] * ca[2] - r * r, 1.0e-6),
+                wp.abs(cb[0] * cb[1]) / wp.max(cb[2] * cb[2] - r * r, 1.0e-6),
+            )
+            across = slope * half_y
+            band = wp.sqrt(half_x * half_x + across * across + 2.0 * wp.abs(half_x * across) * wp.min(tilt, 1.0)) + 0.02
             nearest = wp.int64(int(wp.max(wp.min(a[2], b[2]) - r, 0.0) * 1.0e6)) << wp.int64(32)
             x = wp.int32(0)
             y = box[2] - 1
@@ -277,12 +284,9 @@ def raster_cones(
                         x = box[0]
                         last = box[1]
                         if banded:
-                            s = (float(y) - half_y - ya) * per_row
-                            e = (float(y) + half_y - ya) * per_row
-                            xs_ = xa + (xb - xa) * wp.clamp(s, 0.0, 1.0)
-                            xe = xa + (xb - xa) * wp.clamp(e, 0.0, 1.0)
-                            x = wp.max(x, int(wp.max(wp.min(xs_, xe) - half_x, 0.0)))
-                            last = wp.min(last, int(wp.max(wp.max(xs_, xe) + half_x + 1.0, 0.0)))
+                            centre = xa + slope * (float(y) - ya)
+                            x = wp.max(x, int(wp.max(centre - band, 0.0)))
+                            last = wp.min(last, int(wp.max(centre + band + 1.0, 0.0)))
                         last = wp.where(y < box[3], last, 0)
                 whole = (n + 7) // 8 * 8
                 m = wp.int32(0)
