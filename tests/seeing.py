@@ -107,7 +107,7 @@ def finely(primitives: Primitives, which: np.ndarray) -> tuple[np.ndarray, np.nd
     kind = shapes.kind.numpy()
     a, b, c, d = (getattr(shapes, name).numpy().astype(float) for name in "abcd")
     outline = shapes.outline.numpy()
-    ball = trimesh.creation.icosphere(4)
+    ball = trimesh.creation.icosphere(3)
     v, u = np.meshgrid(np.linspace(-0.74, 1.24, 100), np.linspace(-0.98, 0.98, 99), indexing="ij")
     corner = np.arange(u.size).reshape(u.shape)
     quads = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], -1).reshape(-1, 4)

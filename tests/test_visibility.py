@@ -234,7 +234,7 @@ def test_nothing_in_the_world_is_ground_and_sky() -> None:
 
 
 def test_depth_of_fine_meshes() -> None:
-    """Open3D (Embree) sees berries as icospheres of 5,120 triangles, canes as prisms of 96 sides between such spheres,
+    """Open3D (Embree) sees berries as icospheres of 1,280 triangles, canes as prisms of 96 sides between such spheres,
     and leaves as sheets of some 6,000.
     """
     o3d = pytest.importorskip("open3d", reason="the peer of this test")

@@ -40,7 +40,8 @@ def lidar() -> Iterator[Measurement]:
     """Distances and primitives of all rays, the whole scan, and both while twenty trees move."""
     model, primitives = demo()
     spec = LidarSpec.load("vlp16")
-    head, scanner, caster = _grid(spec), Lidar(spec), RayCaster(primitives)
+    head, caster = _grid(spec), RayCaster(primitives)
+    thin, wide = Lidar(spec.ideal()), Lidar(spec)
     rays = head.direction.numpy()
     reach = spec.farthest.value
     trees = np.unique(model.body_tree[model.bunch_body])[:20]
@@ -54,7 +55,8 @@ def lidar() -> Iterator[Measurement]:
     cases: dict[str, Callable[[], object]] = {
         f"VLP-16, {count} rays, rasterised": lambda: head.hits(primitives, _STAND, reach=reach),
         f"VLP-16, {count} rays, one by one": lambda: caster.cast(_STAND[:3], rays, reach),
-        f"VLP-16, {count} rays, whole scan": lambda: scanner.scan(primitives, _STAND),
+        f"VLP-16, {count} shots, scan of thin beams": lambda: thin.scan(primitives, _STAND),
+        f"VLP-16, {count} shots, scan of true beams": lambda: wide.scan(primitives, _STAND),
         f"20 trees moved, {count} rays, rasterised": follow,
     }
     if find_spec("open3d") is None:
