@@ -217,14 +217,13 @@ def cast_shadows(
                                 over = u > -0.99 and u < 0.99 and v > -0.74 and v < 1.24
                                 over = over and u0 > -1.2 and u0 < 1.2 and v0 > -1.0 and v0 < 1.5
                                 texel = int((v + 0.75) * 128.0) * 256 + int((u + 1.0) * 128.0)
-                                texels[lot] = wp.where(over, texel, -1)
+                                texels[lot] = wp.where(over, texel, 0)  # no blade has its corner
                                 depths[lot] = z - (su * u + sv * v + slant * leaf_height(bend, u, v)) * r
                                 lot += 1
                             for lot in range(run):
                                 texel = texels[lot]
-                                if texel >= 0:
-                                    if int(shapes.outline[number, texel >> 8, texel & 255]) > 0:
-                                        darken(m, start + lot, py, depths[lot], depth_out)
+                                inside = int(shapes.outline[number, texel >> 8, texel & 255]) > 0
+                                darken(m, start + lot, py, wp.where(inside, depths[lot], FAR), depth_out)
             else:
                 o = xyz(a4)
                 reach_i = r
