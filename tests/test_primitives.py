@@ -234,7 +234,7 @@ def test_fruit_ripens_from_green_to_its_variety() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(looks[None], looks[1.0], strict=True))
     ripe, half, green = (looks[share][0] for share in (1.0, 0.5, 0.0))
     assert np.ptp(green, axis=0).max() < 0.06
-    assert (green[:, 1] > 1.5 * green[:, 0]).all()
+    assert (green[:, 1] > 1.3 * green[:, 0]).all()
     between = (half - green) / np.where(np.abs(ripe - green) > 0.02, ripe - green, np.nan)
     assert np.nanmin(between) > -1e-3
     assert np.nanmax(between) < 1.0 + 1e-3
