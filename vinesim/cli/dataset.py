@@ -38,24 +38,23 @@ def run(
         raise WrongUse(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     life = Life(actors) if actors > 0.0 else None
     plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), life)
-    dataset.begin(plan, out)
-    wanted = dataset.missing(out, images)
-    shares = _shares(wanted, workers or max((os.cpu_count() or 2) // 2, 1))
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crew: list[Share] = []
     try:
+        dataset.begin(plan, out)
+        wanted = dataset.missing(out, images)
+        shares = _shares(wanted, workers or max((os.cpu_count() or 2) // 2, 1))
         crew += [_start(plan, out, share) for share in shares]
         with Progress(*columns) as progress:
             task = progress.add_task("images", total=images, completed=images - len(wanted))
             _follow(crew, lambda: progress.advance(task))
     except KeyboardInterrupt:
-        _end(crew)
+        _end(crew, out)
         done = images - len(dataset.missing(out, images))
         print(f"stopped with {done} of {images} images in {out}; the same command goes on")
         return 130
     finally:
-        _end(crew)
-        dataset.sweep(out)
+        _end(crew, out)
     print(f"{dataset.finish(out, images)}: {images} images, {len(wanted)} of them new")
     return 0
 
@@ -114,10 +113,13 @@ def _follow(crew: list[Share], advance) -> None:
             advance()
 
 
-def _end(crew: list[Share]) -> None:
+def _end(crew: list[Share], out: pathlib.Path) -> None:
+    """Stop whoever still works, and take away what that leaves half-written."""
     for process, _ in crew:
         process.terminate()
     for process, tell in crew:
         process.join()
         tell.close()
+    if crew:
+        dataset.sweep(out)
     crew.clear()
