@@ -196,7 +196,8 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     gaze = looking(eye, np.array([3.0, -0.4, 1.0]))
     frame = Camera(seeing.IDEAL, seeing.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, gaze)
     d435 = CameraSpec.load("d435")
-    measured = Camera(d435, d435.info("optical", 0.5)).render(primitives, gaze)
+    clear = looking(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both its imagers, of her own robot
+    measured = Camera(d435, d435.info("optical", 0.5)).render(primitives, clear)
     seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
     for organ, name, at in (
         (Organ.HUMAN, "eva", eva.physics.rigid.stands("eva")),
