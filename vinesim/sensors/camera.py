@@ -309,4 +309,4 @@ class Camera:
             device=self.device,
         )
         self._exposure.halo(primitives, seen.primitive)
-        return self._exposure.develop(self._sunlight.balance, time)
+        return self._exposure.develop(self._sunlight.balance, time, self._sunlight.brightness)

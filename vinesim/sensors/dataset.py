@@ -57,7 +57,7 @@ class DatasetError(SensorError):
 
 def sized(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
     """Intrinsics of a camera at another size [px]: the same horizontal field of view, square pixels kept so."""
-    width, height = size or (spec.width.value, spec.height.value)
+    width, height = size or (int(spec.width.value), int(spec.height.value))
     if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
         raise SensorError(f"size is {width}x{height}; give WxH from {SMALLEST}x{SMALLEST} to {LARGEST}x{LARGEST}")
     if size is None:
