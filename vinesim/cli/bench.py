@@ -52,6 +52,12 @@ def _eyes() -> Iterator[Measurement]:
     return eyes()
 
 
+def _lidar() -> Iterator[Measurement]:
+    from vinesim.sensors.bench_lidar import lidar
+
+    return lidar()
+
+
 def _sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     from vinesim.sensors.bench_sensors import sensors
 
@@ -100,6 +106,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "tick": _tick,
     "asleep": _asleep,
     "camera": _camera,
+    "lidar": _lidar,
     "sensors": _sensors,
     "eyes": _eyes,
     "sync": _sync,
