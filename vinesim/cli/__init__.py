@@ -375,8 +375,8 @@ def bench(
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
-    Of physics and sensors: plants, contact, tick, asleep, camera. Of the network: sync (what delay does, in simulated
-    time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
+    Of physics and sensors: plants, contact, tick, asleep, camera, lidar. Of the network: sync (what delay does, in
+    simulated time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
     fuzz (broken messages).
 
     \b
