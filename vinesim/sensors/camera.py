@@ -258,15 +258,20 @@ class Camera:
         """Frames a second [Hz]."""
         return self.spec.rate.value
 
-    def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> CameraFrame:
-        """The frame seen from ``pose`` [7], the optical frame in the world."""
+    def render(
+        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, measure: bool = True
+    ) -> CameraFrame:
+        """The frame seen from ``pose`` [7], the optical frame in the world.
+
+        Who looks at colours only saves the second view by ``measure=False``: depth is then exact, where in range.
+        """
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
         seen = self.visibility
         seen.draw(primitives, lens)
         shape = (self.info.height, self.info.width)
         rgb, exact = self._picture(primitives, lens, pose, time), seen.depth.numpy().reshape(shape).copy()
-        if self._stereo:
+        if self._stereo and measure:
             depth = self._stereo.measure(primitives, lens, exact, rgb, specs.dice(self.seed, self.name, self.image))
         else:
             too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
