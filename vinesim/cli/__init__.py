@@ -377,9 +377,15 @@ def bench(
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
+<<<<<<< HEAD
+    Of physics and sensors: plants, contact, tick, asleep, camera, lidar. Of the network: sync (what delay does, in
+    simulated time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
+    fuzz (broken messages).
+=======
     Of physics: plants, contact, tick, asleep. Of sensors: camera (speed), sensors (what they measure, beside the
     truth). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links; needs
     root), traffic (bytes a client hears), load (many clients), fuzz (broken messages).
+>>>>>>> main
 
     \b
     Examples:
