@@ -87,11 +87,12 @@ def cast_shadows(
     m: ShadowMap,
     smallest: float,
     lanes: int,
+    slices: int,
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread draws every ``lanes``-th primitive of one cluster as the sun sees it."""
-    k, lane = wp.tid()
+    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it."""
+    k, lane, row = wp.tid()
     cluster = which[k]
     kind = clusters.kind[cluster]
     bound = ball[cluster]
@@ -113,7 +114,7 @@ def cast_shadows(
             r = a4[3]
             if kind == SPHEROID:
                 rt = r / m.texel
-                for py in range(wp.max(int(y - rt), 0), wp.min(int(y + rt) + 2, m.side)):
+                for py in range(wp.max(int(y - rt), 0) + row, wp.min(int(y + rt) + 2, m.side), slices):
                     for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
                         dx = float(px) - x
                         dy = float(py) - y
@@ -131,7 +132,7 @@ def cast_shadows(
                     per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
                     y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
                     y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, m.side)
-                    for py in range(y0, y1):
+                    for py in range(y0 + row, y1, slices):
                         x0 = wp.min(x, x + ex) - wide
                         x1 = wp.max(x, x + ex) + wide
                         if wp.abs(ey) > 4.0:
@@ -189,7 +190,7 @@ def cast_shadows(
                             hx = wp.max(hx, qx)
                             ly = wp.min(ly, qy)
                             hy = wp.max(hy, qy)
-                    for py in range(wp.max(int(ly), 0), wp.min(int(hy) + 2, m.side)):
+                    for py in range(wp.max(int(ly), 0) + row, wp.min(int(hy) + 2, m.side), slices):
                         fy = float(py) - y
                         for px in range(wp.max(int(lx), 0), wp.min(int(hx) + 2, m.side)):
                             fx = float(px) - x
@@ -216,7 +217,7 @@ def cast_shadows(
                 x = wp.dot(p, m.right) / m.texel
                 y = wp.dot(p, m.up) / m.texel
                 rt = reach_i / m.texel
-                for py in range(wp.max(int(y - rt), 0), wp.min(int(y + rt) + 2, m.side)):
+                for py in range(wp.max(int(y - rt), 0) + row, wp.min(int(y + rt) + 2, m.side), slices):
                     for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
                         from_sun = (
                             m.corner

@@ -110,9 +110,12 @@ class Visibility:
         self, primitives: Primitives, lens: visibility.Pinhole, nearest: float = 0.0, farthest: float = REACH
     ) -> None:
         """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
-        distance = self.distances(primitives, lens)
-        seen = np.flatnonzero(distance < float(shapes.FAR))
-        self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        if primitives.raster is None:
+            distance = self.distances(primitives, lens)
+            seen = np.flatnonzero(distance < float(shapes.FAR))
+            self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        else:
+            primitives.raster.fill(primitives, lens, None, self.keys)
         wp.launch(
             visibility.resolve,
             self.width * self.height,
@@ -142,25 +145,24 @@ class Visibility:
 
     def alone(self, primitives: Primitives, lens: visibility.Pinhole, clusters: np.ndarray) -> np.ndarray:
         """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
-        self._raster(primitives, lens, clusters)
+        if primitives.raster is None:
+            self._raster(primitives, lens, clusters)
+        else:
+            primitives.raster.fill(primitives, lens, clusters, self.keys)
         return self.keys.numpy().reshape(self.height, self.width) < int(visibility.EMPTY)
 
     def _raster(self, primitives: Primitives, lens: visibility.Pinhole, seen: np.ndarray) -> None:
         """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
-        if self.device == "cpu":
-            self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
-        else:
-            self.keys.fill_(int(visibility.EMPTY))
+        self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
-        lanes = 1 if self.device == "cpu" else 48
         for kernel, kinds in _RASTER:
             mine = seen[np.isin(kind, kinds)]
             if len(mine):
                 wp.launch(
                     kernel,
-                    (len(mine), lanes),
-                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, lanes],
+                    (len(mine), 1),
+                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, 1],
                     outputs=[self.keys],
                     device=self.device,
                 )
@@ -184,6 +186,7 @@ class Camera:
         self.visibility = Visibility(self.info.width, self.info.height, self.device)
         self._sunlight = Sunlight(self.sun, taps=self.taps, period=self.shadow_period, device=self.device)
         self._rgb = wp.empty((self.info.width * self.info.height, 3), dtype=wp.uint8, device=self.device)
+        self._landing: list[wp.array] = []
 
     @property
     def rate(self) -> float:
@@ -192,6 +195,32 @@ class Camera:
 
     def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> CameraFrame:
         """The frame seen from ``pose`` [7], the optical frame in the world."""
+        self.expose(primitives, pose, time)
+        shape = (self.info.height, self.info.width)
+        rgb, depth, labels = self._fetch(self._rgb, self.visibility.depth, self.visibility.labels)
+        return CameraFrame(
+            time=float(time),
+            name=self.name,
+            info=self.info,
+            pose=np.array(pose, float),
+            rgb=rgb.reshape(*shape, 3),
+            depth=depth.reshape(shape),
+            labels=labels.reshape(shape),
+        )
+
+    def _fetch(self, *arrays: wp.array) -> list[np.ndarray]:
+        """Copies for the host: from a GPU through memory that it can write to, all at once."""
+        if self.device != "cpu":
+            if not self._landing:
+                self._landing = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
+            for array, place in zip(arrays, self._landing, strict=True):
+                wp.copy(place, array)
+            wp.synchronize_stream(self.device)
+            arrays = tuple(self._landing)
+        return [a.numpy().copy() for a in arrays]
+
+    def expose(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> None:
+        """Draw the frame where it is seen: on a GPU, nothing is waited for."""
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
         seen = self.visibility
@@ -215,14 +244,4 @@ class Camera:
             ],
             outputs=[self._rgb],
             device=self.device,
-        )
-        shape = (self.info.height, self.info.width)
-        return CameraFrame(
-            time=float(time),
-            name=self.name,
-            info=self.info,
-            pose=pose,
-            rgb=self._rgb.numpy().reshape(*shape, 3).copy(),
-            depth=seen.depth.numpy().reshape(shape).copy(),
-            labels=seen.labels.numpy().reshape(shape).copy(),
         )

@@ -13,7 +13,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import materials, shadows, shapes
-from vinesim.sensors import textures
+from vinesim.sensors import renderers, textures
 from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
 from vinesim.sensors.grounds import fixed, meadow
 from vinesim.sensors.links import rigid
@@ -32,9 +32,11 @@ _CLUSTER = 24
 class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.shapes`)."""
 
-    def __init__(self, model: Model, *, grass: float = 14.0, device: str = "cpu") -> None:
-        """``grass``: tufts per square metre around the vines, 0 for bare ground."""
+    def __init__(self, model: Model, *, grass: float = 14.0, device: str = "cpu", renderer: str = "warp") -> None:
+        """``grass``: tufts per square metre around the vines, 0 for bare ground; ``renderer``: who draws these."""
         self.model, self.device = model, device
+        self.raster = renderers.raster_of(renderer, device)
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.Visibility` does so itself."""
         bodies = len(model.body_mass)
         self._still = bodies
         """Carrier of what stands still; links follow it."""
