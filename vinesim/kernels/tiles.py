@@ -1,7 +1,7 @@
 """The rasteriser for GPUs: primitives are cut into pieces of a few pixels, and every piece is drawn by some threads.
 
 One leaf may fill the picture and a thousand berries a single pixel each. One thread a primitive would let the whole
-GPU wait for that leaf, so a first kernel only bounds primitives and lists pieces of at most CELL x CELL pixels of
+GPU wait for that leaf, so a first kernel only bounds primitives and lists pieces of at most SIDE x SIDE pixels of
 their bounds, and a second one draws the pieces, all of about the same work. It intersects as the ray caster does.
 No kernel asks the host how long the lists have become: a frame is two launches.
 """
@@ -28,8 +28,9 @@ from vinesim.kernels.visibility import CLOSE, SMOOTH_SIZE, UNBOUND, Pinhole, bal
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-CELL = wp.constant(16)
-"""Side of a piece [pixel]."""
+SIDE = wp.constant(16)
+"""Of a piece [pixel]; twice that for what is larger than LARGE, since one thread lists all pieces of a primitive."""
+LARGE = wp.constant(256)
 LISTS = wp.constant(64)
 """Pieces are kept in so many lists: threads that append to one must take turns."""
 NOTHING = wp.constant(wp.vec4(1.0e6, -1.0e6, 1.0e6, -1.0e6))
@@ -262,20 +263,21 @@ def list_pieces(
         first = clusters.first[cluster]
         for i in range(first + lane, first + clusters.size[cluster], lanes):
             o = outline_of(shapes, i, lens)
+            side = wp.where(wp.max(o.box[1] - o.box[0], o.box[3] - o.box[2]) > LARGE, 2 * SIDE, SIDE)
             needed = wp.int32(0)
-            for top in range(o.box[2], o.box[3], CELL):
-                span = columns(o, top, wp.min(top + CELL, o.box[3]))
-                needed += wp.max(span[1] - span[0] + CELL - 1, 0) // CELL
+            for top in range(o.box[2], o.box[3], side):
+                span = columns(o, top, wp.min(top + side, o.box[3]))
+                needed += wp.max(span[1] - span[0] + side - 1, 0) // side
             if needed > 0:
                 slot = wp.atomic_add(count_out, mine, needed)
-                for top in range(o.box[2], o.box[3], CELL):
-                    bottom = wp.min(top + CELL, o.box[3])
+                for top in range(o.box[2], o.box[3], side):
+                    bottom = wp.min(top + side, o.box[3])
                     span = columns(o, top, bottom)
-                    for left in range(span[0], span[1], CELL):
+                    for left in range(span[0], span[1], side):
                         piece = wp.vec4i(
                             i,
                             left | (top << 16),
-                            wp.min(CELL, span[1] - left) | ((bottom - top) << 16),
+                            wp.min(side, span[1] - left) | ((bottom - top) << 16),
                             int(o.depth * 1.0e6),
                         )
                         if slot < pieces_out.shape[1]:

@@ -22,11 +22,22 @@ class Tiles:
         groups: how many pieces are drawn at once, of each list.
         lanes: threads that draw one piece together.
         listers: threads that list the pieces of one cluster.
+        block: CUDA threads a block that draw pieces.
         room: pieces for which each list has room. What finds none is drawn too, only slowly.
     """
 
-    def __init__(self, device: str, *, groups: int = 256, lanes: int = 16, listers: int = 8, room: int = 16384) -> None:
+    def __init__(
+        self,
+        device: str,
+        *,
+        groups: int = 1024,
+        lanes: int = 32,
+        listers: int = 8,
+        block: int = 64,
+        room: int = 16384,
+    ) -> None:
         self.device, self._groups, self._lanes, self._listers = device, groups, lanes, listers
+        self._block = block
         self._count = wp.zeros(_LISTS, dtype=wp.int32, device=device)
         self._pieces = wp.empty((_LISTS, room), dtype=wp.vec4i, device=device)
         self._all = wp.empty(0, dtype=wp.int32, device=device)
@@ -53,4 +64,5 @@ class Tiles:
             inputs=[primitives.shapes, self._count, self._pieces, lens, self._groups, self._lanes],
             outputs=[keys],
             device=self.device,
+            block_dim=self._block,
         )
