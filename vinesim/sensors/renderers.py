@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from vinesim.kernels.visibility import Pinhole
     from vinesim.sensors.primitives import Primitives
 
-RENDERERS = ("warp", "taichi")
+RENDERERS = ("warp", "taichi", "taichi-gpu")
 """By name, the default first (docs/decisions/renderers.md)."""
 
 
@@ -33,18 +33,29 @@ def raster_of(renderer: str, device: str) -> Raster | None:
     """The rasteriser of that name for primitives on ``device``; None for Warp's own on a CPU."""
     if renderer not in RENDERERS:
         raise NoRenderer(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
-    if renderer == "taichi":
-        if device != "cpu":
-            raise NoRenderer(f"renderer 'taichi' with device {device!r}: Taichi finds its GPU itself; use device cpu")
-        try:
-            from vinesim.sensors.twin import Twin
-        except ImportError as missing:
-            raise NoRenderer(
-                f"renderer 'taichi': {missing.name} is not installed; type: pip install 'vinesim[taichi]'"
-            ) from None
-        return Twin()
+    if renderer != "warp":
+        return _twin(renderer, device)
     if device != "cpu":
         from vinesim.sensors.tiles import Tiles
 
         return Tiles(device)
     return None
+
+
+def _twin(renderer: str, device: str) -> Raster:
+    if device != "cpu":
+        raise NoRenderer(
+            f"renderer {renderer!r} with device {device!r}: that device is Warp's; leave one of the two out"
+        )
+    try:
+        from vinesim.sensors.twin import Twin
+    except ImportError as missing:
+        raise NoRenderer(
+            f"renderer {renderer!r}: {missing.name} is not installed; type: pip install 'vinesim[taichi]'"
+        ) from None
+    try:
+        return Twin(gpu=renderer == "taichi-gpu")
+    except RuntimeError:
+        raise NoRenderer(
+            f"renderer {renderer!r}: Taichi finds no Vulkan or Metal GPU here; use taichi or warp"
+        ) from None

@@ -9,7 +9,9 @@ A GPU here may have no 64-bit atomics. There depth and number are found one afte
 Only this module knows Taichi. No postponed annotations: Taichi needs real ones.
 """
 
+import contextlib
 import functools
+import io
 import os
 from typing import TYPE_CHECKING
 
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 FAR, UNBOUND, CLOSE = float(shapes.FAR), float(visibility.UNBOUND), float(visibility.CLOSE)
 EMPTY, SMOOTH_SIZE, TEXELS = int(visibility.EMPTY), float(visibility.SMOOTH_SIZE), float(shapes.OUTLINE_TEXELS)
 _NOBODY = 2**31 - 1
+_SLICES = 32
+"""Threads of a GPU that share the rows of each primitive of a cluster."""
 KEY, DEPTH, NUMBER = range(3)
 """What a pass draws: depth and number in one; depth alone; the number of what lies at that depth."""
 
@@ -95,9 +99,7 @@ def leaf_outline(s, hull: ti.template(), lens):
         box = ball(lens, p + rib * (0.25 * size), 1.45 * size)
         if p[2] < -1.6 * size:
             box = NOTHING
-    return Bound(
-        box=box, rising=vec3(1.0, turned[0], turned[1]), falling=vec3(-1.0, turned[2], turned[3]), depth=depth
-    )
+    return Bound(box=box, rising=vec3(1.0, turned[0], turned[1]), falling=vec3(-1.0, turned[2], turned[3]), depth=depth)
 
 
 @ti.func
@@ -333,10 +335,9 @@ def hit_leaf(s, outlines: ti.template(), ray, smooth):
                 if bottom != 0.0:
                     t = top / bottom
                     u, v = o[0] + t * d[0], o[1] + t * d[1]
-                    near = t > 0.0 and t < best and sign * u >= -1.0e-5
-                    if near and u < 0.99 and u > -0.99 and v > -0.74 and v < 1.24:
-                        if on_blade(outlines, int(s.b[3]), u, v, smooth):
-                            best = t
+                    nearer = t > 0.0 and t < best and sign * u >= -1.0e-5
+                    if nearer and u < 0.99 and u > -0.99 and v > -0.74 and v < 1.24:
+                        best = ti.select(on_blade(outlines, int(s.b[3]), u, v, smooth), t, best)
     return best
 
 
@@ -394,7 +395,7 @@ def _drawer(kind: int, phase: int):
     @ti.kernel
     def draw(
         a: Table, b: Table, c: Table, d: Table,
-        outlines: ti.types.ndarray(dtype=ti.i8, ndim=3), hull: ti.types.ndarray(dtype=ti.f32, ndim=3),
+        outlines: ti.types.ndarray(ndim=3), hull: ti.types.ndarray(dtype=ti.f32, ndim=3),
         first: ti.types.ndarray(dtype=ti.i32, ndim=1), size: ti.types.ndarray(dtype=ti.i32, ndim=1),
         which: ti.types.ndarray(dtype=ti.i32, ndim=1),
         lens: Lens, slices: ti.i32,
@@ -408,7 +409,10 @@ def _drawer(kind: int, phase: int):
                 smooth = s.a[3] * lens.focal[0] > s.a[2] * SMOOTH_SIZE
                 nearest = int(clamp(o.depth, 0.0, lens.reach) * 1.0e6)
                 left, right = clamp(o.box[0] - 0.01, 0.0, lens.size[0]), clamp(o.box[1] + 1.01, 0.0, lens.size[0])
-                top, bottom = int(clamp(o.box[2] - 0.01, 0.0, lens.size[1])), int(clamp(o.box[3] + 1.01, 0.0, lens.size[1]))
+                top, bottom = (
+                    int(clamp(o.box[2] - 0.01, 0.0, lens.size[1])),
+                    int(clamp(o.box[3] + 1.01, 0.0, lens.size[1])),
+                )
                 if left < right:
                     y = top + part
                     while y < bottom:
@@ -432,7 +436,7 @@ def _drawer(kind: int, phase: int):
                                             ti.atomic_min(keys[at], key)
                                     elif ti.static(phase == DEPTH):
                                         ti.atomic_min(keys[at], z)
-                                    elif z <= keys[at] + 1:  # another compilation may round another way
+                                    elif z == keys[at]:
                                         ti.atomic_min(number[at], i)
                         y += slices
 
@@ -440,11 +444,16 @@ def _drawer(kind: int, phase: int):
 
 
 class Twin:
-    """Fills the keys of pictures as Warp's rasteriser does, on all cores of the CPU."""
+    """Fills the keys of pictures as Warp's rasteriser does: on all cores of the CPU, or on a Vulkan or Metal GPU."""
 
-    def __init__(self) -> None:
-        _start()
+    def __init__(self, gpu: bool = False) -> None:
+        """Raises RuntimeError where there is no such GPU. A process has one kind of twin."""
+        _start(gpu)
+        self._gpu = gpu
+        self._of: tuple[object, int] = (None, -1)
         self._number = np.zeros(1, np.int32)
+        self._tables: list = []
+        self._pixels: list = []
 
     def fill(
         self, primitives: "Primitives", lens: visibility.Pinhole, clusters: np.ndarray | None, keys: wp.array
@@ -452,23 +461,52 @@ class Twin:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         which = _in_view(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
         kind = primitives.cluster_kind[which]
-        s = primitives.shapes
+        mine = {number: which[kind == number] for number in _KINDS}
+        mine = {number: these for number, these in mine.items() if len(these)}
+        if self._gpu:
+            self._fill_there(primitives, lens, mine, keys.numpy())
+            return
+        s, eye, pixels = primitives.shapes, _lens(lens), keys.numpy()
         tables = [t.numpy() for t in (s.a, s.b, s.c, s.d, s.outline, s.hull)]
-        pixels = keys.numpy()
         pixels.fill(EMPTY)
+        for number, these in mine.items():
+            clusters_of = primitives.cluster_first, primitives.cluster_size, these
+            _drawer(number, KEY)(*tables, *clusters_of, eye, 1, pixels, self._number)
+
+    def _fill_there(
+        self, primitives: "Primitives", lens: visibility.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
+    ) -> None:
+        """On a GPU: depths, then numbers; what has not moved stays there."""
+        if self._of != (primitives, primitives.version):
+            s, self._of = primitives.shapes, (primitives, primitives.version)
+            vectors = [(ti.Vector.ndarray(4, ti.f32, len(t)), t.numpy()) for t in (s.a, s.b, s.c, s.d)]
+            flat = [(ti.ndarray(ti.i32, s.outline.shape), s.outline.numpy().astype(np.int32))]
+            hull = s.hull.numpy()
+            flat += [(ti.ndarray(ti.f32, hull.shape), hull)]
+            for place, values in vectors + flat:
+                place.from_numpy(np.ascontiguousarray(values))
+            self._tables = [place for place, _ in vectors + flat]
+        if not self._pixels or self._pixels[0].shape != keys.shape:
+            self._pixels = [ti.ndarray(ti.i32, keys.shape) for _ in range(2)]
+        for array in self._pixels:
+            array.fill(_NOBODY)
         eye = _lens(lens)
-        for number in _KINDS:
-            mine = which[kind == number]
-            if len(mine):
-                _drawer(number, KEY)(
-                    *tables, primitives.cluster_first, primitives.cluster_size, mine, eye, 1, pixels, self._number
-                )
+        for phase in (DEPTH, NUMBER):
+            for number, these in mine.items():
+                clusters_of = primitives.cluster_first, primitives.cluster_size, these
+                _drawer(number, phase)(*self._tables, *clusters_of, eye, _SLICES, *self._pixels)
+        depth, number = (array.to_numpy().astype(np.int64) for array in self._pixels)
+        keys[:] = np.where(number == _NOBODY, EMPTY, (depth << 32) | number)
 
 
 @functools.cache
-def _start() -> None:
-    """Taichi, once a process."""
-    ti.init(arch=ti.cpu, log_level=ti.ERROR, verbose=False)
+def _start(gpu: bool) -> None:
+    """Taichi, once a process; its greeting is kept from standard output, which belongs to the command."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        if gpu:
+            ti.init(arch=[ti.metal, ti.vulkan], enable_fallback=False, log_level=ti.ERROR)
+        else:
+            ti.init(arch=ti.cpu, log_level=ti.ERROR)
 
 
 def _lens(lens: visibility.Pinhole) -> Lens:
