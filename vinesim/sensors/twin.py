@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 FAR, UNBOUND, CLOSE = float(shapes.FAR), float(visibility.UNBOUND), float(visibility.CLOSE)
 EMPTY, SMOOTH_SIZE, TEXELS = int(visibility.EMPTY), float(visibility.SMOOTH_SIZE), float(shapes.OUTLINE_TEXELS)
 _NOBODY = 2**31 - 1
+_NEARLY = 2**30
+"""Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
 _SLICES = 32
 """Threads of a GPU that share the rows of each primitive of a cluster."""
 KEY, DEPTH, NUMBER = range(3)
@@ -436,8 +438,8 @@ def _drawer(kind: int, phase: int):
                                             ti.atomic_min(keys[at], key)
                                     elif ti.static(phase == DEPTH):
                                         ti.atomic_min(keys[at], z)
-                                    elif z == keys[at]:
-                                        ti.atomic_min(number[at], i)
+                                    elif z <= keys[at] + 1:
+                                        ti.atomic_min(number[at], i + ti.select(z == keys[at], 0, _NEARLY))
                         y += slices
 
     return draw
@@ -496,7 +498,7 @@ class Twin:
                 clusters_of = primitives.cluster_first, primitives.cluster_size, these
                 _drawer(number, phase)(*self._tables, *clusters_of, eye, _SLICES, *self._pixels)
         depth, number = (array.to_numpy().astype(np.int64) for array in self._pixels)
-        keys[:] = np.where(number == _NOBODY, EMPTY, (depth << 32) | number)
+        keys[:] = np.where(number == _NOBODY, EMPTY, (depth << 32) | (number & (_NEARLY - 1)))
 
 
 @functools.cache
