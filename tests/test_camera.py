@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import seeing
@@ -189,3 +190,36 @@ def test_shipped_cameras_load(name: str) -> None:
     info = CameraSpec.load(name).info("optical")
     assert (info.width, info.height) == (640, 480)
     assert info.cx == pytest.approx(319.5)
+
+
+def test_qualities_differ_in_colour_only(model, primitives) -> None:
+    """What is measured does not depend on how finely the picture is painted, and it is the same picture."""
+    pose = looking(np.array([0.4, 1.2, 1.5]), np.array([3.0, 1.0, 1.7]))
+    fast, full, still = (_camera(quality=q).render(primitives, pose) for q in ("fast", "full", "still"))
+    for other in (fast, still):
+        assert np.array_equal(other.depth, full.depth)
+        assert np.array_equal(other.labels, full.labels)
+        apart = cv2.blur(other.rgb, (9, 9)).astype(float) - cv2.blur(full.rgb, (9, 9))
+        assert np.abs(apart).mean() < 4.0
+    with pytest.raises(ValueError, match="'pretty'; give fast, full, still"):
+        _camera(quality="pretty")
+
+
+def test_a_still_has_soft_edges() -> None:
+    """Four samples a pixel: along the edge of a slanted board, colours between board and sky appear."""
+    board = seeing.shape("box", 0.01, 0.4, 0.4, at=(2.0, 0.0, 1.2))
+    primitives, _ = seeing.world(seeing.thing(board))
+    pose = seeing.AHEAD.copy()
+    pose[3:] = frames.multiply(pose[3:], frames.exp(np.array([0.0, 0.0, 0.2])))
+    hard, soft = (_camera(quality=q).render(primitives, pose) for q in ("full", "still"))
+    mine = (hard.labels >> 20 == int(Organ.ROBOT)).astype(np.uint8)
+    border = cv2.morphologyEx(mine, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+    between = []
+    for frame in (hard, soft):
+        grey = frame.rgb.astype(np.float32).mean(2)
+        low, high = cv2.erode(grey, np.ones((3, 3))), cv2.dilate(grey, np.ones((3, 3)))
+        edge = border & (high - low > 30.0)
+        share = (grey[edge] - low[edge]) / (high - low)[edge]
+        between.append(((share > 0.15) & (share < 0.85)).mean())
+    assert between[0] < 0.25  # the tree line behind has edges of its own
+    assert between[1] > 1.5 * between[0]

@@ -209,14 +209,6 @@ def test_what_stops_a_worker_is_one_line(scene: pathlib.Path, tmp_path: pathlib.
     assert list(_files(tmp_path / "set")) == ["dataset.json"]
 
 
-def test_the_sun_of_an_equinox() -> None:
-    """Due south at noon and as high as the latitude is far from the pole; due west at six, on the horizon."""
-    latitude = np.radians(41.6)
-    assert dataset.sun_at(12.0, 0.0) == pytest.approx([0.0, -np.sin(latitude), np.cos(latitude)], abs=1e-12)
-    assert dataset.sun_at(18.0, 0.0) == pytest.approx([-1.0, 0.0, 0.0], abs=1e-12)
-    assert np.linalg.norm(dataset.sun_at(15.3, 0.2)) == pytest.approx(1.0)
-
-
 # ---- one picture -----------------------------------------------------------------------------------------------------
 
 

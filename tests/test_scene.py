@@ -7,6 +7,7 @@ import pytest
 
 from vinesim.world import scene
 from vinesim.world.places import data_dir
+from vinesim.world.scene import Sun, sun_at
 
 GOOD = """
 name = "small"
@@ -105,3 +106,22 @@ def test_a_folder_or_binary_is_no_scene(tmp_path):
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(scene.SceneError, match="UTF-8"):
         scene.load(binary)
+
+
+def test_the_sun_of_an_equinox() -> None:
+    """Due south at noon and as high as the latitude is far from the pole; due west at six, on the horizon."""
+    latitude = math.radians(41.6)
+    assert sun_at(12.0, 0.0, latitude) == pytest.approx([0.0, -math.sin(latitude), math.cos(latitude)], abs=1e-12)
+    assert sun_at(18.0, 0.0, latitude) == pytest.approx([-1.0, 0.0, 0.0], abs=1e-12)
+    assert math.hypot(*sun_at(15.3, 0.2, latitude)) == pytest.approx(1.0)
+
+
+def test_a_sun_with_an_hour_moves() -> None:
+    """From nine in the morning to noon in three hours; day 80 is the equinox, to the half degree of the formula."""
+    sun = Sun(hour=9.0, day=80, latitude=0.7)
+    east, north, up = sun.direction(3 * 3600.0)
+    assert (east, north) == pytest.approx((0.0, -math.sin(0.7)), abs=0.01)
+    assert sun.direction(0.0)[0] > 0.6
+    assert sun.direction(0.0)[2] < up
+    fixed = Sun(azimuth=0.3, elevation=0.4)
+    assert fixed.direction(0.0) == fixed.direction(9000.0)

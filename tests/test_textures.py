@@ -44,7 +44,7 @@ def test_the_tone_curve_rises_from_black_to_white() -> None:
 
 def test_the_sun_is_where_it_is_said_to_be() -> None:
     sun = np.array([0.3, -0.5, 0.6]) / np.linalg.norm([0.3, -0.5, 0.6])
-    sky = textures.sky(tuple(sun))
+    sky = textures.sky(tuple(sun), (3.3, 2.95, 2.35))
     row, column = np.unravel_index(sky.sum(-1).argmax(), sky.shape[:2])
     assert (row / (textures.SKY_ROWS - 1)) ** 2 == pytest.approx(sun[2], abs=0.02)
     assert (column / (textures.SKY_COLUMNS - 1) - 0.5) * 2.0 * np.pi == pytest.approx(

@@ -25,7 +25,13 @@ COLOURS = {
     "steel": (0.70, 0.72, 0.74),
     "glass": (0.03, 0.04, 0.06),
     "rubber": (0.05, 0.05, 0.05),
+    "yellow": (0.93, 0.72, 0.05),
+    "amber": (0.80, 0.42, 0.05),
+    "lamp_white": (1.00, 0.97, 0.88),
+    "lamp_green": (0.10, 1.00, 0.30),
+    "lamp_red": (0.70, 0.03, 0.03),
 }
+"""Lamps shine, rubber, steel and glass look like it, all else is painted: sensors go by these words."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +97,32 @@ ACROSS = (math.pi / 2, 0, 0)
 """Turns a cylinder's axis from z to y."""
 ALONG = (0, math.pi / 2, 0)
 """Turns a cylinder's axis from z to x."""
+
+
+def beacon(x: float, y: float, z: float) -> tuple[Piece, ...]:
+    """A signal tower on ``z``: green is lit, amber and red are not."""
+    tiers = ("lamp_green", "amber", "red")
+    return (
+        cylinder(0.012, 0.10, (x, y, z + 0.05), colour="steel", solid=False),
+        *(cylinder(0.026, 0.032, (x, y, z + 0.116 + 0.036 * k), colour=c, solid=False) for k, c in enumerate(tiers)),
+        *(cylinder(0.027, 0.005, (x, y, z + 0.098 + 0.036 * k), colour="dark", solid=False) for k in range(4)),
+    )
+
+
+def lugs(y: float, z: float, half: float, radius: float, width: float) -> list[Piece]:
+    """Bars across a rubber track whose wheels of this radius stand ``half`` before and behind the middle."""
+    bars, step = [], 0.055
+    count = round(2.0 * half / step)
+    for side in (1.0, -1.0):
+        for k in range(count + 1):
+            at = (2.0 * half * k / count - half, y, z + side * (radius + 0.004))
+            bars.append(box((0.022, width, 0.012), at, colour="rubber", solid=False))
+        bend = round(math.pi * radius / step)
+        for k in range(1, bend):
+            angle = math.pi * k / bend
+            at = (side * (half + (radius + 0.004) * math.sin(angle)), y, z + (radius + 0.004) * math.cos(angle))
+            bars.append(box((0.022, width, 0.012), at, (0, side * angle, 0), colour="rubber", solid=False))
+    return bars
 
 
 class Urdf:
@@ -190,15 +222,32 @@ def base(urdf: Urdf) -> None:
             tracks.append(cylinder(0.07, 0.146, (x, y, 0.02), ACROSS, colour="steel", solid=False))
         for x in (-0.11, 0.0, 0.11):
             tracks.append(cylinder(0.045, 0.146, (x, y, -0.03), ACROSS, colour="grey", solid=False))
-        tracks.append(box((0.62, 0.15, 0.02), (0, y, 0.15), colour="white", solid=False))
+        tracks.append(box((0.62, 0.15, 0.014), (0, y, 0.158), colour="white", solid=False))
+        tracks.append(box((0.44, 0.144, 0.03), (0, y, 0.055), colour="dark", solid=False))
+        tracks += lugs(y, 0.02, 0.28, 0.12, 0.136)
+        for x in (0.28, -0.28):
+            tracks.append(cylinder(0.025, 0.152, (x, y, 0.02), ACROSS, colour="dark", solid=False))
     body = (
         box((0.64, 0.42, 0.24), (0, 0, 0.12), colour="white"),
         cylinder(0.12, 0.42, (0.32, 0, 0.12), ACROSS, colour="white"),
         cylinder(0.12, 0.42, (-0.32, 0, 0.12), ACROSS, colour="white"),
         box((0.60, 0.43, 0.03), (0, 0, 0.155), colour="red", solid=False),
         box((0.02, 0.30, 0.05), (0.435, 0, 0.12), colour="glass", solid=False),
-        cylinder(0.035, 0.03, (-0.36, 0.15, 0.255), colour="red", solid=False),
-    )
+        cylinder(0.035, 0.014, (-0.36, 0.15, 0.247), colour="yellow", solid=False),
+        cylinder(0.020, 0.03, (-0.36, 0.15, 0.262), colour="red", solid=False),
+        *beacon(-0.40, -0.15, 0.24),
+        *(cylinder(0.022, 0.012, (0.436, y, 0.165), ALONG, colour="lamp_white", solid=False) for y in (0.17, -0.17)),
+        *(box((0.010, 0.05, 0.02), (-0.437, y, 0.14), colour="lamp_red", solid=False) for y in (0.16, -0.16)),
+        box((0.012, 0.36, 0.03), (0.424, 0, 0.055), colour="rubber", solid=False),
+        box((0.012, 0.36, 0.03), (-0.424, 0, 0.055), colour="rubber", solid=False),
+        # seams, vents and bolts on the deck
+        *(box((0.004, 0.40, 0.002), (x, 0, 0.2405), colour="dark", solid=False) for x in (0.29, -0.06)),
+        *(box((0.05, 0.006, 0.002), (0.20, 0.11 + 0.016 * k, 0.2405), colour="dark", solid=False) for k in range(5)),
+        *(
+            cylinder(0.006, 0.004, (x, y, 0.241), colour="steel", solid=False)
+            for x in (0.27, -0.04) for y in (0.19, -0.19)
+        ),
+    )  # fmt: skip
     urdf.link("base_link", (*body, *tracks), mass=140.0)
     urdf.fix("base_link", "base_footprint", (0, 0, 0.12))
 
@@ -208,7 +257,8 @@ def base(urdf: Urdf) -> None:
     lidar = (
         cylinder(0.02, 0.08, (0, 0, -0.075), colour="dark"),
         cylinder(0.05, 0.07, colour="dark"),
-        cylinder(0.051, 0.025, (0, 0, 0.005), colour="glass", solid=False),
+        cylinder(0.051, 0.036, (0, 0, 0.003), colour="glass", solid=False),
+        cylinder(0.0515, 0.004, (0, 0, -0.026), colour="steel", solid=False),
     )
     urdf.link("base_lidar_link", lidar, mass=0.9)
     urdf.fix("base_lidar_link", "base_link", (0.33, 0, 0.355))
@@ -226,7 +276,11 @@ def torso(urdf: Urdf) -> None:
     column = (
         box((0.20, 0.22, 0.46), (0, 0, 0.23), colour="dark"),
         cylinder(0.11, 0.46, (0.10, 0, 0.23), colour="dark"),
-        box((0.012, 0.05, 0.34), (0.211, 0, 0.24), colour="red", solid=False),
+        box((0.012, 0.05, 0.34), (0.206, 0, 0.24), colour="red", solid=False),
+        # the shell about the column, and the bellows out of which the lift comes
+        cylinder(0.113, 0.020, (0.10, 0, 0.02), colour="grey", solid=False),
+        cylinder(0.113, 0.016, (0.10, 0, 0.452), colour="grey", solid=False),
+        *(cylinder(0.098, 0.007, (0.02, 0, 0.466 + 0.014 * k), colour="rubber", solid=False) for k in range(4)),
     )
     urdf.link("torso_fixed_link", column, mass=18.0)
     urdf.fix("torso_fixed_link", "base_link", (0, 0, 0.24))
@@ -236,7 +290,11 @@ def torso(urdf: Urdf) -> None:
         box((0.16, 0.20, 0.20), (0.02, 0, 0.05), colour="white"),
         cylinder(0.08, 0.32, (0.05, 0, 0.08), ACROSS, colour="white"),
         cylinder(0.045, 0.06, (0.02, 0, 0.18), colour="dark"),
-        box((0.012, 0.16, 0.03), (0.128, 0, 0.06), colour="red", solid=False),
+        box((0.012, 0.16, 0.03), (0.126, 0, 0.075), colour="red", solid=False),
+        box((0.010, 0.030, 0.012), (0.128, 0.0, 0.035), colour="lamp_green", solid=False),
+        *(cylinder(0.083, 0.012, (0.05, y, 0.08), ACROSS, colour="grey", solid=False) for y in (0.155, -0.155)),
+        *(cylinder(0.048, 0.008, (0.02, 0, 0.160 + 0.016 * k), colour="rubber", solid=False) for k in range(3)),
+        box((0.05, 0.12, 0.12), (-0.07, 0, 0.06), colour="dark", solid=False),
     )
     urdf.link("torso_lift_link", yoke, mass=14.0)
     # A ball-screw column: its effort carries arms and yoke (45 kg) twice over, its speed is a linear actuator's.
@@ -257,7 +315,11 @@ def head(urdf: Urdf) -> None:
     face = (
         box((0.10, 0.16, 0.09), (0.02, 0, 0.05), colour="white"),
         cylinder(0.045, 0.16, (0.07, 0, 0.05), ACROSS, colour="white"),
-        box((0.006, 0.15, 0.05), (0.114, 0, 0.05), colour="glass", solid=False),
+        box((0.006, 0.15, 0.05), (0.113, 0, 0.05), colour="glass", solid=False),
+        *(cylinder(0.017, 0.006, (0.117, y, 0.05), ALONG, colour="dark", solid=False) for y in (0.04, -0.04)),
+        *(cylinder(0.010, 0.004, (0.121, y, 0.05), ALONG, colour="lamp_white", solid=False) for y in (0.04, -0.04)),
+        *(cylinder(0.030, 0.012, (0.03, y, 0.05), ACROSS, colour="dark", solid=False) for y in (0.084, -0.084)),
+        *(cylinder(0.022, 0.014, (0.03, y, 0.05), ACROSS, colour="grey", solid=False) for y in (0.084, -0.084)),
     )
     urdf.link("head_2_link", face, mass=1.6)
     urdf.move(
@@ -268,7 +330,12 @@ def head(urdf: Urdf) -> None:
     camera = (
         box((0.025, 0.09, 0.025), (-0.0125, 0, 0), colour="grey"),
         box((0.002, 0.08, 0.018), (0.001, 0, 0), colour="glass", solid=False),
-    )
+        *(
+            cylinder(0.006, 0.003, (0.0015, y, 0), ALONG, colour="grey", solid=False)
+            for y in (-0.030, -0.008, 0.012, 0.030)
+        ),
+        box((0.02, 0.02, 0.02), (-0.0125, 0, -0.02), colour="dark", solid=False),
+    )  # fmt: skip
     urdf.link("head_front_camera_link", camera, mass=0.072)  # mass and size: Intel RealSense D435 data sheet
     urdf.fix("head_front_camera_link", "head_2_link", (0.10, 0, 0.115))
     optical = (-math.pi / 2, 0, -math.pi / 2)
@@ -280,10 +347,23 @@ def head(urdf: Urdf) -> None:
 
 
 def limb(length: float, radius: float, start: float, colour: str) -> tuple[Piece, ...]:
-    """A rounded tube hanging down from ``start`` below the joint."""
+    """A rounded tube hanging down from ``start`` below the joint, with a dark seam at either end."""
     top, bottom = (0, 0, -start), (0, 0, -start - length)
     middle = (0, 0, -start - 0.5 * length)
-    return cylinder(radius, length, middle, colour=colour), sphere(radius, top, colour), sphere(radius, bottom, colour)
+    seams = (cylinder(radius + 0.0015, 0.006, end, colour="dark", solid=False) for end in (top, bottom))
+    tube = cylinder(radius, length, middle, colour=colour)
+    return tube, sphere(radius, top, colour), sphere(radius, bottom, colour), *seams
+
+
+def hub(radius: float, length: float) -> tuple[Piece, ...]:
+    """A joint across the arm: a dark drum with a grey cap and a bolt circle on both sides."""
+    cap = cylinder(0.78 * radius, length + 0.008, (0, 0, 0), ACROSS, colour="grey", solid=False)
+    turns = [2.0 * math.pi * k / 6.0 for k in range(6)]
+    bolts = (
+        cylinder(0.004, length + 0.012, (0.6 * radius * math.cos(a), 0, 0.6 * radius * math.sin(a)), ACROSS,
+                 colour="dark", solid=False) for a in turns
+    )  # fmt: skip
+    return cylinder(radius, length, (0, 0, 0), ACROSS, colour="dark"), cap, *bolts
 
 
 def arm(urdf: Urdf, side: str, mirror: float) -> None:
@@ -294,13 +374,17 @@ def arm(urdf: Urdf, side: str, mirror: float) -> None:
     """
     name = f"arm_{side}_{{}}_link".format
 
-    urdf.link(name(1), (cylinder(0.07, 0.11, (0, mirror * 0.01, 0), ACROSS, colour="white"),), mass=3.2)
+    shoulder = (
+        cylinder(0.07, 0.11, (0, mirror * 0.01, 0), ACROSS, colour="white"),
+        cylinder(0.0715, 0.008, (0, mirror * 0.045, 0), ACROSS, colour="red", solid=False),
+        cylinder(0.0715, 0.006, (0, mirror * -0.040, 0), ACROSS, colour="dark", solid=False),
+    )
+    urdf.link(name(1), shoulder, mass=3.2)
     urdf.link(name(2), (sphere(0.066, (0, 0, 0), "dark"), *limb(0.06, 0.055, 0.04, "white")), mass=3.4)
     urdf.link(name(3), limb(0.17, 0.050, 0.13, "white"), mass=2.8)
-    elbow = cylinder(0.052, 0.115, (0, 0, 0), ACROSS, colour="dark")
-    urdf.link(name(4), (elbow, *limb(0.09, 0.046, 0.05, "white")), mass=2.6)
+    urdf.link(name(4), (*hub(0.052, 0.115), *limb(0.09, 0.046, 0.05, "white")), mass=2.6)
     urdf.link(name(5), limb(0.13, 0.042, 0.17, "white"), mass=1.8)
-    urdf.link(name(6), (cylinder(0.040, 0.085, (0, 0, 0), ACROSS, colour="dark"),), mass=1.0)
+    urdf.link(name(6), hub(0.040, 0.085), mass=1.0)
     wrist = (
         cylinder(0.036, 0.05, (0, 0, 0), ALONG, colour="grey"),
         cylinder(0.034, 0.03, (0, 0, -0.05), colour="grey"),
@@ -340,6 +424,9 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
             box((0.05, 0.15, 0.06), (0.035, 0, 0), colour="dark"),
             cylinder(0.04, 0.02, (0.008, 0, 0), ALONG, colour="dark"),
             box((0.04, 0.152, 0.012), (0.035, 0, 0.015), colour="red", solid=False),
+            cylinder(0.006, 0.152, (0.052, 0, 0.024), ACROSS, colour="steel", solid=False),
+            cylinder(0.006, 0.152, (0.052, 0, -0.024), ACROSS, colour="steel", solid=False),
+            box((0.004, 0.02, 0.008), (0.061, 0, 0.0), colour="lamp_green", solid=False),
         ),
         mass=0.75,
     )

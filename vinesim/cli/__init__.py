@@ -308,20 +308,30 @@ def render(
     ] = None,
     seed: Seed = None,
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its truth.")] = pathlib.Path("render"),
+    robot: Annotated[list[str] | None, typer.Option(help="NAME@X,Y[,YAW]: a robot there [m, rad]; may repeat.")] = None,
+    person: Annotated[
+        list[str] | None,
+        typer.Option(help="X,Y[,YAW][,POSTURE]: somebody who stands, picks, reaches, points, waves, carries or walks."),
+    ] = None,
+    crate: Annotated[
+        list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
+    ] = None,
 ) -> None:
     """Draw one picture, and say all that is true of it: ids, masks, boxes, berries, cut points.
 
     Writes rgb.png, depth.png (16 bits, mm), labels.png (id = R + 256 G + 65536 B), overlay.png, camera.json and
-    truth.json.
+    truth.json. Bunches in a crate were picked from the nearest vines.
 
     \b
     Examples:
       vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7
       vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
-    """
+      vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick --crate 1.8,0.75,0,0.4
+    """  # noqa: E501  # a command line that can be copied
     from vinesim.cli.render import run
 
-    raise typer.Exit(run(scene, camera=camera, at=at, look=look, size=size, seed=seed, out=out))
+    things = {"robots": robot or (), "people": person or (), "crates": crate or ()}
+    raise typer.Exit(run(scene, camera=camera, at=at, look=look, size=size, seed=seed, out=out, **things))
 
 
 @app.command()

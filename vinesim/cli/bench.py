@@ -46,6 +46,12 @@ def _camera() -> Iterator[Measurement]:
     return camera()
 
 
+def _eyes() -> Iterator[Measurement]:
+    from vinesim.client.bench_eyes import eyes
+
+    return eyes()
+
+
 def _sync(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     from vinesim.client.bench_sync import sync
 
@@ -88,6 +94,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "tick": _tick,
     "asleep": _asleep,
     "camera": _camera,
+    "eyes": _eyes,
     "sync": _sync,
     "link": _link,
     "traffic": _traffic,

@@ -4,19 +4,35 @@ from __future__ import annotations
 
 import pathlib
 import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from vinesim.client.stage import Stage
 
-def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: int | None, out: pathlib.Path) -> int:
+
+def run(
+    scene: str,
+    *,
+    camera: str,
+    at: str,
+    look: str,
+    size: str | None,
+    seed: int | None,
+    out: pathlib.Path,
+    robots: Sequence[str] = (),
+    people: Sequence[str] = (),
+    crates: Sequence[str] = (),
+) -> int:
     """Draw it and write ``rgb``, ``depth``, ``labels``, ``overlay`` PNGs, ``camera.json`` and ``truth.json``."""
     from vinesim.cli.join import WrongUse
     from vinesim.sensors import formats, picture, truth
     from vinesim.sensors.camera import Camera, CameraSpec
     from vinesim.sensors.dataset import sized
-    from vinesim.sensors.primitives import Primitives, still_view
+    from vinesim.sensors.primitives import Primitives
     from vinesim.sensors.raycast import enclosing
-    from vinesim.world.generate import generate
     from vinesim.world.ids import unlabel
     from vinesim.world.scene import load, reseeded
 
@@ -27,9 +43,9 @@ def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: 
         raise WrongUse(f"--at {at} lies in the ground; give a height above 0")
     spec = CameraSpec.load(camera)
     info = sized(spec, None if size is None else pixels(size))
-    plan = reseeded(load(scene), seed)
-    model = generate(plan)
-    view, primitives = still_view(model), Primitives(model)
+    plan, staged = reseeded(load(scene), seed), stage(robots, people, crates)
+    model, view = staged.set(plan)
+    primitives = Primitives(model)
     primitives.update(view)
     inside = enclosing(primitives, eye)
     if inside >= 0:
@@ -38,14 +54,15 @@ def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: 
     pose = picture.looking(eye, target)
     seen = truth.look(primitives, info, pose)
     truths = truth.of_bunches(primitives, view, seen)
-    frame = Camera(spec, info, "camera", plan.sun.direction(), taps=16, shadow_period=0.0).render(primitives, pose)
+    frame = Camera(spec, info, "camera", plan.sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
         "depth": picture.depth_millimetres(frame.depth),
         "labels": formats.ids(frame.labels),
         "overlay": formats.overlay(frame.rgb, truths),
     }
-    described = {"scene": plan.name, "seed": plan.seed, "digest": model.digest()}
+    actors = formats.actors(staged.told(len(plan.boxes)), seen.labels)
+    described = {"scene": plan.name, "seed": plan.seed, "digest": model.digest(), "actors": actors}
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name, image in images.items():
@@ -60,6 +77,49 @@ def run(scene: str, *, camera: str, at: str, look: str, size: str | None, seed: 
         f"{sum(t.berries for t in in_sight)} berries and {sum(t.cut_seen for t in in_sight)} cut points in sight"
     )
     return 0
+
+
+def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> Stage:
+    """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
+    from vinesim.cli.join import WrongUse
+    from vinesim.client.stage import CrateAt, PersonAt, RobotAt, Stage
+    from vinesim.robot import description
+    from vinesim.world import figures
+
+    placed_robots, placed_people, placed_crates = [], [], []
+    for text in robots:
+        name, mark, where = text.rpartition("@")
+        if not (mark and name):
+            raise WrongUse(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
+        description.load(name)  # says what is wrong with it
+        placed_robots.append(RobotAt(name, *_place("--robot", where, 3)))
+    for text in people:
+        parts = text.split(",")
+        posture = parts.pop() if len(parts) > 1 and parts[-1].strip().isidentifier() else "stand"
+        if posture not in figures.postures():
+            raise WrongUse(f"--person {text}: posture {posture!r} is none of {', '.join(figures.postures())}")
+        x, y, yaw = (*_place("--person", ",".join(parts), 3), 0.0)[:3]
+        placed_people.append(PersonAt(x, y, yaw, posture))
+    for text in crates:
+        crate = CrateAt(*_place("--crate", text, 4))
+        if not 0.0 <= crate.fill <= 1.0:
+            raise WrongUse(f"--crate {text}: the fill is {crate.fill:g}; give 0 (empty) to 1 (full)")
+        placed_crates.append(crate)
+    return Stage(tuple(placed_robots), tuple(placed_people), tuple(placed_crates))
+
+
+def _place(option: str, text: str, most: int) -> list[float]:
+    """``X,Y[,YAW[,...]]`` as two to ``most`` numbers."""
+    from vinesim.cli.join import WrongUse
+
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if not 2 <= len(values) <= most or not np.isfinite(values).all() or max(map(abs, values)) > 1e4:
+        fields = ",".join(("X", "Y", "YAW", "FILL")[:most])
+        raise WrongUse(f"{option} is at {text!r}; give {fields} in metres and radians, such as 1.5,0.8,3.14")
+    return values
 
 
 def point(option: str, text: str) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.mailbox import Mailbox, poller
 from vinesim.robot.description import Description
+from vinesim.sensors.sunlight import SunPath
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -41,7 +42,7 @@ class Setup:
     name: str
     model: Model
     description: Description
-    sun: tuple[float, float, float]
+    sun: SunPath
     namespace: str
     ros: bool
     keep_pictures: bool
@@ -137,7 +138,7 @@ class _Perception:
         setup, mounts = self.setup, []
         for i, place in enumerate(setup.description.cameras):
             spec = CameraSpec.load(place.type)
-            camera = Camera(spec, spec.info(place.frame), place.name, setup.sun)
+            camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, quality="fast")
             wanted = self._wanted(place.name, always=setup.keep_pictures and i == 0)
             mounts.append(Mount(camera, self._deliver_camera, wanted, setup.sensor_hz))
         for place in setup.description.lidars:

@@ -84,7 +84,7 @@ class Senses:
         context = multiprocessing.get_context("spawn")
         self._mailbox = Mailbox(40 * len(model.body_mass) + (4 << 20), context)
         self._pipe, theirs = context.Pipe()
-        sun = scene.sun.direction()
+        sun = scene.sun.direction
         clock = not namespace if clock is None else clock
         setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz, clock)
         self._process = context.Process(

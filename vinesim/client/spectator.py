@@ -90,10 +90,10 @@ class Pictures:
         info = CameraInfo(
             self.WIDTH, self.HEIGHT, focal, focal, 0.5 * (self.WIDTH - 1), 0.5 * (self.HEIGHT - 1), "viewpoint"
         )
-        sun = spectator.scene.sun.direction()
+        sun = spectator.scene.sun.direction
         self.folder, self.count = folder, 0
         self.last: CameraFrame | None = None
-        self._camera = Camera(CameraSpec.load("pinhole"), info, "viewpoint", sun, shadow_period=0.0)
+        self._camera = Camera(CameraSpec.load("pinhole"), info, "viewpoint", sun, quality="full", shadow_period=0.0)
         self._primitives = Primitives(spectator.model)
         self._moved = np.zeros(len(spectator.model.tree_first), bool)
         self._every = max(round(period / spectator.physics.dt), 1)

@@ -32,6 +32,11 @@ SKIN = wp.constant(9)
 PAINT = wp.constant(10)
 GRASS = wp.constant(11)
 LAMP = wp.constant(12)
+RUBBER = wp.constant(13)
+METAL = wp.constant(14)
+STRAW = wp.constant(15)
+REFLEX = wp.constant(16)
+GLASS = wp.constant(17)
 
 
 @wp.struct
@@ -45,6 +50,8 @@ class Looks:
     blade: wp.array3d(dtype=wp.vec4)
     noise: wp.array2d(dtype=wp.vec4)
     soil: wp.array2d(dtype=wp.vec4)
+    rows: wp.vec2
+    """Where the first row of vines stands, and their spacing [m], along y."""
     ground_sky: wp.array2d(dtype=wp.float32)
     ground_x: float
     ground_y: float
@@ -124,8 +131,13 @@ def matte(n: wp.vec3, albedo: wp.vec3, sky: float) -> Surface:
 
 
 @wp.func
-def ground_surface(looks: Looks, p: wp.vec3, pixel: float) -> Surface:
-    coarse = smooth(looks.noise, p[0] * 0.21, p[1] * 0.21)
+def ground_surface(looks: Looks, p: wp.vec3, pixel: float, slant: float) -> Surface:
+    """Soil and sod at ``p``; ``slant`` is the length that one pixel covers along the line of sight [m]."""
+    # seen at a grazing angle, spots would be drawn out into bands: far away only their mean is left
+    blur = 1.0 / (1.0 + slant * slant * 1.5)
+    mean = wp.vec4(0.5, 0.5, 0.5, 0.5)
+    coarse = (smooth(looks.noise, p[0] * 0.21, p[1] * 0.21) - mean) * blur + mean
+    fields = smooth(looks.noise, p[0] * 0.011, p[1] * 0.011 + 0.37)
     detail = 1.0 / (1.0 + pixel * pixel * 20000.0)
     tone = float(0.5)
     sod = float(0.5)
@@ -135,24 +147,45 @@ def ground_surface(looks: Looks, p: wp.vec3, pixel: float) -> Surface:
         tone = 0.5 + (t[0] - 0.5) * detail
         sod = 0.5 + (t[1] - 0.5) * detail
         n = wp.normalize(wp.vec3(t[2] * detail, t[3] * detail, 1.0))
-    green = smoothstep(0.38, 0.60, coarse[0] * 0.55 + 0.2 * coarse[2] + 0.25 * sod) * 0.85
-    earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
-    turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
-    s = matte(n, mix(earth, turf, green) * (0.8 + 0.4 * coarse[1]), 0.75)
-    s.plain = wp.vec3(0.0, 0.0, 1.0)
-    s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
-    s.gloss = 0.0
+    s = matte(n, wp.vec3(0.0, 0.0, 0.0), 0.75)
+    inside = float(0.0)
     x = (p[0] - looks.ground_x) / looks.ground_cell
     y = (p[1] - looks.ground_y) / looks.ground_cell
-    if x > 0.0 and y > 0.0 and x < float(looks.ground_sky.shape[1] - 1) and y < float(looks.ground_sky.shape[0] - 1):
+    wide = float(looks.ground_sky.shape[1] - 1)
+    high = float(looks.ground_sky.shape[0] - 1)
+    if x > 0.0 and y > 0.0 and x < wide and y < high:
         i = int(x)
         j = int(y)
         fx = x - float(i)
         fy = y - float(j)
         low = looks.ground_sky[j, i] * (1.0 - fx) + looks.ground_sky[j, i + 1] * fx
-        high = looks.ground_sky[j + 1, i] * (1.0 - fx) + looks.ground_sky[j + 1, i + 1] * fx
-        s.sky = low * (1.0 - fy) + high * fy
+        above = looks.ground_sky[j + 1, i] * (1.0 - fx) + looks.ground_sky[j + 1, i + 1] * fx
+        s.sky = low * (1.0 - fy) + above * fy
+        edge = wp.min(wp.min(x, wide - x), wp.min(y, high - y)) * looks.ground_cell
+        inside = smoothstep(0.0, 3.0, edge)
+    green = smoothstep(
+        0.38, 0.60, 0.55 * coarse[0] + 0.2 * coarse[2] + 0.25 * sod + sown(looks.rows, p[1]) * inside * blur
+    )
+    beyond = smoothstep(0.35, 0.65, fields[1])
+    green = wp.min(green * 0.85 + (0.22 + 0.45 * beyond) * (1.0 - inside), 0.92)
+    earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
+    turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
+    turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
+    s.albedo = mix(earth, turf, green) * (0.8 + 0.4 * coarse[1])
+    s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
+    s.gloss = 0.0
     return s
+
+
+@wp.func
+def sown(rows: wp.vec2, y: float) -> float:
+    """How much greener than elsewhere the ground is across rows (first row [m], spacing [m]): bare under the vines and
+    in the tracks of wheels, green between.
+    """
+    lane = (y - rows[0]) / rows[1]
+    away = wp.abs(lane - wp.floor(lane + 0.5)) * rows[1]
+    track = wp.abs(away - 0.5 * rows[1] + 0.7)
+    return 0.16 - 0.26 * smoothstep(0.65, 0.25, away) - 0.14 * smoothstep(0.22, 0.08, track)
 
 
 @wp.func
@@ -174,7 +207,7 @@ def berry_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
     red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
     s.wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
     s.through = wp.vec3(0.95, 0.76, 0.12) * pale + wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
-    bloom = 0.30 - 0.20 * pale - 0.10 * red
+    bloom = 0.46 - 0.32 * pale - 0.10 * red
     s.gloss = 0.045
     bm = bloom * 0.6
     if pixel < a4[3] * 0.35:
@@ -190,7 +223,7 @@ def berry_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
         scar = smoothstep(0.986, 0.994, along)
         s.albedo = mix(s.albedo, wp.vec3(0.07, 0.045, 0.025), scar)
         s.albedo = mix(s.albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
-    s.albedo = mix(s.albedo, wp.vec3(0.42, 0.46, 0.56), wp.clamp(bm, 0.0, 0.8))
+    s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60), wp.clamp(bm, 0.0, 0.8))
     s.polish = 260.0 - 300.0 * wp.min(bm, 0.75)
     s.mirror = 1.0 - wp.min(bm * 1.6, 0.85)
     return s
@@ -237,7 +270,7 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
             t = low * (1.0 - fy) + high * fy
             clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
             vein = t[0] * clear
-            relief = 0.8 * clear
+            relief = 0.85 * clear
             s.normal = wp.normalize(side * (slope_u - t[1] * relief) + rib * (slope_v - t[2] * relief) + up)
             s.albedo = s.albedo * (0.72 + 0.5 * t[3])
         if age > 0.02:
@@ -257,18 +290,48 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
             s.albedo = mix(s.albedo, wp.vec3(0.40, 0.34, 0.05), wp.clamp(yellow, 0.0, 1.0))
             brown = smoothstep(0.03, 0.0, edge - 0.05 * spot[2] * age) * smoothstep(0.35, 0.6, age)
             s.albedo = mix(s.albedo, wp.vec3(0.16, 0.085, 0.03), brown)
-        s.through = wp.cw_mul(s.albedo, wp.vec3(2.3, 2.0, 0.75)) * (1.0 - 0.45 * vein)
+        s.through = wp.cw_mul(s.albedo, wp.vec3(2.3, 2.0, 0.75)) * (1.0 - 0.7 * vein)
         if wp.dot(plain, d) > 0.0:  # from below: paler, felted, veins stand out
             s.albedo = mix(s.albedo * 1.05, wp.vec3(0.22, 0.27, 0.16), 0.42)
             s.albedo = mix(s.albedo, wp.vec3(0.34, 0.38, 0.20), vein * 0.7)
             s.gloss = 0.012
             s.polish = 6.0
         else:
-            s.albedo = mix(s.albedo, wp.vec3(0.30, 0.38, 0.12), vein * 0.55)
+            s.albedo = mix(s.albedo, wp.vec3(0.20, 0.28, 0.08), vein * 0.40)
             s.gloss = 0.05
             s.polish = 22.0
             s.mirror = 0.55
     return s
+
+
+@wp.func
+def unpacked(code: float) -> wp.vec3:
+    """A unit vector from one float: octahedral, two times eleven bits, plus one."""
+    k = int(code) - 1
+    x = float(k % 2047) * (2.0 / 2046.0) - 1.0
+    y = float(k / 2047) * (2.0 / 2046.0) - 1.0
+    z = 1.0 - wp.abs(x) - wp.abs(y)
+    fold = wp.max(-z, 0.0)
+    return wp.normalize(wp.vec3(x - wp.where(x >= 0.0, fold, -fold), y - wp.where(y >= 0.0, fold, -fold), z))
+
+
+@wp.func
+def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
+    """Normal at ``p`` of the smooth surface that a triangle stands for, mixed from those of its corners."""
+    a4 = g.a[i]
+    b4 = g.b[i]
+    c4 = g.c[i]
+    ab = xyz(b4) - xyz(a4)
+    ac = xyz(c4) - xyz(a4)
+    ap = p - xyz(a4)
+    n = wp.cross(ab, ac)
+    if a4[3] > 0.0:
+        whole = wp.dot(n, n)
+        v = wp.clamp(wp.dot(wp.cross(ap, ac), n) / whole, 0.0, 1.0)
+        w = wp.clamp(wp.dot(wp.cross(ab, ap), n) / whole, 0.0, 1.0)
+        mixed = unpacked(a4[3]) * (1.0 - v - w) + unpacked(b4[3]) * v + unpacked(c4[3]) * w
+        n = wp.quat_rotate(as_quat(g.d[i]), mixed)
+    return wp.normalize(n)
 
 
 @wp.func
@@ -304,7 +367,8 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
     elif kind == SPHEROID:
         n = wp.normalize(p - a)
     elif kind == TRIANGLE:
-        n = wp.normalize(wp.cross(xyz(b4) - a, xyz(c4) - a))
+        n = smooth_normal(g, i, p)
+        grain = wp.quat_rotate_inv(as_quat(g.d[i]), p)
     else:
         q = as_quat(b4)
         grain = wp.quat_rotate_inv(q, p - a)
@@ -336,9 +400,9 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
         )
         fine = texel_of(looks.noise, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed)
         height = wide[2] * 0.6 + fine[1] * 0.4
-        s.albedo = mix(wp.vec3(0.075, 0.054, 0.038), wp.vec3(0.27, 0.20, 0.14), smoothstep(0.28, 0.75, height))
+        s.albedo = mix(wp.vec3(0.085, 0.063, 0.045), wp.vec3(0.23, 0.175, 0.125), smoothstep(0.25, 0.80, height))
         s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, height)
-        s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.6)
+        s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.0)
         s.gloss = 0.01
     elif material == POST:
         wide = smooth(looks.noise, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
@@ -373,6 +437,29 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
         s.mirror = 0.4
     elif material == LAMP:
         s.glow = 3.0
+    elif material == RUBBER:
+        s.gloss = 0.03
+        s.polish = 8.0
+    elif material == METAL:
+        s.albedo = tint * 0.55
+        s.gloss = 0.45
+        s.polish = 40.0
+        s.mirror = 0.7
+    elif material == STRAW:
+        if near:
+            t = texel_of(looks.noise, grain[0] * 9.0 + grain[2] * 5.0, grain[1] * 9.0 - grain[2] * 5.0)
+            s.albedo = tint * (0.70 + 0.5 * t[3])
+            s.normal = wp.normalize(n + wp.vec3(t[3] - 0.5, t[2] - 0.5, 0.0) * 0.5)
+        s.through = tint * 0.25
+        s.gloss = 0.02
+    elif material == REFLEX:
+        s.gloss = 0.12
+        s.polish = 20.0
+        s.mirror = 0.5
+    elif material == GLASS:
+        s.gloss = 0.05
+        s.polish = 250.0
+        s.mirror = 1.0
     elif material == STEM:
         s.through = tint * 0.3
     if material != WIRE:

@@ -86,6 +86,74 @@ def stand(
             parts_out[leg + 2, k] = tracked[foot, k]
 
 
+@wp.func
+def turned(poses: wp.array2d(dtype=wp.float64), i: int, v: wp.vec3d):
+    """A vector of a pose's frame, in the world."""
+    return wp.quat_rotate(heading(poses, i), v)
+
+
+@wp.kernel
+def hang(
+    # model
+    upper: wp.float64,
+    lower: wp.float64,
+    shoulder: wp.vec3d,
+    wrist: wp.vec3d,
+    pole: wp.vec3d,
+    neck: wp.float64,
+    nape: wp.vec3d,
+    root: wp.array2d(dtype=wp.float64),
+    length: wp.array2d(dtype=wp.float64),
+    bent: wp.array2d(dtype=wp.float64),
+    # in
+    held: wp.array2d(dtype=wp.float64),
+    closed: wp.array(dtype=wp.float64),
+    # out
+    limbs_out: wp.array2d(dtype=wp.float64),
+):
+    """Pose the neck (thread 0), the left or right arm (1, 2), or one finger (3 to 12) between chest, head and hands.
+
+    ``held``: chest, head, left and right hand. Left things are given; right ones mirror them. A shoulder gives way when
+    the hand is out of the arm's reach, by a fifth of the upper arm at most.
+    """
+    thread = wp.tid()
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    x = wp.vec3d(one, zero, zero)
+    z = wp.vec3d(zero, zero, one)
+    if thread == 0:
+        foot = spot(held, 0) + turned(held, 0, wp.vec3d(zero, zero, neck))
+        up = wp.normalize(spot(held, 1) + turned(held, 1, nape) - foot)
+        write(foot, framed(up, across(turned(held, 0, x), up)), 0, limbs_out)
+    elif thread < 3:
+        hand = thread + 1
+        mirror = wp.vec3d(one, wp.float64(3 - 2 * thread), one)
+        joint = spot(held, 0) + turned(held, 0, wp.cw_mul(shoulder, mirror))
+        target = spot(held, hand) + turned(held, hand, wp.cw_mul(wrist, mirror))
+        reach = wp.length(target - joint)
+        way = wp.normalize(target - joint)
+        most = upper + lower - wp.float64(1.0e-6)
+        joint = joint + wp.clamp(reach - most, zero, wp.float64(0.2) * upper) * way
+        reach = wp.clamp(wp.length(target - joint), wp.abs(upper - lower) + wp.float64(1.0e-3), most)
+        along = (upper * upper - lower * lower + reach * reach) / (wp.float64(2.0) * reach)
+        out = across(turned(held, 0, wp.cw_mul(pole, mirror)), way)
+        elbow = joint + along * way + wp.sqrt(wp.max(upper * upper - along * along, zero)) * out
+        arm = wp.normalize(elbow - joint)
+        fore = wp.normalize(joint + reach * way - elbow)
+        write(joint, framed(arm, across(-out, arm)), 2 * thread - 1, limbs_out)
+        back = turned(held, hand, z) + wp.float64(1.0e-3) * turned(held, hand, x)
+        write(elbow, framed(fore, across(back, fore)), 2 * thread, limbs_out)
+    else:
+        finger = thread - 3
+        hand = 2 + finger / 5
+        at = spot(held, hand) + turned(held, hand, spot(root, finger))
+        q = heading(held, hand) * heading(root, finger)
+        for k in range(3):
+            q = q * wp.quat_from_axis_angle(wp.vec3d(zero, one, zero), bent[finger, k] * closed[finger])
+            write(at, wp.normalize(q), 5 + 3 * finger + k, limbs_out)
+            at = at + wp.quat_rotate(q, length[finger, k] * x)
+
+
 @wp.kernel
 def differ(
     # in

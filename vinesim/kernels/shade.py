@@ -15,15 +15,21 @@ from vinesim.kernels.materials import (
     ground_surface,
     leaf_surface,
     mix,
+    smooth,
     smoothstep,
     solid_surface,
-    texel_of,
 )
 from vinesim.kernels.shadows import ShadowMap, lit_share
 from vinesim.kernels.shapes import LEAF, SPHEROID, Shapes
 from vinesim.kernels.visibility import Pinhole, ray_of
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+WHITE = wp.constant(3.0)
+"""Light, after exposure, that the tone curve shows as nearly white."""
+DARKEST = wp.constant(0.02)
+BRIGHTEST = wp.constant(2.0)
+"""What is darker or brighter counts as this when light is metered."""
 
 
 @wp.struct
@@ -35,7 +41,6 @@ class Light:
     sky_colour: wp.vec3
     bounce: wp.vec3
     haze: wp.vec3
-    exposure: float
     taps: int
     """Shadow samples a pixel."""
     spiral: wp.array(dtype=wp.vec2)
@@ -43,7 +48,6 @@ class Light:
     turns: wp.array(dtype=wp.vec2)
     """[64] cosine and sine of 64 angles."""
     table: wp.array2d(dtype=wp.vec3)
-    tone: wp.array(dtype=wp.uint8)
 
 
 @wp.func
@@ -80,15 +84,15 @@ def sky_light(light: Light, d: wp.vec3) -> wp.vec3:
 def ambient(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
     """Cool sky through the gaps, green light through leaves, warm bounce from the ground."""
     up = 0.5 + 0.5 * n[2]
-    above = light.sky_colour * (sky * sky) + wp.vec3(0.16, 0.24, 0.045) * (1.0 - sky)
+    above = light.sky_colour * (sky * sky) + wp.vec3(0.14, 0.19, 0.075) * (1.0 - sky)
     return above * (0.25 + 0.75 * up) + light.bounce * ((1.0 - up) * (0.35 + 0.65 * sky))
 
 
 @wp.func
 def mirrored(looks: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
     """What a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
-    t = texel_of(looks.noise, r[0] * 0.35 + r[2] * 0.2, r[1] * 0.35 - r[2] * 0.15)
-    hole = smoothstep(0.62 - 0.35 * sky, 0.72 - 0.35 * sky, t[1])
+    t = smooth(looks.noise, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
+    hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, t[1])
     above = mix(wp.vec3(0.05, 0.08, 0.02), wp.vec3(0.75, 0.95, 1.25), hole)
     return mix(light.bounce * 0.8, above, smoothstep(-0.25, 0.25, r[2]))
 
@@ -109,7 +113,7 @@ def shine(
     """Light that leaves a surface at ``p`` against the unit ray ``d``."""
     n = s.normal
     plain = s.plain
-    if kind >= 0 and wp.dot(plain, d) > 0.0:
+    if kind == LEAF and wp.dot(plain, d) > 0.0:
         n = -n
         plain = -plain
     ndl = wp.dot(n, light.sun)
@@ -162,7 +166,7 @@ def shine(
             else:
                 colour += mirrored(looks, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)
     colour += s.albedo * s.glow
-    return mix(colour, light.haze, 1.0 - wp.exp(-t * 0.003))
+    return mix(colour, light.haze, 0.6 * (1.0 - wp.exp(-t * 0.006)))
 
 
 @wp.kernel
@@ -177,46 +181,152 @@ def shade(
     lens: Pinhole,
     primitive: wp.array(dtype=wp.int32),
     keys: wp.array(dtype=wp.int64),
+    block: int,
+    run: int,
+    # out
+    radiance_out: wp.array(dtype=wp.vec3),
+):
+    """One thread lights ``run`` neighbouring blocks of pixels; in a block, each primitive is lit once, at its middle."""
+    across = (lens.width + block - 1) // block
+    first = wp.tid() * run
+    corners = block * block
+    back = wp.transpose(lens.turn)
+    for n in range(first, first + run):
+        left = (n % across) * block
+        top = (n // across) * block
+        for c in range(corners):
+            i = wp.int32(-3)
+            x = left + c % block
+            y = top + c // block
+            if x < lens.width and y < lens.height:
+                i = primitive[y * lens.width + x]
+                for k in range(c):  # whoever comes first speaks for all that see the same
+                    if primitive[(top + k // block) * lens.width + left + k % block] == i:
+                        i = -3
+            if i != -3:
+                ray = wp.vec3(0.0, 0.0, 0.0)
+                reach = wp.vec3(0.0, 0.0, 0.0)
+                depth = float(0.0)
+                share = float(0.0)
+                for k in range(c, corners):
+                    x = left + k % block
+                    y = top + k // block
+                    if x < lens.width and y < lens.height:
+                        pixel = y * lens.width + x
+                        if primitive[pixel] == i:
+                            r = back * ray_of(lens, x, y)
+                            z = float(keys[pixel] >> wp.int64(32)) * 1.0e-6
+                            if i == -2:
+                                z = -lens.eye[2] / r[2]
+                            if i == -1:
+                                z = 1.0
+                            ray += r
+                            reach += r * z
+                            depth += z
+                            share += 1.0
+                per = 1.0 / share
+                z = depth * per
+                scale = wp.length(ray) * per
+                d = ray * (per / scale)
+                colour = wp.vec3(0.0, 0.0, 0.0)
+                if i == -1:
+                    colour = sky_light(light, d)
+                else:
+                    p = lens.eye + reach * per
+                    footprint = z * float(block) / lens.fx
+                    # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
+                    f = 0.06711056 * float(left) + 0.00583715 * float(top)
+                    f = 52.9829189 * (f - wp.floor(f))
+                    turn = light.turns[int((f - wp.floor(f)) * 64.0) & 63]
+                    kind = wp.int32(-1)
+                    s = Surface()
+                    if i >= 0:
+                        kind = shapes.kind[i]
+                        if kind == LEAF:
+                            s = leaf_surface(shapes, looks, i, p, d, footprint)
+                        elif kind == SPHEROID and looks.material[i] == BERRY:
+                            s = berry_surface(shapes, looks, i, p, footprint)
+                        else:
+                            s = solid_surface(shapes, looks, i, p, footprint)
+                    else:
+                        s = ground_surface(looks, p, footprint, footprint * z * scale / lens.eye[2])
+                    colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
+                for k in range(c, corners):
+                    x = left + k % block
+                    y = top + k // block
+                    if x < lens.width and y < lens.height:
+                        if primitive[y * lens.width + x] == i:
+                            radiance_out[y * lens.width + x] = colour
+
+
+@wp.kernel
+def meter(
+    # in
+    radiance: wp.array(dtype=wp.vec3),
+    width: int,
+    height: int,
+    step: int,
+    # out
+    sum_out: wp.array(dtype=wp.int64),
+):
+    """One thread adds log2 luminance of one pixel in ``step`` squared to a sum of millionths, the same in any order."""
+    i = wp.tid()
+    across = width // step
+    x = (i % across) * step + step / 2
+    y = (i // across) * step + step / 2
+    if y < height:
+        c = radiance[y * width + x]
+        light = wp.clamp(0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2], DARKEST, BRIGHTEST)
+        wp.atomic_add(sum_out, 0, wp.int64(int(wp.log2(light) * 65536.0)))
+        wp.atomic_add(sum_out, 1, wp.int64(1))
+
+
+@wp.kernel
+def expose(
+    # in
+    usual: float,
+    key: float,
+    share: float,
+    least: float,
+    most: float,
+    keep: float,
+    # out
+    sum_out: wp.array(dtype=wp.int64),
+    exposure_out: wp.array(dtype=wp.float32),
+):
+    """One thread goes a ``share`` of the stops from the usual exposure to the key's, and keeps some of the old one."""
+    mean = float(sum_out[0]) / (65536.0 * float(wp.max(sum_out[1], wp.int64(1))))
+    wanted = wp.clamp(usual * wp.pow(key * wp.pow(2.0, -mean) / usual, share), least, most)
+    old = exposure_out[0]
+    exposure_out[0] = wp.where(old > 0.0, wanted * wp.pow(wp.max(old, 1.0e-6) / wanted, keep), wanted)
+    sum_out[0] = wp.int64(0)
+    sum_out[1] = wp.int64(0)
+
+
+@wp.kernel
+def develop(
+    # in
+    radiance: wp.array(dtype=wp.vec3),
+    width: int,
+    samples: int,
+    balance: wp.vec3,
+    exposure: wp.array(dtype=wp.float32),
+    tone: wp.array(dtype=wp.uint8),
     run: int,
     # out
     rgb_out: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread colours ``run`` neighbouring pixels from the primitives they see."""
+    """One thread turns the light of ``run`` neighbouring pixels, each of ``samples`` squared samples, into 8-bit sRGB."""
     first = wp.tid() * run
+    per = 1.0 / float(samples * samples)
+    gain = balance * exposure[0]
     for pixel in range(first, first + run):
-        x = pixel % lens.width
-        y = pixel // lens.width
-        i = primitive[pixel]
-        ray = wp.transpose(lens.turn) * ray_of(lens, x, y)
-        scale = wp.length(ray)
-        d = ray / scale
+        left = (pixel % width) * samples
+        top = (pixel // width) * samples
         colour = wp.vec3(0.0, 0.0, 0.0)
-        if i == -1:
-            colour = sky_light(light, d)
-        else:
-            z = float(keys[pixel] >> wp.int64(32)) * 1.0e-6
-            if i == -2:
-                z = -lens.eye[2] / ray[2]
-            p = lens.eye + ray * z
-            footprint = z / lens.fx
-            # interleaved gradient noise (Jimenez 2014) turns the shadow samples from pixel to pixel
-            f = 0.06711056 * float(x) + 0.00583715 * float(y)
-            f = 52.9829189 * (f - wp.floor(f))
-            turn = light.turns[int((f - wp.floor(f)) * 64.0) & 63]
-            kind = wp.int32(-1)
-            s = Surface()
-            if i >= 0:
-                kind = shapes.kind[i]
-                if kind == LEAF:
-                    s = leaf_surface(shapes, looks, i, p, d, footprint)
-                elif kind == SPHEROID and looks.material[i] == BERRY:
-                    s = berry_surface(shapes, looks, i, p, footprint)
-                else:
-                    s = solid_surface(shapes, looks, i, p, footprint)
-            else:
-                s = ground_surface(looks, p, footprint)
-            colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
+        for k in range(samples * samples):
+            c = wp.cw_mul(gain, radiance[(top + k // samples) * width * samples + left + k % samples])
+            # what is brighter than white counts as white: edges against the sky stay smooth
+            colour += wp.min(c, wp.vec3(WHITE, WHITE, WHITE))
         for k in range(3):
-            rgb_out[pixel, k] = light.tone[
-                wp.clamp(int(wp.sqrt(wp.max(colour[k], 0.0) * light.exposure) * 1024.0), 0, 4095)
-            ]
+            rgb_out[pixel, k] = tone[wp.clamp(int(wp.sqrt(wp.max(colour[k] * per, 0.0)) * 1024.0), 0, 4095)]

@@ -250,6 +250,21 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.ar
             spread = wp.clamp(SUN_RADIUS * gap / m.texel, 1.0, 6.0)
         z -= spread * m.texel * 0.3
         lit = wp.where(gap > 0.0, 0.0, 1.0)
+        if taps == 0:  # two texels wide, linear in between: smooth without noise
+            i = int(x)
+            j = int(y)
+            a = x - float(i)
+            b = y - float(j)
+            lit = float(0.0)
+            for row in range(-1, 2):
+                at = (j + row) * m.side + i
+                line = wp.where(m.depth[at] > z, 1.0, 0.0)
+                if m.depth[at - 1] > z:
+                    line += 1.0 - a
+                if m.depth[at + 1] > z:
+                    line += a
+                lit += line * wp.where(row == 0, 1.0, wp.where(row < 0, 1.0 - b, b))
+            lit = lit * 0.25 * (float(taps) + 1.0)
         for k in range(taps):
             v = spiral[k] * spread
             if (

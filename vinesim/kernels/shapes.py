@@ -11,7 +11,7 @@ LEAF       petiole end, size       midrib, outline number  upper normal, seed   
 BOX        centre, half x          quaternion              half y, half z, seed, -      -
 ELLIPSOID  centre, half x          quaternion              half y, half z, seed, -      -
 CYLINDER   centre of one end, r    centre of the other, -  distance along, seed, -, -   -
-TRIANGLE   corner, -               corner, -               corner, -                    -
+TRIANGLE   corner, normal          corner, normal          corner, normal               carrier's quaternion
 ========== ======================= ======================= ============================ =====================
 
 A primitive that encloses the ray's origin is not hit, and triangles are seen from outside only (counter-clockwise):
@@ -421,6 +421,7 @@ def pose_clusters(
             hi = wp.max(wp.max(a, b), c)
             b4 = with_w(b, b4[3])
             c4 = with_w(c, c4[3])
+            d4 = wp.vec4(q[0], q[1], q[2], q[3])
         else:
             turn = q * as_quat(b4)
             r = wp.length(wp.vec3(a4[3], c4[0], c4[1]))

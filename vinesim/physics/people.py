@@ -23,6 +23,8 @@ from vinesim import frames
 from vinesim.kernels import people as kernels
 from vinesim.kernels.launch import bind
 from vinesim.physics.yard import ALL, GROUND, GUEST, ROUGH
+from vinesim.world import figures
+from vinesim.world.figures import PHALANGES
 from vinesim.world.values import POINTS, HandSample, HumanPose, HumanSpec, Shape
 
 SIDES = ("left", "right")
@@ -63,6 +65,11 @@ PARTS = (
     "head", "chest", "hips", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot",
 )  # fmt: skip
 """What of a person is kinematic, in the order of :func:`posture`."""
+LIMBS = (
+    "neck", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm",
+    *(f"{side}_{finger}_{k + 1}" for side in SIDES for finger in figures.FINGERS for k in range(PHALANGES)),
+)  # fmt: skip
+"""What is only seen: it hangs between head, chest and hands, and touches nothing."""
 # shares of a person's height (Winter 2009, after Drillis and Contini)
 THIGH, SHANK, ANKLE, HIP, TRUNK = 0.245, 0.246, 0.039, 0.095, 0.288
 _BACK, _DOWN = 0.09, 0.02
@@ -83,7 +90,7 @@ class HumanError(ValueError):
     """A person that cannot join or move as asked."""
 
 
-# ---------------------------------------------------------------------- what a body looks like and where it is
+# ---------------------------------------------------------------------- what of a body touches, and where it is
 
 
 def standing(root: np.ndarray, height: float = 1.75) -> HumanPose:
@@ -159,12 +166,30 @@ class _Motion:
         self._differ = bind(
             kernels.differ, [shared(self._start), shared(self._goal)], [shared(rows) for rows in self._apart]
         )
+        looks = figures.person(height)
+        self._held, self._closed = np.zeros((4, 7)), np.zeros(2 * len(figures.FINGERS))
+        self._limbs, limbs = np.zeros((len(LIMBS), 7)), looks.limbs
+        bones = [np.ascontiguousarray(table) for table in (looks.root, looks.length, looks.bent)]
+        self._hang = bind(
+            kernels.hang,
+            [
+                limbs.upper_arm, limbs.forearm, *map(wp.vec3d, (limbs.shoulder, limbs.wrist, limbs.elbow)), limbs.neck,
+                wp.vec3d(limbs.nape), *map(shared, bones), shared(self._held), shared(self._closed),
+            ],
+            [shared(self._limbs)],
+        )  # fmt: skip
 
     def posture(self, pose: HumanPose) -> np.ndarray:
         """Poses [part, 7] of :data:`PARTS`."""
         self._tracked[:] = pose.head, pose.hips, pose.left_foot, pose.right_foot
         self._stand(3)
         return self._parts.copy()
+
+    def limbs(self, chest: np.ndarray, head: np.ndarray, hands: np.ndarray, closed: tuple[float, ...]) -> np.ndarray:
+        """Poses [limb, 7] of :data:`LIMBS`, for hands [2, 7] and how far their fingers are bent [2 * finger]."""
+        self._held[0], self._held[1], self._held[2:], self._closed[:] = chest, head, hands, closed
+        self._hang(3 + len(self._closed))
+        return self._limbs.copy()
 
     def apart(self, start: tuple[np.ndarray, ...], goal: tuple[np.ndarray, ...]) -> np.ndarray:
         """From poses to poses [k, 7]: way [m], turn [rad] in world axes, turn in the first pose's axes; [3, k, 3].
@@ -252,11 +277,17 @@ class Person:
                 f"human {self.spec.name!r}: {POINTS[worst]} is {points[worst]}; give seven finite numbers, position "
                 "and unit quaternion (x, y, z, w)"
             )
+        self._fingers = (*pose.left_fingers, *pose.right_fingers)
         self._now = np.concatenate([self._motion.posture(pose), [pose.left, pose.right]])
         """Poses of :data:`PARTS`, then of both controllers."""
         for hand in self.hands:
             hand.closed = bool(getattr(pose, f"{hand.side}_closed")) and not self.copy
             hand.busy = bool(getattr(pose, f"{hand.side}_busy")) and self.copy
+
+    def limbs(self, hands: np.ndarray) -> np.ndarray:
+        """Poses [limb, 7] of :data:`LIMBS`, with the hands [2, 7] where they are."""
+        chest, head = self.parts[PARTS.index("chest")], self.parts[PARTS.index("head")]
+        return self._motion.limbs(chest, head, hands, self._fingers)
 
     def speed(self, hand: Hand, dt: float) -> np.ndarray:
         """Velocity [3] of a controller in this tick, m/s."""

@@ -21,9 +21,10 @@ from vinesim import frames
 from vinesim.physics import geoms, loose, renewal, wrenches, yard
 from vinesim.physics.loose import Loose
 from vinesim.physics.metric import Metric
-from vinesim.physics.people import HAND, PARTS, Hand, HumanError, Person, figure, hand_shapes, rouse
+from vinesim.physics.people import HAND, LIMBS, PARTS, Hand, HumanError, Person, rouse
 from vinesim.physics.robots import GIVE, Felt, RobotBody, unfit
 from vinesim.physics.urdf import RobotError
+from vinesim.world import figures
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.values import HandSample, HumanPose, HumanSpec, Link, RobotSpec
@@ -401,6 +402,17 @@ class Rigid:
         mujoco.mj_jacBody(self.world, self.data, None, jacobian, body)
         return jacobian @ self.data.qvel @ self.data.xmat[body].reshape(3, 3)
 
+    def overlaps(self) -> list[tuple[str, str, float]]:
+        """Who stood in whom when the tick began, as :meth:`prep` found it: actors or things, and how deep [m]."""
+        m, d = self.world, self.data
+        found = []
+        for contact in d.contact:
+            bodies = [m.geom_bodyid[geom] for geom in contact.geom]
+            pairs = zip(bodies, contact.geom, strict=True)
+            names = [self.owners[body][0] if body in self.owners else m.geom(geom).name for body, geom in pairs]
+            found.append((names[0], names[1], -float(contact.dist)))
+        return found
+
     def refresh(self) -> None:
         """Bring MuJoCo's poses to the state as it is now: after a step they are those of the step's start."""
         if not self._fresh:
@@ -421,6 +433,9 @@ class Rigid:
         pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
         for person in self._people.values():  # bit by bit: MuJoCo makes quaternions unit anew
             pose[self._link_row[person.part_bodies]] = person.parts
+            hands = self._link_row[[hand.body for hand in person.hands]]
+            first = hands[-1] + 1
+            pose[first : first + len(LIMBS)] = person.limbs(pose[hands])
         return pose
 
     # ------------------------------------------------------------------ the tick, in two halves
@@ -652,14 +667,15 @@ class Rigid:
         self.generation += 1
         self._links, self._link_body = self._list_links()
         self._link_row = np.zeros(self.world.nbody, int)
-        self._link_row[self._link_body] = np.arange(len(self._link_body))
+        own = self._link_body > 0
+        self._link_row[self._link_body[own]] = np.flatnonzero(own)
         self.owners = self._owners()
         self.geoms = geoms.listed(self.world, self.owners)
 
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []
         for box, size in enumerate(self.model.box_size):
-            links.append(Link(f"box/{box}", Organ.BOX, box, yard.crate(size)))
+            links.append(Link(f"box/{box}", Organ.BOX, box, figures.crate(tuple(map(float, size)), box)))
             bodies.append(self.world.body(f"box/{box}").id)
         for name, robot in self._robots.items():
             for link, shapes in robot.shapes.items():
@@ -667,11 +683,11 @@ class Rigid:
                     links.append(Link(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                     bodies.append(robot.bodies[link])
         for name, person in self._people.items():
-            shapes = dict(zip(PARTS, ((shape,) for shape in figure(person.spec.height)), strict=True))
-            shapes |= {hand.link: hand_shapes(hand.side) for hand in person.hands}
-            for link, drawn in shapes.items():
-                links.append(Link(f"{name}/{link}", Organ.HUMAN, person.spec.index, drawn))
-                bodies.append(person.bodies[link])
+            drawn = figures.person(person.spec.height).parts
+            mine = [(part, person.bodies[part]) for part in (*PARTS, *(hand.link for hand in person.hands))]
+            for part, body in (*mine, *((limb, 0) for limb in LIMBS)):  # limbs have no body: link_q() places them
+                links.append(Link(f"{name}/{part}", Organ.HUMAN, person.spec.index, drawn[part]))
+                bodies.append(body)
         for bunch, body in self._bunches.items():
             links.append(Link(f"bunch/{bunch}", Organ.BUNCH, bunch, body.shapes))
             bodies.append(self._body_of(f"bunch/{bunch}", "bunch"))

@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 
 from vinesim import frames
+from vinesim.world.figures import SURFACES
 from vinesim.world.values import RobotSpec, Shape
 
 
@@ -72,6 +73,10 @@ def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
     return shapes
 
 
+_SURFACES = {name: name for name in SURFACES} | {"steel": "metal", "aluminium": "metal", "lens": "glass"}
+"""What a material of a URDF is made of, by a word of its name: ``rubber``, ``dark_rubber``, ``lamp_green``."""
+
+
 def _numbers(element: ElementTree.Element | None, key: str, default: str) -> np.ndarray:
     return np.array(((element.get(key) if element is not None else None) or default).split(), float)
 
@@ -86,6 +91,8 @@ def _shape(element: ElementTree.Element, paints: dict) -> Shape | None:
     if material is not None and material.find("color") is None:
         material = paints.get(material.get("name"), material)
     rgba = tuple(_numbers(None if material is None else material.find("color"), "rgba", "0.6 0.6 0.6 1"))
+    words = ("" if material is None else material.get("name") or "").lower().split("_")
+    surface = next((_SURFACES[word] for word in words if word in _SURFACES), "")
     geometry = element.find("geometry")
     form = None if geometry is None else next(iter(geometry), None)
     if form is None:
@@ -101,4 +108,4 @@ def _shape(element: ElementTree.Element, paints: dict) -> Shape | None:
         size, file = tuple(_numbers(form, "scale", "1 1 1")), form.get("filename", "").removeprefix("file://")
     else:
         return None
-    return Shape(form.tag, size, frames.pose(_numbers(origin, "xyz", "0 0 0"), turn), rgba, file)
+    return Shape(form.tag, size, frames.pose(_numbers(origin, "xyz", "0 0 0"), turn), rgba, file, surface)

@@ -17,8 +17,9 @@ from vinesim import frames
 from vinesim.kernels import shade, shapes, visibility
 from vinesim.sensors import specs
 from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
+from vinesim.sensors.exposure import Exposure
 from vinesim.sensors.primitives import Primitives
-from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight
+from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight, SunPath
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import CameraFrame, CameraInfo
 from vinesim.world.vine import Number
@@ -91,6 +92,19 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> visibility.Pinhole:
     high = max(info.cy, info.height - info.cy) / info.fy
     lens.close = float(visibility.CLOSE) * float(np.sqrt(1.0 + wide * wide + high * high))
     return lens
+
+
+def finer(info: CameraInfo, samples: int) -> CameraInfo:
+    """Intrinsics of the same view with ``samples`` squared pixels for each one."""
+    return dataclasses.replace(
+        info,
+        width=info.width * samples,
+        height=info.height * samples,
+        fx=info.fx * samples,
+        fy=info.fy * samples,
+        cx=samples * (info.cx + 0.5) - 0.5,
+        cy=samples * (info.cy + 0.5) - 0.5,
+    )
 
 
 class Visibility:
@@ -168,6 +182,28 @@ class Visibility:
                 )
 
 
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """How much a picture may cost. Depth and labels are the same in all."""
+
+    taps: int
+    """Shadow samples a pixel; 0: a small smooth filter."""
+    block: int
+    """Pixels, squared, in which one primitive is lit once."""
+    samples: int
+    """Samples, squared, of one pixel's colour."""
+    fine: int
+    """Divides the texels of the shadow map nearby."""
+
+
+QUALITIES = {
+    "fast": Quality(taps=0, block=2, samples=1, fine=1),
+    "full": Quality(taps=6, block=1, samples=1, fine=1),
+    "still": Quality(taps=12, block=2, samples=2, fine=2),
+}
+"""``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
+
+
 @dataclasses.dataclass
 class Camera:
     """One RGB-D camera."""
@@ -175,17 +211,30 @@ class Camera:
     spec: CameraSpec
     info: CameraInfo
     name: str = "camera"
-    sun: tuple[float, float, float] = DEFAULT_SUN
-    taps: int = 4
-    """Shadow samples a pixel: 4 live, 16 for pictures."""
-    shadow_period: float = 0.2
-    """Moving things get new shadows this often [s]; 0 for every frame."""
+    sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
+    """Towards the sun, or where it is when."""
+    quality: str = "full"
+    """One of :data:`QUALITIES`."""
+    shadow_period: float | None = None
+    """Moving things get new shadows this often [s]; 0 for every frame; 0.2 unless given, 0 for stills."""
+    exposure: float | None = None
+    """Fixed; automatic unless given. 0.75 suits a sunny noon."""
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        self.visibility = Visibility(self.info.width, self.info.height, self.device)
-        self._sunlight = Sunlight(self.sun, taps=self.taps, period=self.shadow_period, device=self.device)
-        self._rgb = wp.empty((self.info.width * self.info.height, 3), dtype=wp.uint8, device=self.device)
+        if self.quality not in QUALITIES:
+            raise ValueError(f"camera {self.name!r} has the quality {self.quality!r}; give {', '.join(QUALITIES)}")
+        self._quality = quality = QUALITIES[self.quality]
+        width, height, samples = self.info.width, self.info.height, quality.samples
+        period = self.shadow_period
+        if period is None:
+            period = 0.0 if self.quality == "still" else 0.2
+        self.visibility = Visibility(width, height, self.device)
+        self._samples = self.visibility
+        if samples > 1:
+            self._samples = Visibility(width * samples, height * samples, self.device)
+        self._sunlight = Sunlight(self.sun, taps=quality.taps, period=period, fine=quality.fine, device=self.device)
+        self._exposure = Exposure(width, height, samples, self.exposure, self.device)
         self._landing: list[wp.array] = []
 
     @property
@@ -195,9 +244,9 @@ class Camera:
 
     def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> CameraFrame:
         """The frame seen from ``pose`` [7], the optical frame in the world."""
-        self.expose(primitives, pose, time)
+        picture = self.expose(primitives, pose, time)
         shape = (self.info.height, self.info.width)
-        rgb, depth, labels = self._fetch(self._rgb, self.visibility.depth, self.visibility.labels)
+        rgb, depth, labels = self._fetch(picture, self.visibility.depth, self.visibility.labels)
         return CameraFrame(
             time=float(time),
             name=self.name,
@@ -219,18 +268,23 @@ class Camera:
             arrays = tuple(self._landing)
         return [a.numpy().copy() for a in arrays]
 
-    def expose(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> None:
-        """Draw the frame where it is seen: on a GPU, nothing is waited for."""
+    def expose(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> wp.array:
+        """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for."""
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
         seen = self.visibility
         seen.draw(primitives, lens, self.spec.nearest.value, self.spec.farthest.value)
+        seen, quality = self._samples, self._quality
+        if quality.samples > 1:
+            lens = pinhole(finer(self.info, quality.samples), pose)
+            seen.draw(primitives, lens)
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
-        run = self.info.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        across, down = (-(-n // quality.block) for n in (seen.width, seen.height))
+        run = across if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
             shade.shade,
-            self.info.width * self.info.height // run,
+            across * down // run,
             inputs=[
                 primitives.shapes,
                 primitives.looks,
@@ -240,8 +294,11 @@ class Camera:
                 lens,
                 seen.primitive,
                 seen.keys,
+                quality.block,
                 run,
             ],
-            outputs=[self._rgb],
+            outputs=[self._exposure.radiance],
             device=self.device,
         )
+        self._exposure.halo(primitives, seen.primitive)
+        return self._exposure.develop(self._sunlight.balance, time)

@@ -26,7 +26,7 @@ from vinesim.sensors.specs import SensorError
 from vinesim.world.berries import VARIETIES
 from vinesim.world.generate import generate
 from vinesim.world.ids import Organ, label
-from vinesim.world.scene import Scene, Season
+from vinesim.world.scene import Scene, Season, sun_at
 from vinesim.world.values import CameraInfo, View
 
 IMAGES_A_VINEYARD = 5
@@ -91,15 +91,6 @@ class Plan:
         return msgspec.structs.replace(self.scene, seed=int(rng.integers(1 << 31)), season=season, fruit=fruit)
 
 
-def sun_at(hour: float, declination: float, latitude: float = float(LATITUDE)) -> tuple[float, float, float]:
-    """Unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude [rad]."""
-    turn = np.radians(15.0) * (hour - 12.0)
-    east = -np.cos(declination) * np.sin(turn)
-    north = np.cos(latitude) * np.sin(declination) - np.sin(latitude) * np.cos(declination) * np.cos(turn)
-    up = np.sin(latitude) * np.sin(declination) + np.cos(latitude) * np.cos(declination) * np.cos(turn)
-    return float(east), float(north), float(up)
-
-
 class Vineyard:
     """One vineyard of a plan, ready to be looked at."""
 
@@ -121,7 +112,7 @@ class Vineyard:
         hour, sun = _daylight(rng)
         seen = self._look(rng)
         truths = truth.of_bunches(self.primitives, self.view, seen, self.caster)
-        camera = Camera(self.spec, self.info, "camera", sun, taps=16, shadow_period=0.0)
+        camera = Camera(self.spec, self.info, "camera", sun, quality="still")
         frame = camera.render(self.primitives, seen.pose)
         bunches = formats.record(truths, self.info)
         name = f"{image:06d}"
@@ -183,7 +174,7 @@ def _daylight(rng: np.random.Generator) -> tuple[float, tuple[float, float, floa
     lowest = np.sin(np.radians(6.0)) - np.sin(LATITUDE) * np.sin(declination)
     half_day = float(np.degrees(np.arccos(lowest / (np.cos(LATITUDE) * np.cos(declination))))) / 15.0
     hour = 12.0 + half_day * float(rng.uniform(-1.0, 1.0))
-    return hour, sun_at(hour, float(declination))
+    return hour, sun_at(hour, float(declination), float(LATITUDE))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

@@ -77,6 +77,16 @@ def record(truths: Iterable[BunchTruth], info: CameraInfo) -> list[dict[str, Any
     ]
 
 
+def actors(told: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
+    """What else was set down in a picture of these ``labels`` [height, width]: with its pixels and its visible box."""
+    found = []
+    for one in told:
+        rows, columns = np.nonzero(labels == one["label"])
+        box = (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())) if len(rows) else None
+        found.append({**one, "pixels": len(rows), "box": _xywh(box)})
+    return found
+
+
 def _xywh(box: Box | None) -> list[int] | None:
     """COCO's way to write a box."""
     return None if box is None else [box[0], box[1], box[2] - box[0] + 1, box[3] - box[1] + 1]

@@ -7,6 +7,7 @@ import numpy as np
 from vinesim.kernels import materials
 from vinesim.sensors import textures
 from vinesim.sensors.batches import CONE, LEAF, Batch, batch, columns
+from vinesim.world import leaves
 from vinesim.world.ids import Organ, label
 from vinesim.world.model import Model
 
@@ -65,7 +66,55 @@ def fixed(model: Model, still: int) -> Batch | None:
     )
 
 
-def meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> Batch | None:
+def rows_of(model: Model) -> tuple[float, float]:
+    """Where the first row of vines stands, and the spacing of the rows [m], both along y."""
+    y = np.unique(np.round(model.fixed_start[model.fixed_organ == int(Organ.TRUNK), 1], 1))
+    if len(y) == 0:
+        return 0.0, 2.5
+    return float(y[0]), float(np.median(np.diff(y))) if len(y) > 1 else 2.5
+
+
+def _sown(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
+    """As :func:`vinesim.kernels.materials.sown`, which colours the ground."""
+    lane = (y - rows[0]) / rows[1]
+    away = np.abs(lane - np.round(lane)) * rows[1]
+    track = np.abs(away - 0.5 * rows[1] + 0.7)
+    return 0.16 - 0.26 * textures.smoothstep(0.65, 0.25, away) - 0.14 * textures.smoothstep(0.22, 0.08, track)
+
+
+def litter(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch | None:
+    """Fallen leaves, more of them when many leaves are old: ``age`` is the mean of :attr:`Model.leaf_age`."""
+    low, high = low - 1.0, high + 1.0
+    n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
+    if n == 0:
+        return None
+    rng = np.random.default_rng(29)
+    spot = low + (high - low) * rng.uniform(size=(n, 2))
+    turn, tilt = rng.uniform(0.0, 2.0 * np.pi, n), rng.normal(0.0, 0.15, n)
+    rib = np.stack([np.cos(turn), np.sin(turn), tilt], 1) / np.hypot(1.0, tilt)[:, None]
+    up = np.cross(rib, np.stack([np.sin(turn), -np.cos(turn), rng.normal(0.0, 0.15, n)], 1))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    dry = rng.uniform(size=(n, 1))
+    tint = (1.0 - dry) * np.array([0.30, 0.24, 0.05]) + dry * np.array([0.17, 0.10, 0.045])
+    bend = columns(
+        rng.normal(0.0, 0.25, n), rng.normal(0.0, 0.25, n), rng.uniform(-0.2, 0.4, n), rng.uniform(0.8, 1.0, n)
+    )
+    return batch(
+        LEAF,
+        columns(spot, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
+        b=columns(rib, leaves.shape_of(np.arange(n))),
+        c=columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(materials.FOLIAGE),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=still,
+        group=_cell_of(spot, 0),
+    )
+
+
+def meadow(rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, still: int) -> Batch | None:
     """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
     low, high = low - 3.0, high + 3.0
     count = int(min(density * np.prod(high - low), 60_000))
@@ -74,11 +123,12 @@ def meadow(low: np.ndarray, high: np.ndarray, density: float, still: int) -> Bat
     rng = np.random.default_rng(23)
     spot = low + (high - low) * rng.uniform(size=(count, 2))
     noise = textures.sample(spot[:, 0] * 0.21, spot[:, 1] * 0.21)
-    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125  # as the ground is coloured
-    spot = spot[green > 0.44 + 0.20 * rng.uniform(size=count)]
+    # as the ground is coloured
+    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + _sown(rows, spot[:, 1])
+    spot = spot[green > 0.40 + 0.24 * rng.uniform(size=count)]
     n = len(spot)
     herb = rng.uniform(size=n) < 0.12
-    size = np.where(herb, rng.uniform(0.03, 0.06, n), 0.05 + 0.13 * rng.uniform(size=n) ** 1.5)
+    size = np.where(herb, rng.uniform(0.03, 0.06, n), 0.06 + 0.17 * rng.uniform(size=n) ** 1.5)
     yaw = rng.uniform(0.0, 2.0 * np.pi, n)
     lean = np.where(herb, rng.uniform(0.5, 1.1, n), rng.normal(0.0, 0.2, n))
     out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)

@@ -11,14 +11,30 @@ from vinesim import frames
 from vinesim.kernels import materials
 from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, batch
 from vinesim.sensors.vines import bunch_parts
+from vinesim.world.figures import smooth
 from vinesim.world.ids import Organ, label
 from vinesim.world.model import Model
-from vinesim.world.values import Link, Shape
+from vinesim.world.values import Link, Mesh, Shape
 
 _MESH_FACES = 4000
 """Most triangles of one mesh; finer ones are simplified."""
 
-_RIGID = {Organ.BOX: int(materials.PLASTIC), Organ.HUMAN: int(materials.CLOTH)}
+_USUAL = {Organ.BOX: "plastic", Organ.HUMAN: "cloth"}
+"""What things are made of that do not say so; robots are painted."""
+_MATERIAL = {
+    "paint": int(materials.PAINT),
+    "plastic": int(materials.PLASTIC),
+    "cloth": int(materials.CLOTH),
+    "skin": int(materials.SKIN),
+    "rubber": int(materials.RUBBER),
+    "metal": int(materials.METAL),
+    "straw": int(materials.STRAW),
+    "reflex": int(materials.REFLEX),
+    "glass": int(materials.GLASS),
+    "lamp": int(materials.LAMP),
+}
+_SMOOTH_STEPS = 2047
+"""Levels of either coordinate of a packed normal."""
 
 
 def rigid(model: Model, links: tuple[Link, ...], first: int, groups: int, shape: dict[int, np.ndarray]) -> list[Batch]:
@@ -33,11 +49,11 @@ def rigid(model: Model, links: tuple[Link, ...], first: int, groups: int, shape:
             mine = bunch_parts(model, link.index, place, np.full(len(place), first + k), groups + k)
             batches += [dataclasses.replace(b, bunch=-1) for b in mine]
             continue
-        material = _RIGID.get(link.organ, int(materials.PAINT))
+        usual = _USUAL.get(link.organ, "paint")
         name = label(link.organ, link.index)
         for piece in link.shapes:
             common = {
-                "material": material,
+                "material": _MATERIAL[piece.surface or usual],
                 "tint": np.asarray(piece.rgba[:3]) ** 2.2,
                 "organ": int(link.organ),
                 "label": name,
@@ -52,30 +68,44 @@ def _rigid_shape(shape: Shape, common: dict) -> Batch:
     """One primitive, or the triangles of a mesh, in the frame of its link."""
     size, pose = shape.size, np.asarray(shape.pose, float)
     centre, turn = pose[:3], pose[3:]
-    if shape.kind in ("capsule", "cylinder"):
-        half = frames.rotate(turn, np.array([0.0, 0.0, size[1]]))
-        kind = CONE if shape.kind == "capsule" else CYLINDER
-        return batch(kind, [[*(centre - half), size[0]]], b=[[*(centre + half), size[0]]], **common)
+    if shape.kind in ("capsule", "cylinder", "cone"):
+        low, high = (size[0], size[1]) if shape.kind == "cone" else (size[0], size[0])
+        half = frames.rotate(turn, np.array([0.0, 0.0, size[-1]]))
+        kind = CYLINDER if shape.kind == "cylinder" else CONE
+        return batch(kind, [[*(centre - half), low]], b=[[*(centre + half), high]], **common)
     if shape.kind == "sphere":
         return batch(ELLIPSOID, [[*centre, size[0]]], b=[turn], c=[[size[0], size[0], 0, 0]], **common)
     if shape.kind in ("ellipsoid", "box"):
         kind = ELLIPSOID if shape.kind == "ellipsoid" else BOX
         return batch(kind, [[*centre, size[0]]], b=[turn], c=[[size[1], size[2], 0, 0]], **common)
     if shape.kind == "mesh":
-        corners = _triangles(shape.file, tuple(size) if len(size) == 3 else (size[0],) * 3)
-        corners = centre + frames.rotate(turn, corners)
-        a, b, c = (np.concatenate([corners[:, k], np.zeros((len(corners), 1))], 1) for k in range(3))
+        mesh = shape.mesh or _read(shape.file, tuple(size) if len(size) == 3 else (size[0],) * 3)
+        corners = centre + frames.rotate(turn, mesh.corners)
+        normals = packed(frames.rotate(turn, mesh.normals))
+        a, b, c = (np.concatenate([corners[:, k], normals[:, k, None]], 1) for k in range(3))
         return batch(TRIANGLE, a, b=b, c=c, **common)
     raise ValueError(
-        f"shape kind {shape.kind!r} of a link is unknown; use capsule, sphere, ellipsoid, box, cylinder or mesh"
+        f"shape kind {shape.kind!r} of a link is unknown; use capsule, cone, sphere, ellipsoid, box, cylinder or mesh"
     )
 
 
-_meshes: dict[tuple[str, tuple[float, ...]], np.ndarray] = {}
+def packed(normals: np.ndarray) -> np.ndarray:
+    """Unit vectors [..., 3] each in one float, as :func:`vinesim.kernels.materials.unpacked` reads them.
+
+    Octahedral (Meyer et al. 2010), two times eleven bits: exact to 0.001 rad.
+    """
+    flat = normals / np.maximum(np.abs(normals).sum(-1, keepdims=True), 1e-12)
+    side = np.where(flat[..., :2] >= 0.0, 1.0, -1.0)
+    folded = np.where(flat[..., 2:] < 0.0, (1.0 - np.abs(flat[..., 1::-1])) * side, flat[..., :2])
+    level = np.round((0.5 + 0.5 * folded) * (_SMOOTH_STEPS - 1))
+    return (1.0 + level[..., 0] + _SMOOTH_STEPS * level[..., 1]).astype(np.float32)
 
 
-def _triangles(file: str, scale: tuple[float, ...]) -> np.ndarray:
-    """Corners [face, 3, 3] m of a mesh file, simplified by merging near vertices until it has few enough faces."""
+_meshes: dict[tuple[str, tuple[float, ...]], Mesh] = {}
+
+
+def _read(file: str, scale: tuple[float, ...]) -> Mesh:
+    """A mesh file [m], simplified by merging near vertices until it has few enough faces."""
     key = (file, scale)
     if key not in _meshes:
         import trimesh
@@ -97,5 +127,5 @@ def _triangles(file: str, scale: tuple[float, ...]) -> np.ndarray:
             linked = member[faces]
             whole = (linked[:, 0] != linked[:, 1]) & (linked[:, 1] != linked[:, 2]) & (linked[:, 0] != linked[:, 2])
             vertices, faces, cells = merged, linked[whole], int(cells * 0.75)
-        _meshes[key] = vertices[faces].astype(np.float32)
+        _meshes[key] = Mesh(vertices[faces].astype(np.float32), smooth(vertices, faces))
     return _meshes[key]

@@ -123,24 +123,19 @@ def portrait(
     height: int = 640,
     view_angle: float = 1.2,
     sun: tuple[float, float, float] = DEFAULT_SUN,
-    samples: int = 2,
+    quality: str = "still",
     primitives: Primitives | None = None,
 ) -> np.ndarray:
     """A picture of a scene [height, width, 3]; written to ``out`` if given.
 
-    ``pose`` [7] is the optical frame (default :func:`standpoint`), ``view_angle`` the horizontal field of view [rad],
-    ``samples`` squared rays a pixel.
+    ``pose`` [7] is the optical frame (default :func:`standpoint`), ``view_angle`` the horizontal field of view [rad].
     """
     primitives = primitives or Primitives(model)
     primitives.update(view)
-    focal = 0.5 * width * samples / np.tan(0.5 * view_angle)
-    w, h = width * samples, height * samples
-    info = CameraInfo(w, h, focal, focal, 0.5 * (w - 1), 0.5 * (h - 1), "portrait")
-    camera = Camera(CameraSpec.load("pinhole"), info, "portrait", sun, taps=8, shadow_period=0.0)
-    frame = camera.render(primitives, standpoint(model) if pose is None else pose, view.time)
-    image = frame.rgb
-    if samples > 1:
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    focal = 0.5 * width / np.tan(0.5 * view_angle)
+    info = CameraInfo(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), "portrait")
+    camera = Camera(CameraSpec.load("pinhole"), info, "portrait", sun, quality=quality)
+    image = camera.render(primitives, standpoint(model) if pose is None else pose, view.time).rgb
     if out is not None:
         write_png(out, image)
     return image

@@ -15,7 +15,7 @@ from vinesim import frames
 from vinesim.kernels import materials, shadows, shapes
 from vinesim.sensors import renderers, textures
 from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
-from vinesim.sensors.grounds import fixed, meadow
+from vinesim.sensors.grounds import fixed, litter, meadow, rows_of
 from vinesim.sensors.links import rigid
 from vinesim.sensors.vines import bunch_parts, canes, foliage, pieces_of
 from vinesim.world.ids import Organ
@@ -32,8 +32,10 @@ _CLUSTER = 24
 class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.shapes`)."""
 
-    def __init__(self, model: Model, *, grass: float = 14.0, device: str = "cpu", renderer: str = "warp") -> None:
-        """``grass``: tufts per square metre around the vines, 0 for bare ground; ``renderer``: who draws these."""
+    def __init__(self, model: Model, *, grass: float = 90.0, device: str = "cpu", renderer: str = "warp") -> None:
+        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``renderer``:
+        who draws (:data:`~vinesim.sensors.renderers.RENDERERS`).
+        """
         self.model, self.device = model, device
         self.raster = renderers.raster_of(renderer, device)
         """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.Visibility` does so itself."""
@@ -49,7 +51,11 @@ class Primitives:
             own = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(pieces), 1))
             batches += bunch_parts(model, bunch, own, pieces, int(model.body_tree[body]))
         self._tree_batches = len(batches)
-        batches += [b for b in (fixed(model, bodies), meadow(low, high, grass, bodies)) if b is not None]
+        around = [fixed(model, bodies)]
+        if grass > 0.0:
+            age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
+            around += [meadow(rows_of(model), low, high, grass, bodies), litter(low, high, age, bodies)]
+        batches += [b for b in around if b is not None]
         self._plants = [b for b in batches if len(b)] or [nothing(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
@@ -166,11 +172,13 @@ class Primitives:
             array(whole["material"].astype(np.int32), wp.int32),
             array(whole["tint"], wp.vec3),
         )
+        self.lamps = np.flatnonzero(whole["material"] == int(materials.LAMP))
+        """Primitives that shine."""
         sky = np.full(total, 0.7, np.float32)
         if self.built:
             known = self._sky[: min(len(self._sky), total)]
             sky[: len(known)] = known
-            for name in ("blade", "noise", "soil", "ground_sky", "ground_x", "ground_y", "ground_cell"):
+            for name in ("blade", "noise", "soil", "rows", "ground_sky", "ground_x", "ground_y", "ground_cell"):
                 setattr(self.looks, name, getattr(self._baked, name))
         self.looks.sky = array(sky, float)
         poses = np.zeros((self._still + 1 + len(links), 7), np.float32)
@@ -230,6 +238,7 @@ class Primitives:
         x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
         ground = seen(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1)).reshape(x.shape)
         looks = self.looks
+        looks.rows = wp.vec2(*rows_of(self.model))
         looks.ground_sky = wp.array(ground, dtype=float, device=self.device)
         looks.ground_x, looks.ground_y, looks.ground_cell = float(low[0]), float(low[1]), float(step)
         looks.blade, looks.noise, looks.soil = (

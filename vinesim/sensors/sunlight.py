@@ -6,6 +6,8 @@ anew only when the camera has left its middle, or when something inside it has m
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -32,21 +34,22 @@ def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
 class _Map:
     """One square of depths seen from the sun, around a focus that moves in steps."""
 
-    def __init__(
-        self, sun: np.ndarray, texel: float, side: int, ahead: float, slack: float, rigid: bool, device: str
-    ) -> None:
-        self.sun, self.ahead, self.slack, self.rigid, self.device = sun, ahead, slack, rigid, device
+    def __init__(self, texel: float, side: int, ahead: float, slack: float, rigid: bool, device: str) -> None:
+        self.ahead, self.slack, self.rigid, self.device = ahead, slack, rigid, device
+        self._every, self._known = wp.empty(0, dtype=wp.int32, device=device), -1
+        self.struct = shadows.ShadowMap()
+        self.struct.depth = wp.empty(side * side, dtype=float, device=device)
+        self.struct.texel, self.struct.side = float(texel), side
+        self.half = 0.5 * texel * side
+
+    def aim(self, sun: np.ndarray) -> None:
+        """Turn to the sun, a unit vector towards it; nothing that was drawn holds any more."""
         self.right = np.cross(sun, [0.0, 0.0, 1.0]) if abs(sun[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
         self.right /= np.linalg.norm(self.right)
         self.up = np.cross(self.right, sun)
         self.focus = np.full(3, np.inf)
         self.time, self.version, self.built = -np.inf, -1, -1
-        self._every, self._known = wp.empty(0, dtype=wp.int32, device=device), -1
-        self.struct = shadows.ShadowMap()
-        self.struct.depth = wp.empty(side * side, dtype=float, device=device)
         self.struct.right, self.struct.up, self.struct.sun = _vector(self.right), _vector(self.up), _vector(sun)
-        self.struct.texel, self.struct.side = float(texel), side
-        self.half = 0.5 * texel * side
 
     def follow(self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float, period: float) -> None:
         """Draw the map anew if it no longer holds for this camera at ``time``."""
@@ -106,41 +109,91 @@ class _Map:
             )
 
 
+SunPath = Callable[[float], tuple[float, float, float]]
+"""Unit vector towards the sun at a simulated time [s]."""
+_STEP = np.cos(np.radians(0.25))
+"""The light is made anew when the sun has moved by a quarter of a degree: once a minute."""
+_NOON = np.array([3.3, 2.95, 2.35])
+"""Light of a sun with :data:`_HIGH` for the sine of its elevation; white is 1 for a sheet in full light."""
+_HIGH = 0.75
+_DEPTH = np.array([0.10, 0.15, 0.27])
+"""Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh's and some haze."""
+_SKY, _BOUNCE, _HAZE = np.array([0.52, 0.70, 1.0]), np.array([0.26, 0.21, 0.13]), np.array([0.50, 0.60, 0.72])
+_ADAPTED = 0.6
+"""Share of the colour of the light that a camera's white balance takes out."""
+
+
+def air_mass(height: float) -> float:
+    """Air on the way of sunlight, 1 from the zenith, by the sine of the sun's elevation (Kasten and Young 1989)."""
+    degrees = np.degrees(np.arcsin(np.clip(height, 0.0, 1.0)))
+    return float(1.0 / (max(height, 0.0) + 0.50572 * (degrees + 6.07995) ** -1.6364))
+
+
+def daylight(height: float) -> tuple[np.ndarray, float]:
+    """Colour [3] of direct sunlight, and how bright the sky is beside its usual self, by the sine of the elevation."""
+    sun = _NOON * np.exp(-_DEPTH * (air_mass(height) - air_mass(_HIGH))) * np.clip(height / 0.02 + 0.5, 0.0, 1.0)
+    return sun, 0.04 + 0.96 * float(np.clip((height + 0.1) / (_HIGH + 0.1), 0.0, 1.0) ** 0.8)
+
+
 class Sunlight:
     """Light of one camera's surroundings."""
 
     def __init__(
-        self, sun: tuple[float, float, float] = DEFAULT_SUN, *, taps: int = 4, period: float = 0.2, device: str = "cpu"
+        self,
+        sun: tuple[float, float, float] | SunPath = DEFAULT_SUN,
+        *,
+        taps: int = 4,
+        period: float = 0.2,
+        fine: int = 1,
+        device: str = "cpu",
     ) -> None:
-        """``sun`` points towards the sun; ``taps`` are shadow samples a pixel; ``period`` [s] as in :class:`Camera`."""
-        direction = np.asarray(sun, float) / np.linalg.norm(sun)
-        self.period = period
-        day = float(np.clip(direction[2] / 0.15, 0.0, 1.0))
-        dim = 0.04 + 0.96 * day
+        """``sun`` points towards the sun, or says where it is when.
+
+        ``taps`` are shadow samples a pixel, 0 for a small smooth filter; ``period`` [s] as in :class:`Camera`;
+        ``fine`` divides the texels of the shadow map nearby.
+        """
+        self._path: SunPath = sun if callable(sun) else lambda time: sun
+        self.period, self._device = period, device
+        self._stands = np.zeros(3)
+        self.balance = np.ones(3)
+        """White balance: factors [3] on linear light."""
         light = shade.Light()
-        light.sun = _vector(direction)
-        light.sun_colour = wp.vec3(3.3 * day, 2.95 * day, 2.35 * day)
-        light.sky_colour = wp.vec3(0.52 * dim, 0.70 * dim, 1.0 * dim)
-        light.bounce = wp.vec3(0.26 * dim, 0.21 * dim, 0.13 * dim)
-        light.haze = wp.vec3(0.50 * dim, 0.60 * dim, 0.72 * dim)
-        light.exposure, light.taps = 0.75, taps
-        light.table = wp.array(textures.sky(tuple(direction)) * np.float32(dim), dtype=wp.vec3, device=device)
+        light.taps = taps
         k = np.arange(max(taps, 1))
         angle, radius = 2.399963 * k, np.sqrt((k + 0.5) / len(k))
         light.spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
         turn = np.arange(64) * (2.0 * np.pi / 64)
         light.turns = _pairs(np.cos(turn), np.sin(turn), device)
-        light.tone = wp.array(textures.tone_curve(), dtype=wp.uint8, device=device)
         self.light = light
+        self._near = _Map(0.007 / fine, 1024 * fine, 2.5, 0.8, True, device)
+        self._far = _Map(0.035, 1024, 12.0, 4.0, False, device)
+
+    def _shine(self, time: float) -> None:
+        """Take the light from where the sun is now, if it has moved."""
+        direction = np.asarray(self._path(time), float)
+        direction = direction / np.linalg.norm(direction)
+        if direction @ self._stands > _STEP:
+            return
+        self._stands, light = direction, self.light
+        sun, dim = daylight(direction[2])
+        light.sun = _vector(direction)
+        light.sun_colour = _vector(sun)
+        light.sky_colour, light.bounce, light.haze = (_vector(c * dim) for c in (_SKY, _BOUNCE, _HAZE))
+        table = textures.sky(tuple(direction), tuple(sun)) * np.float32(dim)
+        light.table = wp.array(table, dtype=wp.vec3, device=self._device)
+        falls = sun * max(direction[2], 0.05) + _SKY * dim
+        usual = _NOON * _HIGH + _SKY
+        self.balance = (usual / usual.mean() / (falls / falls.mean())) ** _ADAPTED
         raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])
         raised /= np.linalg.norm(raised)
-        self._near = _Map(raised, 0.007, 1024, 2.5, 0.8, True, device)
-        self._far = _Map(raised, 0.035, 1024, 12.0, 4.0, False, device)
+        self._near.aim(raised)
+        self._far.aim(raised)
 
     def follow(
         self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
     ) -> tuple[shadows.ShadowMap, shadows.ShadowMap]:
         """The fine and the coarse shadow map for a camera at ``eye`` that looks along ``forward``."""
+        self._shine(time)
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)
         return self._near.struct, self._far.struct

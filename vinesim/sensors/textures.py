@@ -103,16 +103,16 @@ def blades() -> np.ndarray:
             turn = np.radians(angle)
             tip = length * np.array([np.sin(turn), np.cos(turn)])
             away, along = _segment(u, v, np.zeros(2), tip)
-            vein = np.maximum(vein, np.exp(-((away / (0.016 * (1.0 - 0.75 * along))) ** 2)))
-            crease += 0.02 * np.exp(-((away / 0.05) ** 2))
+            vein = np.maximum(vein, np.exp(-((away / (0.021 * (1.0 - 0.7 * along))) ** 2)))
+            crease += 0.03 * np.exp(-((away / 0.05) ** 2))
             for start in np.linspace(0.15, 0.88, 7):
                 for side in (1.0, -1.0):
                     root = (start + 0.04 * side) * tip
                     out = turn + side * np.radians(50.0)
                     reach = 0.55 * length * (1.0 - 0.7 * abs(start - 0.35))
                     away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
-                    vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.009 * (1.0 - 0.6 * along))) ** 2)))
-                    crease += 0.008 * np.exp(-((away / 0.03) ** 2))
+                    vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
+                    crease += 0.014 * np.exp(-((away / 0.03) ** 2))
         fine, wide = _blurred(rng, 3.0), _blurred(rng, 8.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
         slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / SIDE)
@@ -176,7 +176,7 @@ def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
     cover = sample(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
-    cloud = _step(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * _step(0.02, 0.2, height) * 0.55
+    cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55
     turns = azimuth / (2.0 * np.pi)
     layers = []
     for tone, base, rise, count in (
@@ -184,11 +184,11 @@ def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
         (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
     ):
         ridge = base + rise * (sample(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35)
-        layers.append((tone, _step(0.004, -0.004, height - ridge)))
+        layers.append((tone, smoothstep(0.004, -0.004, height - ridge)))
     crowns = 0.014 + 0.020 * sample(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
     leafy = sample(turns * 20.0, height * 8.0, slice(2, 3))
     trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
-    layers.append((trees, _step(0.004, -0.004, height - crowns)))
+    layers.append((trees, smoothstep(0.004, -0.004, height - crowns)))
     return cloud, tuple(layers)
 
 
@@ -199,10 +199,11 @@ def _directions() -> tuple[np.ndarray, np.ndarray]:
 
 
 @functools.lru_cache(maxsize=4)
-def sky(sun: tuple[float, float, float]) -> np.ndarray:
+def sky(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
     """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
 
-    Clear blue with thin clouds, a halo around the sun (unit vector towards it), and hills in the haze.
+    Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
+    hills in the haze.
     """
     (height, azimuth), (cloud, layers) = _directions(), _scenery()
     flat = np.sqrt(1.0 - height**2)
@@ -211,7 +212,7 @@ def sky(sun: tuple[float, float, float]) -> np.ndarray:
     colour = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
-    colour = colour + halo[..., None] * np.array([3.3, 2.95, 2.35])
+    colour = colour + halo[..., None] * np.array(colour_of_sun)
     colour = _mix(colour, np.array([1.35, 1.33, 1.30]), cloud)
     for tone, share in layers:
         colour = _mix(colour, tone, share)
@@ -228,7 +229,7 @@ def sample(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.nda
     return upper * (1.0 - ay) + lower * ay
 
 
-def _step(a: float, b: float, x: np.ndarray) -> np.ndarray:
+def smoothstep(a: float, b: float, x: np.ndarray) -> np.ndarray:
     t = np.clip((x - a) / (b - a), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

@@ -128,7 +128,7 @@ def bunch_parts(model: Model, bunch: int, place: np.ndarray, carrier: np.ndarray
     rng = np.random.default_rng(int(model.bunch_seed[bunch]))
     n = len(one.radius)
     colour = np.array(variety.colour) * (1.0 + 0.10 * rng.normal(size=(n, 1)))
-    colour = colour + np.array([0.10, 0.05, 0.01]) * (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(
+    colour = colour + np.array([0.055, 0.014, 0.010]) * (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(
         0.5 * rng.normal(size=(n, 1)), 0.0, 1.0
     )
     pieces = len(carrier)

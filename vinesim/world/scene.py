@@ -78,17 +78,36 @@ class Box(_Part, frozen=True, kw_only=True):
 
 
 class Sun(_Part, frozen=True, kw_only=True):
-    """Direction to the sun."""
+    """Where the sun stands: fixed by two angles, or on its path from an hour on."""
 
     azimuth: float = 0.9
     """[rad] from +x, counter-clockwise seen from above."""
     elevation: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.9
     """[rad] above the horizon."""
+    hour: Annotated[float, msgspec.Meta(ge=0.0, le=24.0)] | None = None
+    """Solar time at the start [h]; from there the sun moves, x is east and y north, and the angles do not count."""
+    day: Annotated[int, msgspec.Meta(ge=1, le=366)] = 258
+    """Of the year; 258 is the middle of September, the season of table grapes."""
+    latitude: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.726
+    """[rad] north; 41.6 degrees is Aprilia, Italy, where CANOPIES picks."""
 
-    def direction(self) -> tuple[float, float, float]:
-        """Unit vector from the ground to the sun, world axes."""
+    def direction(self, time: float = 0.0) -> tuple[float, float, float]:
+        """Unit vector from the ground to the sun, world axes, at a simulated time [s]."""
+        if self.hour is not None:
+            # Cooper (1969), to 0.4 degrees
+            declination = math.radians(23.45) * math.sin(2.0 * math.pi * (284 + self.day) / 365.0)
+            return sun_at(self.hour + time / 3600.0, declination, self.latitude)
         level = math.cos(self.elevation)
         return level * math.cos(self.azimuth), level * math.sin(self.azimuth), math.sin(self.elevation)
+
+
+def sun_at(hour: float, declination: float, latitude: float) -> tuple[float, float, float]:
+    """Unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude [rad]."""
+    turn = math.radians(15.0) * (hour - 12.0)
+    east = -math.cos(declination) * math.sin(turn)
+    north = math.cos(latitude) * math.sin(declination) - math.sin(latitude) * math.cos(declination) * math.cos(turn)
+    up = math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * math.cos(turn)
+    return east, north, up
 
 
 class Wind(_Part, frozen=True, kw_only=True):

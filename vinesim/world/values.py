@@ -13,12 +13,23 @@ import numpy as np
 from vinesim.world.ids import Organ
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Triangles, seen from where their corners run counter-clockwise."""
+
+    corners: np.ndarray
+    """[face, 3, 3] m"""
+    normals: np.ndarray
+    """[face, 3, 3] of the smooth surface at each corner."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Shape:
     """One visible or touchable primitive, in the frame of the link or body that carries it.
 
     ``kind`` is ``"capsule"`` (size: radius, half length along z), ``"sphere"`` (radius), ``"ellipsoid"``
-    (half axes), ``"box"`` (half edges), ``"cylinder"`` (radius, half length along z) or ``"mesh"`` (scale; ``file``).
+    (half axes), ``"box"`` (half edges), ``"cylinder"`` (radius, half length along z), ``"cone"`` with round ends
+    (radii at -z and +z, half length along z) or ``"mesh"`` (scale; ``file`` or ``mesh``).
     """
 
     kind: str
@@ -26,7 +37,11 @@ class Shape:
     pose: np.ndarray
     """[7] m, 1"""
     rgba: tuple[float, float, float, float] = (0.6, 0.6, 0.6, 1.0)
+    """sRGB"""
     file: str = ""
+    surface: str = ""
+    """What it is made of (:data:`vinesim.world.figures.SURFACES`); empty: what such things are usually made of."""
+    mesh: Mesh | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
