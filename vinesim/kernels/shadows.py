@@ -3,6 +3,7 @@
 import warp as wp
 
 from vinesim.kernels.shapes import (
+    BOX,
     CONE,
     CYLINDER,
     FAR,
@@ -11,7 +12,10 @@ from vinesim.kernels.shapes import (
     TRIANGLE,
     Clusters,
     Shapes,
-    hit,
+    as_quat,
+    hit_box,
+    hit_sphere,
+    hit_triangle,
     leaf_heights,
     xyz,
 )
@@ -208,11 +212,13 @@ def cast_shadows(
             else:
                 o = xyz(a4)
                 reach_i = r
+                half = wp.vec3(r, c4[0], c4[1])
+                ray = wp.quat_rotate_inv(as_quat(b4), -m.sun)
                 if kind == TRIANGLE:
                     o = (xyz(a4) + xyz(b4) + xyz(c4)) / 3.0
                     reach_i = wp.max(wp.max(wp.length(xyz(a4) - o), wp.length(xyz(b4) - o)), wp.length(xyz(c4) - o))
                 else:
-                    reach_i = wp.length(wp.vec3(r, c4[0], c4[1]))
+                    reach_i = wp.length(half)
                 p = o - m.corner
                 x = wp.dot(p, m.right) / m.texel
                 y = wp.dot(p, m.up) / m.texel
@@ -225,7 +231,15 @@ def cast_shadows(
                             + m.up * (float(py) * m.texel)
                             + m.sun * SUN_HEIGHT
                         )
-                        t = hit(shapes, i, from_sun, -m.sun, 0)
+                        t = FAR
+                        if kind == TRIANGLE:
+                            t = hit_triangle(xyz(a4) - from_sun, xyz(b4) - from_sun, xyz(c4) - from_sun, -m.sun)
+                        else:
+                            eye = wp.quat_rotate_inv(as_quat(b4), from_sun - xyz(a4))
+                            if kind == BOX:
+                                t = hit_box(eye, ray, half)
+                            else:
+                                t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
                         if t < FAR:
                             darken(m, px, py, t, depth_out)
 

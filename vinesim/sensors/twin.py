@@ -33,8 +33,8 @@ EMPTY, SMOOTH_SIZE, TEXELS = int(visibility.EMPTY), float(visibility.SMOOTH_SIZE
 _NOBODY = 2**31 - 1
 _NEARLY = 2**30
 """Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
-_SLICES = 32
-"""Threads of a GPU that share the rows of each primitive of a cluster."""
+_SPREAD = (24, 32)
+"""Threads of a GPU that share the primitives of a cluster, and the rows of each of them."""
 KEY, DEPTH, NUMBER = range(3)
 """What a pass draws: depth and number in one; depth alone; the number of what lies at that depth."""
 
@@ -391,7 +391,11 @@ _KINDS = {
 
 @functools.cache
 def _drawer(kind: int, phase: int):
-    """The kernel that draws clusters of one kind: one thread draws every ``slices``-th row of one cluster."""
+    """The kernel that draws clusters of one kind.
+
+    One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster.
+    """
+    block = 1 if phase == KEY else 64  # near clusters cost a core as much as a hundred far ones
     place, outline, hit = _KINDS[kind]
 
     @ti.kernel
@@ -400,12 +404,13 @@ def _drawer(kind: int, phase: int):
         outlines: ti.types.ndarray(ndim=3), hull: ti.types.ndarray(dtype=ti.f32, ndim=3),
         first: ti.types.ndarray(dtype=ti.i32, ndim=1), size: ti.types.ndarray(dtype=ti.i32, ndim=1),
         which: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        lens: Lens, slices: ti.i32,
+        lens: Lens, lanes: ti.i32, slices: ti.i32,
         keys: ti.types.ndarray(ndim=1), number: ti.types.ndarray(dtype=ti.i32, ndim=1),
     ):  # fmt: skip
-        for k, part in ti.ndrange(which.shape[0], slices):
-            begin = first[which[k]]
-            for i in range(begin, begin + size[which[k]]):
+        ti.loop_config(block_dim=block)
+        for k, lane, part in ti.ndrange(which.shape[0], lanes, slices):
+            i, end = first[which[k]] + lane, first[which[k]] + size[which[k]]
+            while i < end:
                 s = place(lens, a[i], b[i], c[i], d[i])
                 o = outline(s, hull, lens)
                 smooth = s.a[3] * lens.focal[0] > s.a[2] * SMOOTH_SIZE
@@ -441,6 +446,7 @@ def _drawer(kind: int, phase: int):
                                     elif z <= keys[at] + 1:
                                         ti.atomic_min(number[at], i + ti.select(z == keys[at], 0, _NEARLY))
                         y += slices
+                i += lanes
 
     return draw
 
@@ -473,7 +479,7 @@ class Twin:
         pixels.fill(EMPTY)
         for number, these in mine.items():
             clusters_of = primitives.cluster_first, primitives.cluster_size, these
-            _drawer(number, KEY)(*tables, *clusters_of, eye, 1, pixels, self._number)
+            _drawer(number, KEY)(*tables, *clusters_of, eye, 1, 1, pixels, self._number)
 
     def _fill_there(
         self, primitives: "Primitives", lens: visibility.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
@@ -496,7 +502,7 @@ class Twin:
         for phase in (DEPTH, NUMBER):
             for number, these in mine.items():
                 clusters_of = primitives.cluster_first, primitives.cluster_size, these
-                _drawer(number, phase)(*self._tables, *clusters_of, eye, _SLICES, *self._pixels)
+                _drawer(number, phase)(*self._tables, *clusters_of, eye, *_SPREAD, *self._pixels)
         depth, number = (array.to_numpy().astype(np.int64) for array in self._pixels)
         keys[:] = np.where(number == _NOBODY, EMPTY, (depth << 32) | (number & (_NEARLY - 1)))
 
