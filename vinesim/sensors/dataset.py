@@ -70,6 +70,7 @@ class Plan:
     camera: str
     size: tuple[int, int] | None = None
     """Width and height [px]; the camera's own unless given."""
+    renderer: str = "warp"
 
     def settings(self) -> dict[str, Any]:
         """All that decides what the images show, as JSON."""
@@ -80,6 +81,7 @@ class Plan:
             "seed": self.seed,
             "camera": self.camera,
             "size": [info.width, info.height],
+            "renderer": self.renderer,
         }
 
     def vineyard(self, number: int) -> Scene:
@@ -100,7 +102,7 @@ class Vineyard:
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
         self.view: View = still_view(self.model)
-        self.primitives = Primitives(self.model)
+        self.primitives = Primitives(self.model, renderer=plan.renderer)
         self.primitives.update(self.view)
         self.caster = RayCaster(self.primitives)
         self.spec = CameraSpec.load(plan.camera)

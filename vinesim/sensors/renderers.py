@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -29,33 +30,30 @@ class Raster(Protocol):
         ...
 
 
-def raster_of(renderer: str, device: str) -> Raster | None:
-    """The rasteriser of that name for primitives on ``device``; None for Warp's own on a CPU."""
+def check(renderer: str) -> str:
+    """Its name, if it is known and installed; :class:`NoRenderer` in words if not."""
     if renderer not in RENDERERS:
         raise NoRenderer(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
-    if renderer != "warp":
-        return _twin(renderer, device)
-    if device != "cpu":
-        from vinesim.sensors.tiles import Tiles
-
-        return Tiles(device)
-    return None
+    if renderer != "warp" and importlib.util.find_spec("taichi") is None:
+        raise NoRenderer(f"renderer {renderer!r}: Taichi is not installed; type: pip install 'vinesim[taichi]'")
+    return renderer
 
 
-def _twin(renderer: str, device: str) -> Raster:
-    if device != "cpu":
-        raise NoRenderer(
-            f"renderer {renderer!r} with device {device!r}: that device is Warp's; leave one of the two out"
-        )
-    try:
+def raster_of(renderer: str, device: str) -> Raster | None:
+    """The rasteriser of that name for primitives on ``device``; None for Warp's own on a CPU."""
+    if check(renderer) != "warp":
+        if device != "cpu":
+            raise NoRenderer(f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out")
         from vinesim.sensors.twin import Twin
-    except ImportError as missing:
-        raise NoRenderer(
-            f"renderer {renderer!r}: {missing.name} is not installed; type: pip install 'vinesim[taichi]'"
-        ) from None
-    try:
-        return Twin(gpu=renderer == "taichi-gpu")
-    except RuntimeError:
-        raise NoRenderer(
-            f"renderer {renderer!r}: Taichi finds no Vulkan or Metal GPU here; use taichi or warp"
-        ) from None
+
+        try:
+            return Twin(gpu=renderer == "taichi-gpu")
+        except RuntimeError:
+            raise NoRenderer(
+                f"renderer {renderer!r}: Taichi finds no Vulkan or Metal GPU; use taichi or warp"
+            ) from None
+    if device == "cpu":
+        return None
+    from vinesim.sensors.tiles import Tiles
+
+    return Tiles(device)

@@ -515,6 +515,7 @@ def _start(gpu: bool) -> None:
             ti.init(arch=[ti.metal, ti.vulkan], enable_fallback=False, log_level=ti.ERROR)
         else:
             ti.init(arch=ti.cpu, log_level=ti.ERROR)
+        ti.sync()
 
 
 def _lens(lens: visibility.Pinhole) -> Lens:
