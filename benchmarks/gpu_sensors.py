@@ -64,9 +64,8 @@ class Report:
         name = driver = "none"
         if device != "cpu":
             query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
-            name, driver = (
-                subprocess.run(query, capture_output=True, text=True, check=True).stdout.split("\n")[0].split(", ")
-            )
+            answer = subprocess.run(query, capture_output=True, text=True, check=True).stdout
+            name, driver = answer.splitlines()[0].split(", ")
         self._about = {"device": name, "driver": driver, "warp": wp.config.version}
 
     def __call__(self, case: str, value: float, unit: str) -> None:
@@ -76,7 +75,7 @@ class Report:
 
 
 def compare(say: Report, model: Model, device: str) -> None:
-    """What a camera and a lidar see, beside the CPU."""
+    """What a camera and a lidar see, beside the CPU of the same machine."""
     (ours, _), (theirs, _) = world(model, device), world(model, "cpu")
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
@@ -98,13 +97,16 @@ def compare(say: Report, model: Model, device: str) -> None:
         Lidar(LidarSpec.load("vlp16"), device=where).scan(primitives, STAND)
         for primitives, where in ((ours, device), (theirs, "cpu"))
     ]
-    found = [
-        dict(zip(zip(s.ring, s.offset, strict=True), zip(s.labels, s.xyz, strict=True), strict=True)) for s in scans
-    ]
-    both = found[0].keys() & found[1].keys()
-    equal = [shot for shot in both if found[0][shot][0] == found[1][shot][0]]
-    say("lidar: shots that return the label that the CPU's do", len(equal) / max(len(found[0]), len(found[1])), "1")
-    apart = [np.linalg.norm(found[0][shot][1] - found[1][shot][1]) for shot in equal]
+    a, b = (
+        {
+            (ring, offset): (label, xyz)
+            for ring, offset, label, xyz in zip(s.ring, s.offset, s.labels, s.xyz, strict=True)
+        }
+        for s in scans
+    )
+    equal = [shot for shot in a.keys() & b.keys() if a[shot][0] == b[shot][0]]
+    say("lidar: shots that return the label that the CPU's do", len(equal) / max(len(a), len(b)), "1")
+    apart = [np.linalg.norm(a[shot][1] - b[shot][1]) for shot in equal]
     say("lidar: range of those, 99.9 % differ by less than", float(1e3 * np.quantile(apart, 0.999)), "mm")
 
 
@@ -154,33 +156,24 @@ def measure(say: Report, model: Model, device: str) -> None:
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
     for name, (eye, target) in VIEWS.items():
-        camera, pose = Camera(spec, info, device=device), looking(np.array(eye), np.array(target))
+        pose = looking(np.array(eye), np.array(target))
         lens = pinhole(info, pose)
-        camera.expose(primitives, pose)
-        say(
-            f"{name}: visibility, {about}",
-            milliseconds(lambda c=camera, p=lens: c.visibility.draw(primitives, p), device),
-            "ms",
-        )
-        say(
-            f"{name}: frame, cached shadows, {about}",
-            milliseconds(lambda c=camera, p=pose: c.expose(primitives, p), device),
-            "ms",
-        )
+        for quality in ("fast", "full"):
+            camera = Camera(spec, info, quality=quality, device=device)
+            camera.expose(primitives, pose)
+            spent = milliseconds(lambda c=camera, p=pose: c.expose(primitives, p), device)
+            say(f"{name}: {quality} frame, cached shadows, {about}", spent, "ms")
+        spent = milliseconds(lambda c=camera, at=lens: c.visibility.draw(primitives, at), device)
+        say(f"{name}: visibility alone, {about}", spent, "ms")
         for reach, one in (("near", camera._sunlight._near), ("far", camera._sunlight._far)):
             say(f"{name}: {reach} shadows drawn anew", milliseconds(lambda m=one: m._draw(primitives), device), "ms")
-    camera = Camera(spec, info, device=device)
     poses = [looking(np.array([-0.6 + 1e-4 * n, 1.0, 1.45]), np.array([8.0, 1.35, 1.45])) for n in range(400)]
-    say(
-        f"frames on the device, moving camera, {about}",
-        rate(lambda n: camera.expose(primitives, poses[n]), device),
-        "1/s",
-    )
-    say(
-        f"frames handed to the host, moving camera, {about}",
-        rate(lambda n: camera.render(primitives, poses[n]), device),
-        "1/s",
-    )
+    for quality in ("fast", "full"):
+        camera = Camera(spec, info, quality=quality, device=device)
+        often = rate(lambda n, c=camera: c.expose(primitives, poses[n]), device)
+        say(f"{quality} frames left on the device, moving camera, {about}", often, "1/s")
+        often = rate(lambda n, c=camera: c.render(primitives, poses[n]), device)
+        say(f"{quality} frames handed to the host, moving camera, {about}", often, "1/s")
     lidar = Lidar(LidarSpec.load("vlp16"), device=device)
     say("lidar scans handed to the host", rate(lambda n: lidar.scan(primitives, STAND), device, 100), "1/s")
     tree = RayCaster(primitives)
