@@ -33,8 +33,9 @@ EMPTY, SMOOTH_SIZE, TEXELS = int(visibility.EMPTY), float(visibility.SMOOTH_SIZE
 _NOBODY = 2**31 - 1
 _NEARLY = 2**30
 """Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
-_SPREAD = (24, 32)
-"""Threads of a GPU that share the primitives of a cluster, and the rows of each of them."""
+_CORES, _GPU = (64, 1), (24, 32)
+"""How many share the primitives of a cluster, and the rows of each of them. Taichi hands 512 iterations at once to a
+core of a CPU, idle ones counted: so 8 clusters, few enough that no core is left with all that is near."""
 KEY, DEPTH, NUMBER = range(3)
 """What a pass draws: depth and number in one; depth alone; the number of what lies at that depth."""
 
@@ -389,13 +390,26 @@ _KINDS = {
 # ------------------------------------------------------------------------------------------------ drawing
 
 
+@ti.func
+def lens_of(view: ti.template()):
+    """The camera out of one array: a struct of vectors costs Taichi a millisecond a launch."""
+    return Lens(
+        eye=vec3(view[0], view[1], view[2]),
+        turn=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
+        focal=vec2(view[12], view[13]),
+        centre=vec2(view[14], view[15]),
+        size=vec2(view[16], view[17]),
+        reach=view[18],
+        close=view[19],
+    )
+
+
 @functools.cache
 def _drawer(kind: int, phase: int):
     """The kernel that draws clusters of one kind.
 
     One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster.
     """
-    block = 1 if phase == KEY else 64  # near clusters cost a core as much as a hundred far ones
     place, outline, hit = _KINDS[kind]
 
     @ti.kernel
@@ -404,13 +418,13 @@ def _drawer(kind: int, phase: int):
         outlines: ti.types.ndarray(ndim=3), hull: ti.types.ndarray(dtype=ti.f32, ndim=3),
         first: ti.types.ndarray(dtype=ti.i32, ndim=1), size: ti.types.ndarray(dtype=ti.i32, ndim=1),
         which: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        lens: Lens, lanes: ti.i32, slices: ti.i32,
+        view: ti.types.ndarray(dtype=ti.f32, ndim=1), lanes: ti.i32, slices: ti.i32,
         keys: ti.types.ndarray(ndim=1), number: ti.types.ndarray(dtype=ti.i32, ndim=1),
     ):  # fmt: skip
-        ti.loop_config(block_dim=block)
         for k, lane, part in ti.ndrange(which.shape[0], lanes, slices):
             i, end = first[which[k]] + lane, first[which[k]] + size[which[k]]
             while i < end:
+                lens = lens_of(view)
                 s = place(lens, a[i], b[i], c[i], d[i])
                 o = outline(s, hull, lens)
                 smooth = s.a[3] * lens.focal[0] > s.a[2] * SMOOTH_SIZE
@@ -474,12 +488,12 @@ class Twin:
         if self._gpu:
             self._fill_there(primitives, lens, mine, keys.numpy())
             return
-        s, eye, pixels = primitives.shapes, _lens(lens), keys.numpy()
+        s, eye, pixels = primitives.shapes, _numbers(lens), keys.numpy()
         tables = [t.numpy() for t in (s.a, s.b, s.c, s.d, s.outline, s.hull)]
         pixels.fill(EMPTY)
         for number, these in mine.items():
             clusters_of = primitives.cluster_first, primitives.cluster_size, these
-            _drawer(number, KEY)(*tables, *clusters_of, eye, 1, 1, pixels, self._number)
+            _drawer(number, KEY)(*tables, *clusters_of, eye, *_CORES, pixels, self._number)
 
     def _fill_there(
         self, primitives: "Primitives", lens: visibility.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
@@ -498,11 +512,11 @@ class Twin:
             self._pixels = [ti.ndarray(ti.i32, keys.shape) for _ in range(2)]
         for array in self._pixels:
             array.fill(_NOBODY)
-        eye = _lens(lens)
+        eye = _numbers(lens)
         for phase in (DEPTH, NUMBER):
             for number, these in mine.items():
                 clusters_of = primitives.cluster_first, primitives.cluster_size, these
-                _drawer(number, phase)(*self._tables, *clusters_of, eye, *_SPREAD, *self._pixels)
+                _drawer(number, phase)(*self._tables, *clusters_of, eye, *_GPU, *self._pixels)
         depth, number = (array.to_numpy().astype(np.int64) for array in self._pixels)
         keys[:] = np.where(number == _NOBODY, EMPTY, (depth << 32) | (number & (_NEARLY - 1)))
 
@@ -518,11 +532,10 @@ def _start(gpu: bool) -> None:
         ti.sync()
 
 
-def _lens(lens: visibility.Pinhole) -> Lens:
-    return Lens(
-        eye=vec3(*lens.eye), turn=mat3(np.array(lens.turn).reshape(3, 3)), focal=vec2(lens.fx, lens.fy),
-        centre=vec2(lens.cx, lens.cy), size=vec2(lens.width, lens.height), reach=lens.reach, close=lens.close,
-    )  # fmt: skip
+def _numbers(lens: visibility.Pinhole) -> np.ndarray:
+    """What :func:`lens_of` reads."""
+    others = lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.reach, lens.close
+    return np.concatenate([np.array(lens.eye), np.array(lens.turn).ravel(), others]).astype(np.float32)
 
 
 def _in_view(primitives: "Primitives", lens: visibility.Pinhole) -> np.ndarray:
