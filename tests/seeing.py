@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import numpy as np
+import trimesh
 import warp as wp
 
 from vinesim import frames
@@ -51,6 +53,22 @@ def world(*links: Link, model: Model | None = None, at=None, grass: float = 0.0)
     primitives = Primitives(model, grass=grass)
     primitives.update(view)
     return primitives, view
+
+
+def everything(folder: Path) -> Primitives:
+    """The demo scene with grass and one solid of each kind between its rows; ``folder`` takes a mesh."""
+    turn = frames.normalize(np.array([0.3, 0.2, -0.4, 0.8]))
+    solids = thing(
+        shape("box", 0.2, 0.1, 0.3),
+        shape("cylinder", 0.08, 0.2, at=(0, 0, 0.5), turn=turn),
+        shape("capsule", 0.07, 0.2, at=(0.3, 0, 0.5), turn=turn),
+        shape("ellipsoid", 0.1, 0.05, 0.2, at=(-0.3, 0, 0.5), turn=turn),
+        shape("sphere", 0.1, at=(0, 0.3, 0.6)),
+    )
+    trimesh.creation.icosphere(2, radius=0.15).export(folder / "ball.stl")
+    ball = thing(shape("mesh", 1.0, 1.0, 1.0, at=(0, -0.3, 0.6), file=str(folder / "ball.stl")), name="mesh", index=1)
+    at = np.tile([1.2, 1.0, 0.6, *frames.yaw(0.5)], (2, 1))
+    return world(solids, ball, model=demo(), at=at, grass=3.0)[0]
 
 
 def raster(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -> tuple[np.ndarray, np.ndarray]:

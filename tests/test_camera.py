@@ -3,6 +3,7 @@
 import dataclasses
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import seeing
@@ -122,7 +123,7 @@ def test_depth_conventions() -> None:
     wall = seeing.shape("box", 0.05, 0.3, 0.3, at=(2.0, 0.9, 1.0))
     far = seeing.shape("box", 0.05, 2.0, 2.0, at=(12.0, -4.0, 2.0))
     primitives, _ = seeing.world(*(seeing.thing(s, name=str(i), index=i) for i, s in enumerate((ball, wall, far))))
-    spec = CameraSpec.load("d435")
+    spec = msgspec.structs.replace(CameraSpec.load("d435"), stereo=None)
     frame = Camera(spec, seeing.SMALL, sun=SUN).render(primitives, seeing.AHEAD)
     organ = frame.labels >> 20
     robot = [frame.depth[frame.labels == label(Organ.ROBOT, i)] for i in range(3)]
@@ -180,7 +181,7 @@ def test_bad_input_is_named(tmp_path) -> None:
         CameraSpec.load("d43")
     file = tmp_path / "bad.toml"
     shipped = find("cameras", "d435", ".toml").read_text(encoding="utf-8")
-    file.write_text(shipped.replace('value = 0.175, unit = "m"', 'value = 175, unit = "mm"'), encoding="utf-8")
+    file.write_text(shipped.replace('value = 0.158, unit = "m"', 'value = 158, unit = "mm"'), encoding="utf-8")
     with pytest.raises(SensorError, match=r"nearest\.unit is 'mm'; give the value in 'm'"):
         CameraSpec.load(str(file))
 

@@ -3,6 +3,7 @@
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -58,7 +59,7 @@ def over_the_wire(message):
 
 def points(cloud: PointCloud2) -> np.ndarray:
     """A cloud read as a stranger would: by its own fields."""
-    formats = {PointField.FLOAT32: "f4", PointField.UINT16: "u2"}
+    formats = {PointField.FLOAT32: "f4", PointField.UINT16: "u2", PointField.UINT8: "u1"}
     dtype = np.dtype(
         {
             "names": [f.name for f in cloud.fields],
@@ -199,6 +200,18 @@ def test_lidar_cloud_round_trip_is_exact(count):
         assert np.array_equal(cloud["intensity"], scan.intensity)
         assert np.array_equal(cloud["ring"], scan.ring)
         assert np.array_equal(cloud["time"], scan.offset)
+
+
+def test_a_lidar_with_two_returns_says_which_is_which():
+    """One more field in what was padding: readers of x y z intensity ring time find them where they were."""
+    scan = lidar_scan(6)
+    dual = dataclasses.replace(scan, returned=np.array([1, 1, 2, 1, 2, 1], np.uint8))
+    message, plain = (over_the_wire(convert.lidar_cloud(s)) for s in (dual, scan))
+    assert [f.name for f in message.fields] == ["x", "y", "z", "intensity", "ring", "return_type", "time"]
+    assert message.point_step == plain.point_step
+    assert points(message)[0]["return_type"].tolist() == [1, 1, 2, 1, 2, 1]
+    where = {f.name: f.offset for f in message.fields}
+    assert {f.name: f.offset for f in plain.fields} == {k: v for k, v in where.items() if k != "return_type"}
 
 
 def joint_sample() -> JointSample:

@@ -16,6 +16,9 @@ from pycocotools.coco import COCO
 
 from vinesim.cli.join import WrongUse
 from vinesim.cli.render import run as render
+from vinesim.client.life import Life
+from vinesim.client.stage import NoRoom
+from vinesim.robot.description import DescriptionError
 from vinesim.sensors import dataset, formats
 from vinesim.sensors.dataset import DatasetError, Plan
 from vinesim.sensors.specs import SensorError
@@ -24,6 +27,7 @@ from vinesim.world.places import NotFoundInData
 from vinesim.world.scene import load
 
 IMAGES = 6  # of two vineyards
+LIFE = Life(0.5)
 SCENE = """
 name = "one vine"
 seed = 1
@@ -47,6 +51,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
     options = {"images": IMAGES, "size": "160x120", "seed": 5, "scene": scene, "out": out, "workers": workers}
+    options["actors"] = LIFE.share
     given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     return [sys.executable, "-m", "vinesim.cli", "dataset", *given]
 
@@ -55,7 +60,7 @@ def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
 def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A data set made in this process, in one go."""
     out = tmp_path_factory.mktemp("whole") / "set"
-    plan = Plan(load(scene), 5, "d435", (160, 120))
+    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
     dataset.begin(plan, out)
     assert list(dataset.draw(plan, out, dataset.missing(out, IMAGES))) == list(range(IMAGES))
     dataset.finish(out, IMAGES)
@@ -160,20 +165,52 @@ def test_every_image_has_its_yolo_boxes_depth_berries_and_pose(whole: pathlib.Pa
         assert (np.abs(local) <= 0.5 * np.array(box["size"]) + 1e-3).all()
 
 
+def test_life_is_in_a_share_of_the_images_and_all_bunches_have_their_ripeness(whole: pathlib.Path) -> None:
+    records = [json.loads(p.read_text()) for p in sorted((whole / "records").glob("*.json"))]
+    lively = [record for record in records if record["actors"]]
+    assert 0 < len(lively) < IMAGES
+    for record in lively:
+        ids = _ids(whole / "ids" / f"{record['image']:06d}.png")
+        assert [one["pixels"] for one in record["actors"]] == [(ids == one["label"]).sum() for one in record["actors"]]
+        assert {one["kind"] for one in record["actors"]} <= {"robot", "human", "box"}
+    still = _ids(whole / "ids" / f"{next(r['image'] for r in records if not r['actors']):06d}.png")
+    assert (still < label(Organ.BOX, 0)).all()
+    ripeness = {}
+    for one in json.loads((whole / "annotations.json").read_text())["annotations"]:
+        vineyard = records[one["image_id"]]["scene"]["seed"]
+        assert ripeness.setdefault((vineyard, one["bunch"]), one["ripeness"]) == one["ripeness"]
+    assert len(set(ripeness.values())) > 3
+    assert all(0.0 <= value <= 1.0 for value in ripeness.values())
+
+
+def test_an_image_is_the_same_whatever_was_drawn_before(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """The last image of a vineyard, alone: wind, company and picked bunches of the others leave no trace."""
+    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    dataset.begin(plan, tmp_path)
+    last = dataset.IMAGES_A_VINEYARD - 1
+    list(dataset.draw(plan, tmp_path, [last]))
+    alone = {name: data for name, data in _files(tmp_path).items() if f"{last:06d}" in name}
+    assert len(alone) == 6
+    assert alone == {name: _files(whole)[name] for name in alone}
+
+
 def _turned(q, v: np.ndarray) -> np.ndarray:
     u, w = np.asarray(q[:3], float), float(q[3])
     return v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
 
 
 def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    plan = Plan(load(scene), 5, "d435", (160, 120))
+    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
     before = _files(whole)
     dataset.begin(plan, whole)
     assert _files(whole) == before
     for other, words in (
-        (Plan(load(scene), 6, "d435", (160, 120)), "seed 5, not 6"),
-        (Plan(load("vsp"), 5, "d435", (160, 120)), "scene"),
-        (Plan(load(scene), 5, "d435", (320, 240)), "size"),
+        (Plan(load(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
+        (Plan(load("vsp"), 5, "d435", (160, 120), LIFE), "scene"),
+        (Plan(load(scene), 5, "d435", (320, 240), LIFE), "size"),
+        (Plan(load(scene), 5, "d435", (160, 120)), "life"),
     ):
         with pytest.raises(DatasetError, match=words):
             dataset.begin(other, whole)
@@ -219,7 +256,7 @@ def _render(out: pathlib.Path, **changed) -> int:
 
 def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
     assert _render(tmp_path / "shot") == 0
-    names = {"rgb.png", "depth.png", "labels.png", "overlay.png", "camera.json", "truth.json"}
+    names = {"rgb.png", "depth.png", "measured.png", "labels.png", "overlay.png", "camera.json", "truth.json"}
     assert {p.name for p in (tmp_path / "shot").iterdir()} == names
     camera = json.loads((tmp_path / "shot/camera.json").read_text())
     assert camera["k"][0] == camera["k"][4] == pytest.approx(617.0 / 4)
@@ -243,6 +280,14 @@ def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
         ({"look": "0.4,1.2,1.3"}, WrongUse, "where the camera stands"),
         ({"at": "1,2,-0.1"}, WrongUse, "in the ground"),
         ({"at": "0,0,1"}, WrongUse, "inside"),
+        ({"robots": ["vinebot"]}, WrongUse, "give NAME@X,Y,YAW"),
+        ({"robots": ["vinebot@1"]}, WrongUse, "--robot is at '1'; give X,Y,YAW"),
+        ({"robots": ["dalek@1,2"]}, DescriptionError, "dalek.* give a path or one of: logistic, vinebot"),
+        ({"robots": ["vinebot@0.1,0.1"]}, NoRoom, r"robot_0 stands \d+ cm deep in (trunk|pole)"),
+        ({"people": ["1,1,0,dance"]}, WrongUse, "posture 'dance' is none of stand, pick"),
+        ({"people": ["1,1.2", "1.1,1.2"]}, NoRoom, "person_. stands .* deep in person_.; move one"),
+        ({"crates": ["1,1,0,1.5"]}, WrongUse, "the fill is 1.5; give 0"),
+        ({"crates": ["1,inf"]}, WrongUse, "--crate is at '1,inf'; give X,Y,YAW,FILL"),
     ],
 )
 def test_what_cannot_be_drawn_is_said(tmp_path: pathlib.Path, changed: dict, error: type, words: str) -> None:
@@ -252,8 +297,39 @@ def test_what_cannot_be_drawn_is_said(tmp_path: pathlib.Path, changed: dict, err
     assert not (tmp_path / "shot").exists()
 
 
+def test_a_picture_with_company(tmp_path: pathlib.Path) -> None:
+    """Whoever is asked for is there, where asked, with a label that truth tells; the vineyard is the same one."""
+    things = {"robots": ["vinebot@3,1.3,-2.5"], "people": ["2.2,0.9,2.4,pick"], "crates": ["1.6,1.4,0.2,0.25"]}
+    assert _render(tmp_path / "shot", look="2.2,1.2,0.6", **things) == 0
+    assert _render(tmp_path / "bare", look="2.2,1.2,0.6") == 0
+    said, bare = (json.loads((tmp_path / name / "truth.json").read_text()) for name in ("shot", "bare"))
+    ids = _ids(tmp_path / "shot/labels.png")
+    depth = cv2.imread(str(tmp_path / "shot/depth.png"), cv2.IMREAD_UNCHANGED) * 1e-3
+    assert said["digest"] == bare["digest"]
+    assert [one["kind"] for one in said["actors"]] == ["robot", "human", "box"]
+    camera = json.loads((tmp_path / "shot/camera.json").read_text())
+    fx, _, cx, _, fy, cy = camera["k"][:6]
+    for one in said["actors"][:2]:
+        rows, columns = np.nonzero((ids == one["label"]) & (depth > 0))
+        assert one["pixels"] == (ids == one["label"]).sum() > 50
+        z = depth[rows, columns]
+        points = _turned(camera["quaternion_xyzw"], np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1))
+        away = np.hypot(*(points + camera["position"] - [one["x"], one["y"], 0.0])[:, :2].T)
+        assert np.quantile(away, 0.95) < 0.8
+    loose = [one for one in said["bunches"] if not one["attached"]]
+    assert loose
+    assert all(one["cut"] is None for one in loose)
+
+
+def test_a_camera_of_absurd_resolution_is_refused(tmp_path: pathlib.Path) -> None:
+    text = (pathlib.Path(dataset.__file__).parents[2] / "data/cameras/d435.toml").read_text()
+    (tmp_path / "huge.toml").write_text(text.replace("width = { value = 640", "width = { value = 640000"))
+    with pytest.raises(SensorError, match="size is 640000x480; give WxH from 16x16 to 4096x4096"):
+        _render(tmp_path / "shot", camera=str(tmp_path / "huge.toml"), size=None)
+
+
 def test_a_camera_without_range_is_refused(tmp_path: pathlib.Path) -> None:
     text = (pathlib.Path(dataset.__file__).parents[2] / "data/cameras/d435.toml").read_text()
-    (tmp_path / "blind.toml").write_text(text.replace("nearest = { value = 0.175", "nearest = { value = 10.0"))
+    (tmp_path / "blind.toml").write_text(text.replace("nearest = { value = 0.158", "nearest = { value = 10.0"))
     with pytest.raises(SensorError, match="no range"):
         _render(tmp_path / "shot", camera=str(tmp_path / "blind.toml"))

@@ -78,20 +78,48 @@ def test_the_newest_view_wins_and_the_rest_is_counted(view) -> None:
 
 
 def test_nothing_is_rendered_that_nobody_wants(view) -> None:
-    wanted, unwanted, listening = Inbox(), Inbox(), threading.Event()
+    wanted, unwanted, taken, listening = Inbox(), Inbox(), Inbox(), threading.Event()
     lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
     mounts = [Mount(_camera(), unwanted, wanted=listening.is_set, rate=10.0), Mount(lidar, wanted, rate=10.0)]
-    poses = {"head": seeing.AHEAD, "lidar": np.array([0, 0, 1.0, 0, 0, 0, 1])}
+    mounts.append(Mount(_camera("other"), taken, rate=10.0))  # the last: when it has a picture, the view was taken
+    poses = {"head": seeing.AHEAD, "other": seeing.AHEAD, "lidar": np.array([0, 0, 1.0, 0, 0, 0, 1])}
     with Eyes(seeing.empty(), mounts) as eyes:
-        for k in range(3):
+        for k in range(4):  # a revolution is over a tenth of a second after it was begun
             eyes.see(dataclasses.replace(view, time=0.1 * k), poses)
-            wanted.wait(k + 1)
+            taken.wait(k + 1)
         assert unwanted.frames == []
         listening.set()
-        eyes.see(dataclasses.replace(view, time=0.3), poses)
-        unwanted.wait(1)
-    assert eyes.frames == {"head": 1, "lidar": 4}
-    assert eyes.dropped == {"head": 0, "lidar": 0}
+        eyes.see(dataclasses.replace(view, time=0.4), poses)
+        taken.wait(5)
+    assert eyes.frames == {"head": 1, "lidar": 4, "other": 5}
+    assert eyes.dropped == {"head": 0, "lidar": 0, "other": 0}
+    assert [len(inbox.frames) for inbox in (unwanted, wanted)] == [1, 4]
+
+
+def test_a_late_thread_fires_from_where_the_lidar_was() -> None:
+    """Views that nobody had time for leave their poses behind: no shot is fired from a wrong place."""
+    gate, inbox, started = threading.Event(), Inbox(), Inbox()
+    wall = seeing.thing(seeing.shape("box", 0.1, 30.0, 30.0, at=(6.1, 0.0, 1.0)))
+    rest = np.array([[0, 0, 0, 0, 0, 0, 1.0]])
+    view = still_view(seeing.empty(), (wall,), rest)
+
+    def slow(frame) -> None:
+        started(frame)
+        assert gate.wait(20.0)
+
+    lidar = Lidar(LidarSpec.load("vlp16").ideal(), "lidar")
+    mounts = [Mount(_camera(), slow, rate=1.0), Mount(lidar, inbox)]
+    with Eyes(seeing.empty(), mounts) as eyes:
+        for k in range(11):  # the thread is kept by the first picture and sees the first and the last view
+            pose = np.array([0.02 * k, 0, 1.0, 0, 0, 0, 1])
+            eyes.see(dataclasses.replace(view, time=0.01 * k), {"head": seeing.AHEAD, "lidar": pose})
+            started.wait(1)
+        gate.set()
+        inbox.wait(1)
+    scan = inbox.frames[0]
+    mine = scan.labels == label(Organ.ROBOT, 0)
+    assert mine.sum() > 1000
+    assert scan.xyz[mine, 0] + 2.0 * (scan.time + scan.offset[mine]) == pytest.approx(6.0, abs=2e-3)
 
 
 def test_trees_that_moved_in_skipped_views_are_taken_over() -> None:

@@ -11,9 +11,10 @@ from test_rigid import arm, step, yard
 from touch_scenes import probe
 
 from vinesim import frames
-from vinesim.physics.people import PARTS, THICK, HumanError, posture, standing
+from vinesim.physics.people import LIMBS, PARTS, THICK, HumanError, posture, standing
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.yard import FRICTION
+from vinesim.world import figures
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.values import POINTS, Drive, HumanPose, HumanSpec
@@ -339,10 +340,72 @@ def test_people_are_seen_as_people():
     rigid = Rigid(yard())
     rigid.add_human(eva())
     links = [link for link in rigid.links() if link.organ == Organ.HUMAN]
-    assert [link.name for link in links] == [f"eva/{part}" for part in (*PARTS, "left_hand", "right_hand")]
+    names = (*PARTS, "left_hand", "right_hand", *LIMBS)
+    assert [link.name for link in links] == [f"eva/{name}" for name in names]
     assert {link.index for link in links} == {3}
     assert all(link.shapes for link in links)
     assert set(rigid.geoms.actor) == {"eva"}
+    assert not {link.partition("/")[2] for link in rigid.geoms.link} & set(LIMBS)  # only seen
+
+
+def limbs_of(pose: HumanPose) -> tuple[Rigid, dict[str, np.ndarray]]:
+    """Poses of all links of somebody in this pose, by part."""
+    rigid = Rigid(yard())
+    rigid.add_human(HumanSpec("eva", 0, pose))
+    step(rigid, 1)
+    return rigid, {k.name.partition("/")[2]: q for k, q in zip(rigid.links(), rigid.link_q(), strict=True)}
+
+
+@pytest.mark.parametrize("posture", figures.postures())
+def test_arms_reach_from_shoulders_to_wrists(posture: str):
+    """Bones keep their lengths, elbows join, and both arms of a mirrored pose mirror each other."""
+    look = figures.person(1.75)
+    pose = figures.posed(standing(frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(0.7))), posture, 1.75)
+    _, at = limbs_of(pose)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        upper, fore, hand = at[f"{side}_upper_arm"], at[f"{side}_forearm"], at[f"{side}_hand"]
+        reach = upper[:3] + frames.rotate(upper[3:], np.array([look.limbs.upper_arm, 0, 0]))
+        assert reach == pytest.approx(fore[:3], abs=1e-9)
+        wrist = hand[:3] + frames.rotate(hand[3:], np.array(look.limbs.wrist) * [1, sign, 1])
+        assert fore[:3] + frames.rotate(fore[3:], np.array([look.limbs.forearm, 0, 0])) == pytest.approx(
+            wrist, abs=1e-4
+        )
+        shoulder = at["chest"][:3] + frames.rotate(at["chest"][3:], np.array(look.limbs.shoulder) * [1, sign, 1])
+        assert np.linalg.norm(upper[:3] - shoulder) < 0.07  # it gives way a little
+
+
+def test_an_arm_that_is_too_short_points_at_its_hand():
+    pose = standing(frames.pose(np.zeros(3)))
+    far = dataclasses.replace(pose, left=frames.pose(np.array([3.0, 0.2, 1.2])))
+    _, at = limbs_of(far)
+    upper, fore = at["left_upper_arm"], at["left_forearm"]
+    assert frames.rotate(upper[3:], np.array([1.0, 0, 0])) == pytest.approx(
+        frames.rotate(fore[3:], np.array([1.0, 0, 0])), abs=0.01
+    )
+    assert np.isfinite(np.concatenate(list(at.values()))).all()
+
+
+def test_fingers_bend_as_they_are_told():
+    """Each by itself, towards the palm, and no joint comes apart."""
+    look = figures.person(1.75)
+    for bent in range(5):
+        told = tuple(float(k == bent) for k in range(5))
+        pose = dataclasses.replace(standing(frames.pose(np.zeros(3))), left_fingers=told, right_fingers=told)
+        _, at = limbs_of(pose)
+        for s, side in enumerate(("left", "right")):
+            down = frames.rotate(at[f"{side}_hand"][3:], np.array([0.0, 0.0, -1.0]))
+            for k, finger in enumerate(figures.FINGERS):
+                bones = [at[f"{side}_{finger}_{n + 1}"] for n in range(3)]
+                ahead = [frames.rotate(bone[3:], np.array([1.0, 0.0, 0.0])) for bone in bones]
+                for n in (0, 1):
+                    tip = bones[n][:3] + look.length[5 * s + k, n] * ahead[n]
+                    assert tip == pytest.approx(bones[n + 1][:3], abs=1e-9)
+                angle = np.arccos(np.clip(ahead[0] @ ahead[2], -1.0, 1.0))
+                wanted = look.bent[5 * s + k, 1:].sum() if k == bent else 0.0
+                assert angle == pytest.approx(wanted, abs=1e-6)
+                if k == bent and finger != "thumb":
+                    assert ahead[0] @ down > 0.9
+                    assert ahead[1] @ down > -0.1
 
 
 # ---------------------------------------------------------------------- holding

@@ -202,10 +202,10 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     ):
         mine = label(organ, label_index(name))
         points = eye + scan.xyz[scan.labels == mine].astype(float)
-        assert len(points) > 50, name
+        assert len(points) > 30, name
         assert np.linalg.norm(points[:, :2] - at[:2], axis=1).max() < 0.8
         here = seen == mine
-        assert here.sum() > 50, name
+        assert here.sum() > 30, name
         info, depth = frame.info, frame.depth[here].astype(float)
         rays = np.stack([(columns[here] - info.cx) / info.fx, (rows[here] - info.cy) / info.fy, np.ones(len(depth))], 1)
         found = gaze[:3] + frames.rotate(gaze[3:], rays * depth[:, None])

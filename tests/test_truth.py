@@ -332,7 +332,7 @@ def test_depth_and_lidar_measure_the_same_scene(grove) -> None:
     """Lidar points, seen by the camera, lie as deep as its depth says: within 2 mm in the median."""
     _, primitives, _ = grove
     pose = looking(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7]))
-    scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, np.array([*pose[:3], 0.0, 0.0, 0.0, 1.0]))
+    scan = Lidar(LidarSpec.load("vlp16").ideal()).scan(primitives, np.array([*pose[:3], 0.0, 0.0, 0.0, 1.0]))
     fine = CameraInfo(1280, 960, 1000.0, 1000.0, 639.5, 479.5, "optical")
     seen = truth.look(primitives, fine, pose)
     local = frames.rotate(frames.conjugate(pose[3:]), scan.xyz.astype(float))

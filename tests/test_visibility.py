@@ -82,17 +82,6 @@ def test_a_plane_at_a_known_depth() -> None:
     assert np.abs(depth - 1.5).max() < 2e-6
 
 
-def _solids():
-    ball = trimesh.creation.icosphere(2, radius=0.15)
-    return ball, seeing.thing(
-        seeing.shape("box", 0.2, 0.1, 0.3),
-        seeing.shape("cylinder", 0.08, 0.2, at=(0, 0, 0.5), turn=SKEW),
-        seeing.shape("capsule", 0.07, 0.2, at=(0.3, 0, 0.5), turn=SKEW),
-        seeing.shape("ellipsoid", 0.1, 0.05, 0.2, at=(-0.3, 0, 0.5), turn=SKEW),
-        seeing.shape("sphere", 0.1, at=(0, 0.3, 0.6)),
-    )
-
-
 VIEWPOINTS = {
     "along the rows": ([-1.9, 1.0, 1.45], [6.0, 1.2, 1.4]),
     "up into the canopy": ([1.2, 1.2, 1.3], [1.3, 1.2, 2.0]),
@@ -107,13 +96,7 @@ VIEWPOINTS = {
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory):
-    ball, link = _solids()
-    file = tmp_path_factory.mktemp("mesh") / "ball.stl"
-    ball.export(file)
-    mesh = seeing.thing(seeing.shape("mesh", 1.0, 1.0, 1.0, at=(0, -0.3, 0.6), file=str(file)), name="mesh", index=1)
-    at = np.tile([1.2, 1.0, 0.6, *frames.yaw(0.5)], (2, 1))
-    primitives, _ = seeing.world(link, mesh, model=seeing.demo(), at=at, grass=3.0)
-    return primitives
+    return seeing.everything(tmp_path_factory.mktemp("mesh"))
 
 
 @pytest.mark.parametrize("where", VIEWPOINTS)

@@ -293,7 +293,6 @@ def torso(urdf: Urdf) -> None:
         box((0.012, 0.16, 0.03), (0.126, 0, 0.075), colour="red", solid=False),
         box((0.010, 0.030, 0.012), (0.128, 0.0, 0.035), colour="lamp_green", solid=False),
         *(cylinder(0.083, 0.012, (0.05, y, 0.08), ACROSS, colour="grey", solid=False) for y in (0.155, -0.155)),
-        *(cylinder(0.048, 0.008, (0.02, 0, 0.160 + 0.016 * k), colour="rubber", solid=False) for k in range(3)),
         box((0.05, 0.12, 0.12), (-0.07, 0, 0.06), colour="dark", solid=False),
     )
     urdf.link("torso_lift_link", yoke, mass=14.0)

@@ -355,11 +355,14 @@ def dataset(
         int | None, typer.Option(min=1, max=256, help="Processes; half as many as cores unless given.")
     ] = None,
     renderer: Renderer = "warp",
+    actors: Annotated[
+        float, typer.Option(help="Share of the images with people, robots, crates and wind; 0 leaves the vines alone.")
+    ] = 0.4,
 ) -> None:
     """Draw random pictures of random vineyards with their truth: COCO with masks, YOLO, depth, ids, poses.
 
-    Seed of the vines, leaves, varieties, hour and season of the sun and the viewpoint are drawn for you. Killed or
-    stopped, the same command goes on; more images may be asked for later.
+    Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, who is there and the viewpoint are drawn
+    for you. Killed or stopped, the same command goes on; more images may be asked for later.
 
     \b
     Examples:

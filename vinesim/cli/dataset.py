@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vinesim.cli.join import WrongUse
 from vinesim.cli.render import pixels
+from vinesim.client.life import Life
 from vinesim.sensors import dataset, renderers
 from vinesim.sensors.dataset import DatasetError, Plan
 from vinesim.world.scene import load
@@ -20,13 +21,24 @@ Share = tuple[multiprocessing.process.BaseProcess, Connection]
 
 
 def run(
-    *, images: int, out: pathlib.Path, scene: str, seed: int, camera: str, size: str | None, workers: int | None,
+    *,
+    images: int,
+    out: pathlib.Path,
+    scene: str,
+    seed: int,
+    camera: str,
+    size: str | None,
+    workers: int | None,
+    actors: float,
     renderer: str,
-) -> int:  # fmt: skip
+) -> int:
     """Draw what is not there yet, then gather the annotations of all images."""
     if seed < 0:
         raise WrongUse(f"--seed is {seed}: give 0 or more")
-    plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), renderers.check(renderer))
+    if not 0.0 <= actors <= 1.0:
+        raise WrongUse(f"--actors is {actors:g}: give a share of the images, 0 to 1")
+    life = Life(actors) if actors > 0.0 else None
+    plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check(renderer))
     dataset.begin(plan, out)
     wanted = dataset.missing(out, images)
     shares = _shares(wanted, workers or max((os.cpu_count() or 2) // 2, 1))

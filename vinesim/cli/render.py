@@ -27,13 +27,14 @@ def run(
     crates: Sequence[str] = (),
     renderer: str = "warp",
 ) -> int:
-    """Draw it and write ``rgb``, ``depth``, ``labels``, ``overlay`` PNGs, ``camera.json`` and ``truth.json``."""
+    """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.cli.join import WrongUse
     from vinesim.sensors import formats, picture, renderers, truth
     from vinesim.sensors.camera import Camera, CameraSpec
     from vinesim.sensors.dataset import sized
     from vinesim.sensors.primitives import Primitives
     from vinesim.sensors.raycast import enclosing
+    from vinesim.world.generate import generate
     from vinesim.world.ids import unlabel
     from vinesim.world.scene import load, reseeded
 
@@ -46,7 +47,8 @@ def run(
     spec = CameraSpec.load(camera)
     info = sized(spec, None if size is None else pixels(size))
     plan, staged = reseeded(load(scene), seed), stage(robots, people, crates)
-    model, view = staged.set(plan)
+    model = generate(plan)
+    view = staged.set(model)
     primitives = Primitives(model, renderer=renderer)
     primitives.update(view)
     inside = enclosing(primitives, eye)
@@ -59,11 +61,12 @@ def run(
     frame = Camera(spec, info, "camera", plan.sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
-        "depth": picture.depth_millimetres(frame.depth),
+        "depth": picture.depth_millimetres(frame.exact_depth),
+        "measured": picture.depth_millimetres(frame.depth),
         "labels": formats.ids(frame.labels),
         "overlay": formats.overlay(frame.rgb, truths),
     }
-    actors = formats.actors(staged.told(len(plan.boxes)), seen.labels)
+    actors = formats.actors(staged.told(model), seen.labels)
     described = {"scene": plan.name, "seed": plan.seed, "digest": model.digest(), "actors": actors}
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ import pathlib
 import pickle
 import signal
 import sys
+import zlib
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
@@ -138,13 +139,14 @@ class _Perception:
 
         load_kernels()
         setup, mounts = self.setup, []
+        seed = zlib.crc32(setup.name.encode())  # no two robots have the same noise
         for i, place in enumerate(setup.description.cameras):
             spec = CameraSpec.load(place.type)
-            camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, quality="fast")
+            camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, quality="fast", seed=seed)
             wanted = self._wanted(place.name, always=setup.keep_pictures and i == 0)
             mounts.append(Mount(camera, self._deliver_camera, wanted, setup.sensor_hz))
         for place in setup.description.lidars:
-            lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame)
+            lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame, seed=seed)
             mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name), setup.sensor_hz))
         primitives = Primitives(setup.model, renderer=setup.renderer)
         return stack.enter_context(Eyes(setup.model, mounts, primitives=primitives, nice=EYES_NICE))

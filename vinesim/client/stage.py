@@ -1,6 +1,6 @@
 """Robots, people and crates set down in a vineyard for a picture: what a simulation would show at that instant.
 
-    model, view = Stage(robots=(RobotAt("vinebot", pose),), crates=(CrateAt(3.0, 0.5, fill=0.6),)).set(scene)
+    view = Stage(robots=(RobotAt("vinebot", 1.5, 0.8),), crates=(CrateAt(3.0, 0.5, fill=0.6),)).set(model)
 
 Bunches in a crate were picked from the nearest vines and fell in one after another, by the rigid world that clients
 simulate.
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import msgspec
 import numpy as np
 
 from vinesim import frames
@@ -19,20 +18,18 @@ from vinesim.physics.step import Physics
 from vinesim.robot import description
 from vinesim.world import figures
 from vinesim.world.berries import VARIETIES
-from vinesim.world.generate import generate
 from vinesim.world.ids import Organ, label
 from vinesim.world.model import Model
-from vinesim.world.scene import Box, Scene
 from vinesim.world.values import HumanSpec, View
 
 BULK = 330.0
 """Of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
-WALL = 0.012
-"""[m] of a crate."""
+WALL, MASS = 0.012, 1.6
+"""[m] and [kg] of a crate: how thick its walls are, and how heavy it is when empty."""
 CLEAR = 0.01
 """[m] Whoever stands deeper than this in something else stands in it."""
 FALL, REST, TRIES = 25, 100, 3
-"""[tick] between two bunches that fall into a crate, and for the heap to settle; how often what rolled out is put back."""
+"""[tick] between bunches that fall into a crate; for the heap to settle; how often what rolled out is put back."""
 
 
 class NoRoom(ValueError):
@@ -87,19 +84,24 @@ class Stage:
     crates: tuple[CrateAt, ...] = ()
     """After those of the scene."""
 
-    def set(self, plan: Scene) -> tuple[Model, View]:
+    def set(self, model: Model) -> View:
         """The vineyard with all of it at rest; :class:`NoRoom` if two would stand in each other."""
-        model = generate(self.furnished(plan))
-        return model, self.enter(Physics(model), len(plan.boxes))
+        return self.enter(Physics(self.furnished(model)))
 
-    def furnished(self, plan: Scene) -> Scene:
-        """The scene with the crates in it. Boxes change no plant, and the scene's own keep their numbers."""
-        boxes = tuple(Box(x=c.x, y=c.y, yaw=c.yaw, size=c.size) for c in self.crates)
-        return msgspec.structs.replace(plan, boxes=plan.boxes + boxes)
+    def furnished(self, model: Model) -> Model:
+        """The same vineyard with the crates after its own boxes."""
+        count = len(self.crates)
+        pose, size = np.array([c.pose for c in self.crates]), np.array([c.size for c in self.crates])
+        return dataclasses.replace(
+            model,
+            box_pose=np.concatenate([model.box_pose, pose.reshape(count, 7)]).astype(model.box_pose.dtype),
+            box_size=np.concatenate([model.box_size, size.reshape(count, 3)]).astype(model.box_size.dtype),
+            box_mass=np.append(model.box_mass, [MASS] * count).astype(model.box_mass.dtype),
+        )
 
-    def enter(self, physics: Physics, first: int) -> View:
-        """Fill the crates, of which ``first`` is the number of the first one, then let everybody in."""
-        for number, crate in enumerate(self.crates, first):
+    def enter(self, physics: Physics) -> View:
+        """In a world that is furnished: fill the crates, then let everybody in."""
+        for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             heap(physics, number, crate)
         for index, one in enumerate(self.robots):
             pose = _at(one.x, one.y, one.yaw)
@@ -110,11 +112,11 @@ class Stage:
         _apart(physics)
         return physics.view()
 
-    def told(self, first: int = 0) -> list[dict]:
-        """Everything that was set down, as JSON: label, kind, where."""
+    def told(self, model: Model) -> list[dict]:
+        """Everything that is set down in a vineyard, as JSON: label, kind, where."""
         told = []
         for organ, things, start in (
-            (Organ.ROBOT, self.robots, 0), (Organ.HUMAN, self.people, 0), (Organ.BOX, self.crates, first),
+            (Organ.ROBOT, self.robots, 0), (Organ.HUMAN, self.people, 0), (Organ.BOX, self.crates, len(model.box_size)),
         ):  # fmt: skip
             for number, one in enumerate(things, start):
                 told.append({"kind": organ.name.lower(), "label": label(organ, number), **dataclasses.asdict(one)})

@@ -270,7 +270,7 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
             t = low * (1.0 - fy) + high * fy
             clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
             vein = t[0] * clear
-            relief = 0.85 * clear
+            relief = 0.6 * clear
             s.normal = wp.normalize(side * (slope_u - t[1] * relief) + rib * (slope_v - t[2] * relief) + up)
             s.albedo = s.albedo * (0.72 + 0.5 * t[3])
         if age > 0.02:

@@ -111,11 +111,9 @@ def hang(
     # out
     limbs_out: wp.array2d(dtype=wp.float64),
 ):
-    """Pose the neck (thread 0), the left or right arm (1, 2), or one finger (3 to 12) between chest, head and hands.
-
-    ``held``: chest, head, left and right hand. Left things are given; right ones mirror them. A shoulder gives way when
-    the hand is out of the arm's reach, by a fifth of the upper arm at most.
-    """
+    """One thread hangs the neck (0), the left or right arm (1, 2) or a finger (3 to 12) between chest, head and hands."""
+    # ``held``: chest, head, left and right hand. Left things are given; right ones mirror them. A shoulder gives way
+    # when the hand is out of the arm's reach, by a fifth of the upper arm at most.
     thread = wp.tid()
     zero = wp.float64(0.0)
     one = wp.float64(1.0)

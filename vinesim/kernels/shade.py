@@ -40,6 +40,9 @@ class Light:
     sun_colour: wp.vec3
     sky_colour: wp.vec3
     bounce: wp.vec3
+    """From the ground."""
+    leaves: wp.vec3
+    """Through the canopy."""
     haze: wp.vec3
     taps: int
     """Shadow samples a pixel."""
@@ -84,7 +87,7 @@ def sky_light(light: Light, d: wp.vec3) -> wp.vec3:
 def ambient(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
     """Cool sky through the gaps, green light through leaves, warm bounce from the ground."""
     up = 0.5 + 0.5 * n[2]
-    above = light.sky_colour * (sky * sky) + wp.vec3(0.14, 0.19, 0.075) * (1.0 - sky)
+    above = light.sky_colour * (sky * sky) + light.leaves * (1.0 - sky)
     return above * (0.25 + 0.75 * up) + light.bounce * ((1.0 - up) * (0.35 + 0.65 * sky))
 
 
@@ -93,7 +96,7 @@ def mirrored(looks: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
     """What a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
     t = smooth(looks.noise, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
     hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, t[1])
-    above = mix(wp.vec3(0.05, 0.08, 0.02), wp.vec3(0.75, 0.95, 1.25), hole)
+    above = mix(light.leaves * 0.4, light.sky_colour * 1.3, hole)
     return mix(light.bounce * 0.8, above, smoothstep(-0.25, 0.25, r[2]))
 
 
@@ -161,7 +164,7 @@ def shine(
         if s.mirror * fresnel > 0.006:
             r = d - n * (2.0 * wp.dot(n, d))
             if kind == LEAF:
-                above = mix(wp.vec3(0.06, 0.09, 0.03), light.sky_colour, s.sky * s.sky)
+                above = mix(light.leaves * 0.45, light.sky_colour, s.sky * s.sky)
                 colour += mix(light.bounce, above, 0.5 + 0.5 * r[2]) * (wp.min(fresnel, 0.16) * s.mirror * s.occlusion)
             else:
                 colour += mirrored(looks, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)

@@ -264,21 +264,28 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.ar
             spread = wp.clamp(SUN_RADIUS * gap / m.texel, 1.0, 6.0)
         z -= spread * m.texel * 0.3
         lit = wp.where(gap > 0.0, 0.0, 1.0)
-        if taps == 0:  # two texels wide, linear in between: smooth without noise
+        if taps == 0:  # a box of two texels, or of four where what casts the shadow is far; smooth without noise
             i = int(x)
             j = int(y)
             a = x - float(i)
             b = y - float(j)
+            for k in range(4):
+                at = (j + (k & 1) * 4 - 2) * m.side + i + (k & 2) * 2 - 2
+                gap = wp.max(gap, z - m.depth[at])
+            half = wp.where(SUN_RADIUS * gap > 1.5 * m.texel, 2, 1)
             lit = float(0.0)
-            for row in range(-1, 2):
+            for row in range(-half, half + 1):
                 at = (j + row) * m.side + i
-                line = wp.where(m.depth[at] > z, 1.0, 0.0)
-                if m.depth[at - 1] > z:
+                line = float(0.0)
+                if m.depth[at - half] > z:
                     line += 1.0 - a
-                if m.depth[at + 1] > z:
+                if m.depth[at + half] > z:
                     line += a
-                lit += line * wp.where(row == 0, 1.0, wp.where(row < 0, 1.0 - b, b))
-            lit = lit * 0.25 * (float(taps) + 1.0)
+                for column in range(1 - half, half):
+                    if m.depth[at + column] > z:
+                        line += 1.0
+                lit += line * wp.where(row == -half, 1.0 - b, wp.where(row == half, b, 1.0))
+            lit = lit * 0.25 / float(half * half)
         for k in range(taps):
             v = spiral[k] * spread
             if (

@@ -35,6 +35,9 @@ TRIANGLE = wp.constant(6)
 FAR = wp.constant(1.0e30)
 OUTLINE_TEXELS = wp.constant(128.0)
 """Texels of a leaf's outline per leaf unit: 256 texels over u in [-1, 1], v in [-0.75, 1.25]."""
+TINY = wp.constant(1.0e-20)
+SLACK = wp.constant(1.0e-3)
+"""By how much bounds of a blade are wider than they need be, leaf units."""
 HIDDEN = wp.constant(-1.0e6)
 """Height at which things that are gone lie for the ray caster [m]."""
 
@@ -106,7 +109,7 @@ def hit_sphere(centre: wp.vec3, r: float, d: wp.vec3) -> float:
 
 @wp.func
 def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
-    """First hit of a ray from the origin with the hull of two spheres (Quilez, "round cone")."""
+    """First hit of a ray from the origin with the hull of two spheres (Quilez, "round cone"), without a branch."""
     ba = b - a
     slope = ra - rb
     dd = wp.dot(d, d)
@@ -125,30 +128,21 @@ def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
     k1 = d2 * m3 - m1 * m2 + m2 * slope * ra
     k0 = d2 * m5 - m1 * m1 + m1 * slope * ra * 2.0 - m0 * ra * ra
     h = k1 * k1 - k0 * k2
-    best = FAR
-    side = wp.int32(0)
-    if d2 > 0.0 and h >= 0.0:
-        root = wp.sqrt(h)
-        if k2 > 0.0:
-            t = (-root - k1) / k2
-            y = m1 - ra * slope + t * m2
-            if y > 0.0 and y < d2:
-                best = t + shift
-                side = 1
-        elif k2 < 0.0:  # steeper than the slope, as when looking along the axis: either root may be the first hit
-            for k in range(2):
-                t = (wp.where(k == 0, root, -root) - k1) / k2
-                y = m1 - ra * slope + t * m2
-                if y > 0.0 and y < d2 and t + shift > 0.0:
-                    best = wp.min(best, t + shift)
-    if side == 0:
-        h1 = m3 * m3 - dd * (m5 - ra * ra)
-        if h1 > 0.0:
-            best = (-m3 - wp.sqrt(h1)) / dd + shift
-        m6 = wp.dot(ob, d)
-        h2 = m6 * m6 - dd * (wp.dot(ob, ob) - rb * rb)
-        if h2 > 0.0:
-            best = wp.min(best, (-m6 - wp.sqrt(h2)) / dd + shift)
+    root = wp.sqrt(wp.max(h, 0.0))
+    per = 1.0 / wp.where(wp.abs(k2) > TINY, k2, TINY)
+    t1 = (-root - k1) * per
+    t2 = (root - k1) * per
+    y1 = m1 - ra * slope + t1 * m2
+    y2 = m1 - ra * slope + t2 * m2
+    wide = d2 > 0.0 and h >= 0.0  # neither sphere holds the other, and the ray meets the infinite cone
+    steep = k2 < 0.0  # than the slope, as when looking along the axis: either root may be the first hit
+    best = wp.where(wide and y1 > 0.0 and y1 < d2 and (t1 + shift > 0.0 or not steep), t1 + shift, FAR)
+    best = wp.min(best, wp.where(wide and steep and y2 > 0.0 and y2 < d2 and t2 + shift > 0.0, t2 + shift, FAR))
+    h1 = m3 * m3 - dd * (m5 - ra * ra)
+    best = wp.min(best, wp.where(h1 > 0.0, (-m3 - wp.sqrt(wp.max(h1, 0.0))) / dd + shift, FAR))
+    m6 = wp.dot(ob, d)
+    h2 = m6 * m6 - dd * (wp.dot(ob, ob) - rb * rb)
+    best = wp.min(best, wp.where(h2 > 0.0, (-m6 - wp.sqrt(wp.max(h2, 0.0))) / dd + shift, FAR))
     return wp.where(best > 0.0, best, FAR)
 
 
@@ -211,6 +205,48 @@ def hit_triangle(p: wp.vec3, q: wp.vec3, r: wp.vec3, d: wp.vec3) -> float:
 
 
 @wp.func
+def leaf_heights(bend: wp.vec4) -> wp.vec2:
+    """Lowest and highest w of a blade, leaf units (|u| <= 0.95, |v| <= 1.05)."""
+    low = wp.min(0.0, bend[0] * 0.9) + wp.min(0.0, bend[1] * 1.1) + wp.min(0.0, bend[2] * 0.95)
+    high = wp.max(0.0, bend[0] * 0.9) + wp.max(0.0, bend[1] * 1.1) + wp.max(0.0, bend[2] * 0.95)
+    return wp.vec2(low, high)
+
+
+@wp.func
+def leaf_height(bend: wp.vec4, u: float, v: float) -> float:
+    """Height w of a blade, leaf units."""
+    return bend[0] * u * u + bend[1] * v * v + bend[2] * wp.abs(u)
+
+
+@wp.func
+def leaf_extent(hull: wp.array2d(dtype=wp.vec2), number: int) -> wp.vec3:
+    """Largest |u|, lowest and highest v of an outline: corners 1 and 5 of its octagon lie at the sides, 3 and 7 at the
+    ends.
+    """
+    return wp.vec3(
+        wp.max(wp.abs(hull[number, 1][0]), wp.abs(hull[number, 5][0])), hull[number, 3][1], hull[number, 7][1]
+    )
+
+
+@wp.func
+def leaf_bulge(hull: wp.array2d(dtype=wp.vec2), number: int, bend: wp.vec4) -> wp.vec2:
+    """How far a blade rises above, and falls below, the hull of its points over the corners of its octagon, leaf units.
+
+    A quadratic deviates from its interpolation by at most its curvature times (range / 2)^2. Each half of a blade is
+    one; corners 3 and 7 lie at the midrib, or near it.
+    """
+    extent = leaf_extent(hull, number)
+    wide = 0.5 * extent[0]
+    long = 0.5 * (extent[2] - extent[1])
+    across = wide * wide * bend[0]
+    along = long * long * bend[1]
+    off = wp.abs(bend[2]) * wp.max(wp.abs(hull[number, 3][0]), wp.abs(hull[number, 7][0])) + SLACK
+    above = wp.max(-across, 0.0) + wp.max(-along, 0.0) + off
+    below = wp.max(across, 0.0) + wp.max(along, 0.0) + off
+    return wp.vec2(above, below)
+
+
+@wp.func
 def inside_outline(outline: wp.array3d(dtype=wp.int8), number: int, u: float, v: float, smooth: int) -> bool:
     """Whether a point of the leaf's plane belongs to the blade."""
     x = (u + 1.0) * OUTLINE_TEXELS - 0.5
@@ -255,6 +291,45 @@ def hit_leaf(
                             if inside_outline(outline, number, u, v, smooth):
                                 best = t
     return best
+
+
+@wp.func
+def on_sheet(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, t: float) -> float:
+    """``t`` if a ray is then over the half of ``sign`` of a blade's rectangle, else :data:`FAR`."""
+    u = sign * (o[0] + t * d[0])
+    v = o[1] + t * d[1]
+    return wp.where(u >= -1.0e-5 and u < extent[0] and v > extent[1] and v < extent[2] and t > 0.0, t, FAR)
+
+
+@wp.func
+def sheet_roots(bend: wp.vec4, extent: wp.vec3, sign: float, o: wp.vec3, d: wp.vec3) -> wp.vec2:
+    """Both hits with one half of a blade's rectangle; :data:`FAR` for none."""
+    q2 = -(bend[0] * d[0] * d[0] + bend[1] * d[1] * d[1])
+    q1 = d[2] - 2.0 * (bend[0] * o[0] * d[0] + bend[1] * o[1] * d[1]) - bend[2] * sign * d[0]
+    q0 = o[2] - bend[0] * o[0] * o[0] - bend[1] * o[1] * o[1] - bend[2] * sign * o[0]
+    h = q1 * q1 - 4.0 * q2 * q0
+    root = wp.sqrt(wp.max(h, 0.0))
+    q = -0.5 * (q1 + wp.where(q1 > 0.0, root, -root))
+    one = on_sheet(sign, extent, o, d, q0 / wp.where(wp.abs(q) > TINY, q, TINY))
+    other = on_sheet(sign, extent, o, d, q / wp.where(wp.abs(q2) > TINY, q2, TINY))
+    return wp.vec2(wp.where(h >= 0.0, one, FAR), wp.where(h >= 0.0, other, FAR))
+
+
+@wp.func
+def hit_sheet(bend: wp.vec4, extent: wp.vec3, o: wp.vec3, d: wp.vec3) -> float:
+    """First hit with the rectangle |u| < x, y < v < z that a blade is cut from; negative if there are several hits.
+
+    Without a branch, so that a compiler can take several rays at once.
+    """
+    right = sheet_roots(bend, extent, 1.0, o, d)
+    left = sheet_roots(bend, extent, -1.0, o, d)
+    first = wp.min(wp.min(right[0], right[1]), wp.min(left[0], left[1]))
+    # several, if the nearest two differ: max-min of each pair, and of the pairs
+    second = wp.min(
+        wp.max(wp.min(right[0], right[1]), wp.min(left[0], left[1])),
+        wp.min(wp.max(right[0], right[1]), wp.max(left[0], left[1])),
+    )
+    return wp.where(second < FAR, -first, first)
 
 
 @wp.func
@@ -341,14 +416,6 @@ def normal_at(s: Shapes, i: int, p: wp.vec3) -> wp.vec3:
 
 
 # ---------------------------------------------------------------------------------------------- motion
-
-
-@wp.func
-def leaf_heights(bend: wp.vec4) -> wp.vec2:
-    """Lowest and highest w of a blade, leaf units (|u| <= 0.95, |v| <= 1.05)."""
-    low = wp.min(0.0, bend[0] * 0.9) + wp.min(0.0, bend[1] * 1.1) + wp.min(0.0, bend[2] * 0.95)
-    high = wp.max(0.0, bend[0] * 0.9) + wp.max(0.0, bend[1] * 1.1) + wp.max(0.0, bend[2] * 0.95)
-    return wp.vec2(low, high)
 
 
 @wp.kernel

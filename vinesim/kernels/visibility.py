@@ -19,9 +19,13 @@ from vinesim.kernels.shapes import (
     hit_cone,
     hit_cylinder,
     hit_leaf,
+    hit_sheet,
     hit_sphere,
     hit_triangle,
-    leaf_heights,
+    inside_outline,
+    leaf_bulge,
+    leaf_extent,
+    leaf_height,
     squeeze,
     xyz,
 )
@@ -35,8 +39,17 @@ UNBOUND = wp.constant(1.0e6)
 """A tangent beyond any picture."""
 CLOSE = wp.constant(0.05)
 """Nearer than this [m] bounds are taken from spheres, which know no plane."""
+RUN = wp.constant(64)
+"""Pixels of a row that are taken at once; loops over them are written so that LLVM takes eight at a time."""
 SMOOTH_SIZE = wp.constant(120.0)
 """From this size in pixels on a leaf's outline is interpolated between texels."""
+
+
+Depths = wp.types.vector(length=64, dtype=wp.float32)
+"""Scratch for one run of pixels."""
+
+
+Pixels = wp.types.vector(length=64, dtype=wp.int32)
 
 
 @wp.struct
@@ -65,10 +78,16 @@ def ray_of(lens: Pinhole, x: int, y: int) -> wp.vec3:
 
 
 @wp.func
+def key_of(t: float, i: int) -> wp.int64:
+    """What a hit is kept as: the least is the nearest."""
+    return (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i)
+
+
+@wp.func
 def keep(pixel: int, t: float, i: int, reach: float, keys_out: wp.array(dtype=wp.int64)):
     """Enter a hit."""
     if t < reach:
-        wp.atomic_min(keys_out, pixel, (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i))
+        wp.atomic_min(keys_out, pixel, key_of(t, i))
 
 
 @wp.func
@@ -189,6 +208,9 @@ def raster_cones(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    xs = Pixels()
+    ys = Pixels()
+    depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
@@ -226,20 +248,37 @@ def raster_cones(
             banded = clear and wp.min(ca[2], cb[2]) - r > 0.01 and wp.abs(yb - ya) > 2.0
             per_row = wp.where(banded, 1.0 / (yb - ya), 0.0)
             nearest = wp.int64(int(wp.max(wp.min(a[2], b[2]) - r, 0.0) * 1.0e6)) << wp.int64(32)
-            for y in range(box[2], box[3]):
-                x0 = box[0]
-                x1 = box[1]
-                if banded:
-                    s = (float(y) - half_y - ya) * per_row
-                    e = (float(y) + half_y - ya) * per_row
-                    xs = xa + (xb - xa) * wp.clamp(s, 0.0, 1.0)
-                    xe = xa + (xb - xa) * wp.clamp(e, 0.0, 1.0)
-                    x0 = wp.max(x0, int(wp.max(wp.min(xs, xe) - half_x, 0.0)))
-                    x1 = wp.min(x1, int(wp.max(wp.max(xs, xe) + half_x + 1.0, 0.0)))
-                for x in range(x0, x1):
-                    at = y * lens.width + x
-                    if keys_out[at] > nearest:
-                        keep(at, hit_cone(a, a4[3], b, b4[3], ray_of(lens, x, y)), i, lens.reach, keys_out)
+            x = wp.int32(0)
+            y = box[2] - 1
+            last = wp.int32(0)
+            while y < box[3]:
+                n = wp.int32(0)
+                while n < RUN and y < box[3]:
+                    if x < last:
+                        if keys_out[y * lens.width + x] > nearest:
+                            xs[n] = x
+                            ys[n] = y
+                            n += 1
+                        x += 1
+                    else:
+                        y += 1
+                        x = box[0]
+                        last = box[1]
+                        if banded:
+                            s = (float(y) - half_y - ya) * per_row
+                            e = (float(y) + half_y - ya) * per_row
+                            xs_ = xa + (xb - xa) * wp.clamp(s, 0.0, 1.0)
+                            xe = xa + (xb - xa) * wp.clamp(e, 0.0, 1.0)
+                            x = wp.max(x, int(wp.max(wp.min(xs_, xe) - half_x, 0.0)))
+                            last = wp.min(last, int(wp.max(wp.max(xs_, xe) + half_x + 1.0, 0.0)))
+                        last = wp.where(y < box[3], last, 0)
+                whole = (n + 7) // 8 * 8
+                m = wp.int32(0)
+                while m < whole:
+                    depths[m] = hit_cone(a, a4[3], b, b4[3], ray_of(lens, xs[m], ys[m]))
+                    m += 1
+                for m in range(n):
+                    keep(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
 
 
 @wp.kernel
@@ -258,6 +297,7 @@ def raster_leaves(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         size = a4[3]
@@ -269,8 +309,7 @@ def raster_leaves(
             rib = lens.turn * xyz(b4)
             up = lens.turn * xyz(shapes.c[i])
             side = wp.cross(rib, up)
-            heights = leaf_heights(bend)
-            # octagon around the outline at the lowest and the highest level: bounds of x, y, x + y, x - y
+            # octagon around the picture of the blade: bounds of x, y, x + y, x - y
             x_low = float(UNBOUND)
             x_high = -float(UNBOUND)
             y_low = float(UNBOUND)
@@ -280,11 +319,13 @@ def raster_leaves(
             dif_low = float(UNBOUND)
             dif_high = -float(UNBOUND)
             z_low = float(FAR)
+            bulge = leaf_bulge(shapes.hull, number, bend)
             for n in range(8):
                 corner = shapes.hull[number, n]
-                flat = p + (side * corner[0] + rib * corner[1]) * size
+                height = leaf_height(bend, corner[0], corner[1])
+                flat = p + (side * corner[0] + rib * corner[1] + up * (height - bulge[1])) * size
                 for m in range(2):
-                    q = flat + up * (heights[m] * size)
+                    q = flat + up * (float(m) * (bulge[0] + bulge[1]) * size)
                     z_low = wp.min(z_low, q[2])
                     k_z = 1.0 / wp.max(q[2], 0.01)
                     qx = q[0] * k_z * lens.fx + lens.cx
@@ -311,6 +352,7 @@ def raster_leaves(
                 smooth = wp.int32(0)
                 if size * lens.fx > p[2] * SMOOTH_SIZE:
                     smooth = 1
+                extent = leaf_extent(shapes.hull, number)
                 nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)
                 for y in range(box[2], box[3]):
                     x0 = box[0]
@@ -320,16 +362,30 @@ def raster_leaves(
                         x0 = wp.max(x0, int(wp.max(wp.max(sum_low - fy, dif_low + fy) - 0.01, 0.0)))
                         x1 = wp.min(x1, int(wp.max(wp.min(sum_high - fy, dif_high + fy) + 1.01, 0.0)))
                     row = dz + dy * fy
-                    for x in range(x0, x1):
-                        at = y * lens.width + x
-                        if keys_out[at] > nearest:
-                            keep(
-                                at,
-                                hit_leaf(shapes.outline, number, bend, eye, row + dx * float(x), smooth),
-                                i,
-                                lens.reach,
-                                keys_out,
-                            )
+                    at = y * lens.width
+                    while x0 < x1 and keys_out[at + x0] <= nearest:
+                        x0 += 1
+                    while x0 < x1 and keys_out[at + x1 - 1] <= nearest:
+                        x1 -= 1
+                    for start in range(x0, x1, RUN):
+                        n = wp.min(x1 - start, RUN)
+                        whole = (n + 7) // 8 * 8
+                        x = wp.int32(0)
+                        while x < whole:
+                            depths[x] = hit_sheet(bend, extent, eye, row + dx * float(start + x))
+                            x += 1
+                        for k in range(n):
+                            t = depths[k]
+                            if t < lens.reach:
+                                ray = row + dx * float(start + k)
+                                if t < 0.0:
+                                    t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
+                                    keep(at + start + k, t, i, lens.reach, keys_out)
+                                elif key_of(t, i) < keys_out[at + start + k]:
+                                    u = eye[0] + t * ray[0]
+                                    v = eye[1] + t * ray[1]
+                                    if inside_outline(shapes.outline, number, u, v, smooth):
+                                        keep(at + start + k, t, i, lens.reach, keys_out)
 
 
 @wp.kernel
@@ -460,10 +516,9 @@ def ground_depth(lens: Pinhole, x: int, y: int) -> float:
     """Depth at which a pixel's ray meets the ground, z = 0."""
     d = ray_of(lens, x, y)
     fall = lens.turn[0, 2] * d[0] + lens.turn[1, 2] * d[1] + lens.turn[2, 2]
-    t = FAR
-    if fall < -1.0e-6 and lens.eye[2] > 0.0:
-        t = -lens.eye[2] / fall
-    return wp.where(t < lens.reach, t, FAR)
+    meets = fall < -1.0e-6 and lens.eye[2] > 0.0
+    t = -lens.eye[2] / wp.where(meets, fall, -1.0)
+    return wp.where(meets and t < lens.reach, t, FAR)
 
 
 @wp.kernel
@@ -478,28 +533,27 @@ def resolve(
     farthest: float,
     too_near: float,
     too_far: float,
+    run: int,
     # out
     primitive_out: wp.array(dtype=wp.int32),
     depth_out: wp.array(dtype=wp.float32),
     labels_out: wp.array(dtype=wp.int32),
 ):
-    """One thread reads one pixel's key into depth [m], label and primitive (-1 sky, -2 ground)."""
-    pixel = wp.tid()
-    key = keys[pixel]
-    t = ground_depth(lens, pixel % lens.width, pixel // lens.width)
-    i = wp.where(t < FAR, -2, -1)
-    name = wp.where(t < FAR, ground_label, 0)
-    if key < EMPTY:
-        z = float(key >> wp.int64(32)) * 1.0e-6
-        if z < t:
-            t = z
-            i = int(key & LOW)
-            name = label[i]
-    primitive_out[pixel] = i
-    labels_out[pixel] = name
-    depth = t
-    if t < nearest:
-        depth = too_near
-    if t > farthest:
-        depth = too_far
-    depth_out[pixel] = depth
+    """One thread reads ``run`` pixels' keys into depth [m], label and primitive (-1 sky, -2 ground)."""
+    first = wp.tid() * run
+    column = first % lens.width
+    row = first // lens.width
+    for pixel in range(first, first + run):
+        key = keys[pixel]
+        t = ground_depth(lens, column + pixel - first, row)
+        i = wp.where(t < FAR, -2, -1)
+        name = wp.where(t < FAR, ground_label, 0)
+        if key < EMPTY:
+            z = float(key >> wp.int64(32)) * 1.0e-6
+            if z < t:
+                t = z
+                i = int(key & LOW)
+                name = label[i]
+        primitive_out[pixel] = i
+        labels_out[pixel] = name
+        depth_out[pixel] = wp.where(t < nearest, too_near, wp.where(t > farthest, too_far, t))

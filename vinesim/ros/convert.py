@@ -45,7 +45,17 @@ LIDAR_POINT = np.dtype(
 )
 """One point of a lidar; time [s] counts from the stamp."""
 
-_FIELD_TYPES = {"f4": PointField.FLOAT32, "u2": PointField.UINT16, "u4": PointField.FLOAT32}
+DUAL_LIDAR_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "return_type", "time"],
+        "formats": ["f4", "f4", "f4", "f4", "u2", "u1", "f4"],
+        "offsets": [0, 4, 8, 12, 16, 18, 20],
+        "itemsize": 24,
+    }
+)
+"""The same of a lidar that reports two returns of a shot; return_type: 1 the strongest, 2 the other."""
+
+_FIELD_TYPES = {"f4": PointField.FLOAT32, "u1": PointField.UINT8, "u2": PointField.UINT16, "u4": PointField.FLOAT32}
 
 
 class CommandError(ValueError):
@@ -171,14 +181,20 @@ def depth_cloud(frame: CameraFrame) -> PointCloud2:
 
 
 def lidar_cloud(scan: LidarScan) -> PointCloud2:
-    """One revolution: x y z intensity ring time, unorganised, every point valid."""
-    message, points = _cloud(scan.time, scan.frame_id, LIDAR_POINT, 1, len(scan.xyz))
+    """One revolution: x y z intensity ring time (and return_type), unorganised, every point valid.
+
+    Raw, as drivers publish it: each point in the frame that the lidar had at that point's time.
+    """
+    point = LIDAR_POINT if scan.returned is None else DUAL_LIDAR_POINT
+    message, points = _cloud(scan.time, scan.frame_id, point, 1, len(scan.xyz))
     points = points[0]
     for axis, name in enumerate("xyz"):
         points[name] = scan.xyz[:, axis]
     points["intensity"] = scan.intensity
     points["ring"] = scan.ring
     points["time"] = scan.offset
+    if scan.returned is not None:
+        points["return_type"] = scan.returned
     message.is_dense = True
     return message
 

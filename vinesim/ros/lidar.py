@@ -13,7 +13,7 @@ from vinesim.world.values import LidarScan
 
 
 class Lidar:
-    """``<name>/points``: x y z intensity ring time."""
+    """``<name>/points``: x y z intensity ring time; return_type too if the lidar reports two returns of a shot."""
 
     def __init__(self, advertise: Advertise, name: str) -> None:
         self._points = advertise(PointCloud2, f"{name}/points", SENSOR)

@@ -33,7 +33,7 @@ KINDS = {
 
 @dataclasses.dataclass
 class Batch:
-    """Primitives of one kind in the frames of their carriers; ``group`` never mixes in one cluster."""
+    """Primitives of one kind in the frames of their carriers; neither groups nor bunches ever mix in one cluster."""
 
     kind: int
     a: np.ndarray
@@ -46,7 +46,8 @@ class Batch:
     label: np.ndarray
     carrier: np.ndarray
     group: np.ndarray
-    bunch: int = -1
+    bunch: np.ndarray
+    """Which bunch a primitive belongs to while that hangs; -1 for none."""
 
     def __len__(self) -> int:
         return len(self.a)
@@ -57,9 +58,9 @@ def batch(kind: int, a, *, b=0.0, c=0.0, d=0.0, material, tint, organ, label, ca
     a = np.atleast_2d(np.asarray(a, np.float32))
     n = len(a)
     wide = [np.broadcast_to(np.asarray(v, np.float32), (n, 4)) for v in (b, c, d)]
-    flat = [np.broadcast_to(np.asarray(v, np.int32), n) for v in (organ, label, carrier, group)]
+    flat = [np.broadcast_to(np.asarray(v, np.int32), n) for v in (organ, label, carrier, group, bunch)]
     tint = np.broadcast_to(np.clip(np.asarray(tint, np.float32), 0.004, 1.0), (n, 3))
-    return Batch(kind, a, *wide, np.broadcast_to(np.asarray(material, np.int32), n), tint, *flat, bunch)
+    return Batch(kind, a, *wide, np.broadcast_to(np.asarray(material, np.int32), n), tint, *flat)
 
 
 def columns(*parts) -> np.ndarray:

@@ -95,7 +95,7 @@ def camera() -> Iterator[Measurement]:
     pose = looking(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
     seen, lens = Visibility(info.width, info.height), pinhole(info, pose)
     eye = Camera(spec, info)
-    lidar = Lidar(LidarSpec.load("vlp16"))
+    lidar = Lidar(LidarSpec.load("vlp16").ideal())
     stand = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
     trees = np.unique(model.body_tree[model.bunch_body])[:20]
     awake = dataclasses.replace(view, moved=trees)
@@ -173,6 +173,5 @@ def _camera_rays(info: CameraInfo, pose: np.ndarray) -> np.ndarray:
 
 def _lidar_rays(lidar: Lidar, pose: np.ndarray) -> np.ndarray:
     """Origins and directions [shot, 6] of one revolution."""
-    e, a = np.resize(lidar._elevation.numpy(), len(lidar.offset)), lidar._azimuth.numpy()
-    d = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
+    d = lidar.grid.direction.numpy()
     return np.concatenate([np.broadcast_to(pose[:3], d.shape), d], -1).astype(np.float32)

@@ -1,7 +1,7 @@
-"""RGB-D cameras: exact depth and labels, and a picture.
+"""RGB-D cameras: a picture, labels, exact depth, and depth as the sensor measures it.
 
 Depth follows REP-118: metres along the optical axis; -Inf nearer than the sensor can measure, +Inf farther than it can,
-which includes the open sky; NaN is kept for a pixel that should have measured and did not (noise models).
+which includes the open sky; NaN for a pixel that should have measured and did not (:mod:`vinesim.sensors.stereo`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from vinesim.sensors import specs
 from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
 from vinesim.sensors.exposure import Exposure
 from vinesim.sensors.primitives import Primitives
+from vinesim.sensors.stereo import Stereo, StereoSpec
 from vinesim.sensors.sunlight import DEFAULT_SUN, Sunlight, SunPath
 from vinesim.world.ids import Organ, label
 from vinesim.world.values import CameraFrame, CameraInfo
@@ -39,15 +40,17 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """One kind of camera (``data/cameras``)."""
 
     model: str
-    width: Annotated[Number, "px"]
-    height: Annotated[Number, "px"]
-    fx: Annotated[Number, "px"]
-    fy: Annotated[Number, "px"]
-    nearest: Annotated[Number, "m"]
+    width: Annotated[Number, "px", (1.0, 8192.0)]
+    height: Annotated[Number, "px", (1.0, 8192.0)]
+    fx: Annotated[Number, "px", (1.0, 1e6)]
+    fy: Annotated[Number, "px", (1.0, 1e6)]
+    nearest: Annotated[Number, "m", (0.0, 1000.0)]
     """Smallest depth that is measured."""
-    farthest: Annotated[Number, "m"]
+    farthest: Annotated[Number, "m", (0.0, 1000.0)]
     """Largest depth that is measured."""
-    rate: Annotated[Number, "Hz"]
+    rate: Annotated[Number, "Hz", (0.01, 1000.0)]
+    stereo: StereoSpec | None = None
+    """How depth is measured; exactly unless given."""
 
     @classmethod
     def load(cls, name: str) -> CameraSpec:
@@ -59,6 +62,12 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
                 "give 0 <= nearest < farthest"
             )
         return spec
+
+    def ideal(self) -> CameraSpec:
+        """The same camera if it measured exactly and from anywhere."""
+        number = msgspec.structs.replace
+        near, far = number(self.nearest, value=0.0), number(self.farthest, value=1000.0)
+        return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None)
 
     def info(self, frame_id: str, scale: float = 1.0) -> CameraInfo:
         """Intrinsics with the principal point in the middle; ``scale`` enlarges the picture."""
@@ -130,9 +139,10 @@ class Visibility:
             self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
         else:
             primitives.raster.fill(primitives, lens, None, self.keys)
+        run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
             visibility.resolve,
-            self.width * self.height,
+            self.width * self.height // run,
             inputs=[
                 primitives.labels,
                 self.keys,
@@ -142,6 +152,7 @@ class Visibility:
                 float(farthest),
                 -float("inf"),
                 float("inf"),
+                run,
             ],
             outputs=[self.primitive, self.depth, self.labels],
             device=self.device,
@@ -198,7 +209,7 @@ class Quality:
 
 QUALITIES = {
     "fast": Quality(taps=0, block=2, samples=1, fine=1),
-    "full": Quality(taps=6, block=1, samples=1, fine=1),
+    "full": Quality(taps=0, block=1, samples=1, fine=1),
     "still": Quality(taps=12, block=2, samples=2, fine=2),
 }
 """``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
@@ -220,6 +231,9 @@ class Camera:
     exposure: float | None = None
     """Fixed; automatic unless given. 0.75 suits a sunny noon."""
     device: str = "cpu"
+    seed: int = 0
+    image: int = 0
+    """Number of the next image. What the sensor measures follows from (seed, name, this)."""
 
     def __post_init__(self) -> None:
         if self.quality not in QUALITIES:
@@ -236,6 +250,8 @@ class Camera:
         self._sunlight = Sunlight(self.sun, taps=quality.taps, period=period, fine=quality.fine, device=self.device)
         self._exposure = Exposure(width, height, samples, self.exposure, self.device)
         self._landing: list[wp.array] = []
+        reach = self.spec.nearest.value, self.spec.farthest.value
+        self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, Visibility, self.device)
 
     @property
     def rate(self) -> float:
@@ -244,17 +260,27 @@ class Camera:
 
     def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> CameraFrame:
         """The frame seen from ``pose`` [7], the optical frame in the world."""
+        pose = np.array(pose, float)
         picture = self.expose(primitives, pose, time)
         shape = (self.info.height, self.info.width)
-        rgb, depth, labels = self._fetch(picture, self.visibility.depth, self.visibility.labels)
+        rgb, exact, labels = self._fetch(picture, self.visibility.depth, self.visibility.labels)
+        rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
+        if self._stereo:
+            lens, dice = pinhole(self.info, pose), specs.dice(self.seed, self.name, self.image)
+            depth = self._stereo.measure(primitives, lens, exact, rgb, dice)
+        else:
+            too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
+            depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
+        self.image += 1
         return CameraFrame(
             time=float(time),
             name=self.name,
             info=self.info,
-            pose=np.array(pose, float),
-            rgb=rgb.reshape(*shape, 3),
-            depth=depth.reshape(shape),
+            pose=pose,
+            rgb=rgb,
+            depth=depth,
             labels=labels.reshape(shape),
+            exact_depth=exact,
         )
 
     def _fetch(self, *arrays: wp.array) -> list[np.ndarray]:
@@ -273,7 +299,7 @@ class Camera:
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
         seen = self.visibility
-        seen.draw(primitives, lens, self.spec.nearest.value, self.spec.farthest.value)
+        seen.draw(primitives, lens)
         seen, quality = self._samples, self._quality
         if quality.samples > 1:
             lens = pinhole(finer(self.info, quality.samples), pose)
@@ -301,4 +327,4 @@ class Camera:
             device=self.device,
         )
         self._exposure.halo(primitives, seen.primitive)
-        return self._exposure.develop(self._sunlight.balance, time)
+        return self._exposure.develop(self._sunlight.balance, time, self._sunlight.brightness)

@@ -11,7 +11,7 @@ import json
 import os
 import pathlib
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -23,9 +23,11 @@ from vinesim.sensors.camera import Camera, CameraSpec
 from vinesim.sensors.primitives import Primitives, still_view
 from vinesim.sensors.raycast import RayCaster, enclosing
 from vinesim.sensors.specs import SensorError
+from vinesim.sensors.vines import Ripeness
 from vinesim.world.berries import VARIETIES
 from vinesim.world.generate import generate
 from vinesim.world.ids import Organ, label
+from vinesim.world.model import Model
 from vinesim.world.scene import Scene, Season, sun_at
 from vinesim.world.values import CameraInfo, View
 
@@ -37,12 +39,16 @@ HEIGHT = (0.7, 1.7)
 """Of the camera above the ground [m]: robots' arms and heads."""
 DISTANCE = (0.35, 1.8)
 """From the camera to the bunch it looks at [m]."""
+NEAR = 2.5
+"""So far from where something happens hangs the bunch that is looked at [m]."""
 TOO_NEAR = 0.15
 """What is nearer [m] than this and fills more than a fiftieth of the picture makes it a bad one."""
 LATITUDE = np.radians(41.6)
 """Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
-_TRIES = 60
-_FOLDERS = ("images", "labels", "depth", "ids", "berries", "records")
+SEEN = 0.01
+"""Share of the pixels that show somebody or something else than the vineyard, where something happens."""
+_TRIES, _SOCIABLE = 60, 30
+_FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 
 
 class DatasetError(SensorError):
@@ -51,14 +57,30 @@ class DatasetError(SensorError):
 
 def sized(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
     """Intrinsics of a camera at another size [px]: the same horizontal field of view, square pixels kept so."""
-    if size is None:
-        return spec.info("camera_optical_frame")
-    width, height = size
+    width, height = size or (int(spec.width.value), int(spec.height.value))
     if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
         raise SensorError(f"size is {width}x{height}; give WxH from {SMALLEST}x{SMALLEST} to {LARGEST}x{LARGEST}")
+    if size is None:
+        return spec.info("camera_optical_frame")
     scale = width / spec.width.value
     focal = spec.fx.value * scale, spec.fy.value * scale
     return CameraInfo(width, height, *focal, 0.5 * (width - 1), 0.5 * (height - 1), "camera_optical_frame")
+
+
+class Life(Protocol):
+    """What moves in an image and who is there beside the vines; sensors draw it and do not know where it comes from."""
+
+    def settings(self) -> dict[str, Any]:
+        """All that decides what happens, as JSON."""
+        ...
+
+    def view(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
+        """What there is, near which point [2] m of the ground to look, and a record of it; None if nothing happens.
+
+        It follows from the model and the random numbers alone. ``actors`` of the record are what
+        :func:`formats.actors` takes.
+        """
+        ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -70,6 +92,8 @@ class Plan:
     camera: str
     size: tuple[int, int] | None = None
     """Width and height [px]; the camera's own unless given."""
+    life: Life | None = None
+    """Without it plants hang at rest and nobody is there."""
     renderer: str = "warp"
 
     def settings(self) -> dict[str, Any]:
@@ -82,6 +106,7 @@ class Plan:
             "camera": self.camera,
             "size": [info.width, info.height],
             "renderer": self.renderer,
+            "life": None if self.life is None else self.life.settings(),
         }
 
     def vineyard(self, number: int) -> Scene:
@@ -101,9 +126,10 @@ class Vineyard:
         self.model = generate(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
-        self.view: View = still_view(self.model)
-        self.primitives = Primitives(self.model, renderer=plan.renderer)
-        self.primitives.update(self.view)
+        self.still: View = still_view(self.model)
+        self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
+        self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer)
+        self.primitives.update(self.still)
         self.caster = RayCaster(self.primitives)
         self.spec = CameraSpec.load(plan.camera)
         self.info = sized(self.spec, plan.size)
@@ -112,11 +138,13 @@ class Vineyard:
         """Write everything about one image; its record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _daylight(rng)
-        seen = self._look(rng)
-        truths = truth.of_bunches(self.primitives, self.view, seen, self.caster)
-        camera = Camera(self.spec, self.info, "camera", sun, quality="still")
+        view, near, happens = self._happening(image)
+        seen = self._look(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
+        truths = truth.of_bunches(self.primitives, view, seen, self.caster)
+        camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image=image)
         frame = camera.render(self.primitives, seen.pose)
-        bunches = formats.record(truths, self.info)
+        bunches = formats.record(truths, self.info, self.ripeness.bunch)
+        happens["actors"] = formats.actors(happens.get("actors", []), seen.labels)
         name = f"{image:06d}"
         record = {
             "image": image,
@@ -129,12 +157,14 @@ class Vineyard:
                 "yellow": self.scene.season.yellow,
             },
             "sun": {"hour": hour, "direction": list(sun)},
+            **happens,
             "camera": formats.camera(self.spec.model, self.info, seen.pose),
             "bunches": bunches,
         }
         images = {
             "images": frame.rgb,
-            "depth": picture.depth_millimetres(frame.depth),
+            "depth": picture.depth_millimetres(frame.exact_depth),
+            "measured": picture.depth_millimetres(frame.depth),
             "ids": formats.ids(frame.labels),
             "berries": formats.berry_ids(seen),
         }
@@ -146,14 +176,40 @@ class Vineyard:
         with _part(_record(folder, image)) as part:
             formats.write_json(part, record)
 
-    def _look(self, rng: np.random.Generator) -> truth.Look:
-        """From somewhere near a bunch, in the open, with that bunch in sight."""
+    def _happening(self, image: int) -> tuple[View, np.ndarray | None, dict[str, Any]]:
+        """What there is in an image, drawn; whatever was there in the image before leaves no trace."""
+        every = np.arange(len(self.model.tree_first))
+        self.primitives.update(self.still, every)
+        life = self.plan.life
+        happens = life and life.view(self.model, np.random.default_rng([self.plan.seed, 5, image]))
+        if happens is None:
+            return self.still, None, {}
+        self.primitives.update(happens[0], every)
+        return happens
+
+    def _look(
+        self, rng: np.random.Generator, view: View, near: np.ndarray | None, company: list[tuple[float, float]]
+    ) -> truth.Look:
+        """From somewhere near a hanging bunch, in the open, with that bunch in sight.
+
+        If something happens, the bunch hangs ``near`` there, and somebody of the ``company`` [m] is seen too, if a
+        place for that is soon found.
+        """
         model = self.model
-        for _ in range(_TRIES):
-            bunch = int(rng.integers(len(model.bunch_body)))
-            pose = self.view.body_q[model.bunch_body[bunch]].astype(float)
+        hanging = np.flatnonzero(view.bunch_attached)
+        if near is not None:
+            away = np.linalg.norm(view.body_q[model.bunch_body[hanging], :2] - near, axis=1)
+            hanging = hanging[away < NEAR] if (away < NEAR).any() else hanging
+        if not len(hanging):
+            raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
+        for attempt in range(_TRIES):
+            bunch = int(hanging[rng.integers(len(hanging))])
+            pose = view.body_q[model.bunch_body[bunch]].astype(float)
             middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
             height, away, around = rng.uniform(*HEIGHT), rng.uniform(*DISTANCE), rng.uniform(0.0, 2.0 * np.pi)
+            if company and attempt < _SOCIABLE:  # somebody is behind the bunch
+                behind = np.array(company[rng.integers(len(company))]) - middle[:2]
+                around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
             rise = height - middle[2]
             level = np.sqrt(max(away**2 - rise**2, rise**2))  # never steeper than 45 degrees
             eye = np.array([*(middle[:2] + level * np.array([np.cos(around), np.sin(around)])), height])
@@ -165,6 +221,8 @@ class Vineyard:
             optical[3:] = frames.multiply(optical[3:], roll)
             seen = truth.look(self.primitives, self.info, optical)
             shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
+            if company and attempt < _SOCIABLE and (seen.labels >= label(Organ.BOX, 0)).mean() < SEEN:
+                continue
             if (seen.depth < TOO_NEAR).mean() < 0.02 and shown >= formats.LEAST_PIXELS:
                 return seen
         raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_TRIES} tries")

@@ -16,6 +16,8 @@ KEY = 0.13
 """Exposed light of the usual picture's geometric mean; white is 1."""
 SHARE = 0.5
 """Of the stops that would bring any picture to the key: what is dark stays darker than what is bright."""
+DUSK = 0.7
+"""Share of the stops by which a low sun gives less light that exposure makes up beforehand."""
 LEAST, MOST = 0.25, 8.0
 """Exposure stays within these."""
 SETTLING = 0.25
@@ -41,8 +43,11 @@ class Exposure:
         self._tone = wp.array(textures.tone_curve(), dtype=wp.uint8, device=device)
         self._time: float | None = None
 
-    def develop(self, balance: np.ndarray, time: float) -> wp.array:
-        """The picture [pixel, 3] uint8 of :attr:`radiance`, taken at ``time`` [s]: it stays on the device."""
+    def develop(self, balance: np.ndarray, time: float, brightness: float = 1.0) -> wp.array:
+        """The picture [pixel, 3] uint8 of :attr:`radiance`, taken at ``time`` [s]: it stays on the device.
+
+        ``balance`` are factors [3] on linear light; ``brightness`` is that of the daylight beside a sunny noon.
+        """
         if self.fixed is None:
             since = np.inf if self._time is None else time - self._time
             keep = float(np.exp(-since / SETTLING)) if since >= 0.0 else 0.0
@@ -61,7 +66,7 @@ class Exposure:
             wp.launch(
                 shade.expose,
                 1,
-                inputs=[USUAL, KEY, SHARE, LEAST, MOST, keep],
+                inputs=[USUAL * max(brightness, 0.01) ** -DUSK, KEY, SHARE, LEAST, MOST, keep],
                 outputs=[self._sum, self._exposure],
                 device=self.device,
             )

@@ -1,7 +1,8 @@
 """The thread that sees: takes the newest view of the world, renders what somebody wants, drops what comes too late.
 
 Physics calls :meth:`Eyes.see` every tick and never waits. Warp's launches release the interpreter lock, so a frame
-costs the physics thread the other core, not its tick.
+costs the physics thread the other core, not its tick. A camera takes a frame at once; a lidar fires at every view the
+shots whose time has come, and delivers a revolution when its last shot is fired.
 """
 
 from __future__ import annotations
@@ -11,25 +12,29 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
 import warp as wp
 
-from vinesim.kernels import lidar, shade, shadows, shapes, visibility
+from vinesim.kernels import lidar, shade, shadows, shapes, stereo, sweep, visibility
 from vinesim.sensors.camera import Camera
 from vinesim.sensors.lidar import Lidar
 from vinesim.sensors.primitives import Primitives
+from vinesim.sensors.rolling import Rolling
 from vinesim.world.model import Model
 from vinesim.world.values import CameraFrame, LidarScan, View
 
 log = logging.getLogger(__name__)
 
+_STANDS = 1024
+"""Poses of a lidar that wait for the thread; more than it ever needs."""
+
 
 def load_kernels() -> None:
     """Compile what pictures and scans need, or read it from the cache, before anybody waits for one."""
-    for module in (lidar, shade, shadows, shapes, visibility):
+    for module in (lidar, shade, shadows, shapes, stereo, sweep, visibility):
         wp.load_module(module, device="cpu")
 
 
@@ -82,6 +87,8 @@ class Eyes:
         self.failure: BaseException | None = None
         """What stopped the thread, if anything did; :meth:`see` and :meth:`stop` raise it."""
         self._due = dict.fromkeys(names, -np.inf)
+        self._turning = {m.name: Rolling(m.sensor, m.rate) for m in mounts if isinstance(m.sensor, Lidar)}
+        self._stands: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in self._turning}
         self._news = threading.Condition()
         self._newest: tuple[View, Mapping[str, np.ndarray]] | None = None
         self._moved: list[np.ndarray] = []
@@ -124,6 +131,10 @@ class Eyes:
         self._raise()
         with self._news:
             self._newest = (view, poses)
+            for name in self._stands.keys() & poses.keys():
+                self._stands[name].append((view.time, poses[name]))
+                if len(self._stands[name]) > _STANDS:
+                    del self._stands[name][: _STANDS // 2]
             if len(view.moved):
                 self._moved.append(view.moved)
                 if len(self._moved) > 256:
@@ -148,6 +159,10 @@ class Eyes:
                     (view, poses), self._newest = self._newest, None
                     moved += self._moved
                     self._moved = []
+                    for name, stands in self._stands.items():
+                        for time, pose in stands:
+                            self._turning[name].track.add(time, pose)
+                        stands.clear()
                 due = [m for m in self.mounts if self._is_due(m, view.time, poses)]
                 if not due:
                     continue
@@ -156,20 +171,33 @@ class Eyes:
                 for mount in due:
                     if self._stopping:
                         return
-                    sensor, pose = mount.sensor, poses[mount.name]
-                    take = sensor.render if isinstance(sensor, Camera) else sensor.scan
-                    mount.deliver(take(self.primitives, pose, view.time))
-                    self.frames[mount.name] += 1
+                    for result in self._take(mount, view.time, poses[mount.name]):
+                        mount.deliver(result)
+                        self.frames[mount.name] += 1
         except BaseException as failure:  # surfaced by the next see() or stop()
             log.exception("the sensing thread stops")
             self.failure = failure
 
+    def _take(self, mount: Mount, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
+        """What a sensor has to deliver at simulation time ``now``."""
+        if isinstance(mount.sensor, Camera):
+            yield mount.sensor.render(self.primitives, pose, now)
+            return
+        turning = self._turning[mount.name]
+        missed = turning.dropped
+        yield from turning.go(self.primitives, now)
+        self.dropped[mount.name] += turning.dropped - missed
+
     def _is_due(self, mount: Mount, now: float, poses: Mapping[str, np.ndarray]) -> bool:
-        """Whether a sensor takes a frame of simulation time ``now``; counts the frames it has missed."""
+        """Whether a sensor has something to do at simulation time ``now``; counts the frames it has missed."""
         name = mount.name
         if name not in poses or not mount.wanted():
             self._due[name] = -np.inf  # whoever comes back is served at once, and missed nothing
+            if name in self._turning:
+                self._turning[name].stop(now)
             return False
+        if name in self._turning:
+            return True
         due, period = self._due[name], 1.0 / (mount.rate or mount.sensor.rate)
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf

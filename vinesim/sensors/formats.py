@@ -15,6 +15,8 @@ from vinesim.world.berries import VARIETIES
 from vinesim.world.ids import Kind, Organ, thing, thing_name
 from vinesim.world.values import CameraInfo
 
+_FURTHER = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
+"""What annotations tell of a bunch beside what COCO asks for."""
 LEAST_PIXELS = 16
 """A bunch is annotated (COCO, YOLO) if at least so many pixels show it; records name all."""
 
@@ -45,8 +47,11 @@ def camera(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
     }
 
 
-def record(truths: Iterable[BunchTruth], info: CameraInfo) -> list[dict[str, Any]]:
-    """Bunches of one picture as JSON: metres in world axes; boxes are [column, row, width, height] px."""
+def record(truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray | None = None) -> list[dict[str, Any]]:
+    """Bunches of one picture as JSON: metres in world axes; boxes are [column, row, width, height] px.
+
+    ``ripeness`` [bunch], 0 green to 1 ripe; all are ripe unless given.
+    """
     return [
         {
             "bunch": one.bunch,
@@ -54,6 +59,7 @@ def record(truths: Iterable[BunchTruth], info: CameraInfo) -> list[dict[str, Any
             "label": one.label,
             "tree": one.tree,
             "variety": VARIETIES[one.variety].name,
+            "ripeness": 1.0 if ripeness is None else float(ripeness[one.bunch]),
             "attached": one.attached,
             "pixels": one.pixels,
             "amodal_pixels": one.amodal_pixels,
@@ -148,7 +154,7 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
         "num_keypoints": int(within),
         "amodal_bbox": bunch["amodal_box"],
         "amodal_segmentation": bunch["amodal_mask"],
-        **{name: bunch[name] for name in ("occlusion", "bunch", "tree", "variety", "berries", "berries_seen")},
+        **{name: bunch[name] for name in _FURTHER},
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.kernels import materials
 from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, batch
-from vinesim.sensors.vines import bunch_parts
+from vinesim.sensors.vines import Ripeness, bunches
 from vinesim.world.figures import smooth
 from vinesim.world.ids import Organ, label
 from vinesim.world.model import Model
@@ -37,7 +37,14 @@ _SMOOTH_STEPS = 2047
 """Levels of either coordinate of a packed normal."""
 
 
-def rigid(model: Model, links: tuple[Link, ...], first: int, groups: int, shape: dict[int, np.ndarray]) -> list[Batch]:
+def rigid(
+    model: Model,
+    links: tuple[Link, ...],
+    first: int,
+    groups: int,
+    shape: dict[int, np.ndarray],
+    ripeness: Ripeness | None = None,
+) -> list[Batch]:
     """Shapes of all links; carriers and groups count on from the given numbers.
 
     ``shape`` has the poses [piece, 7] of each picked bunch's pieces in its frame.
@@ -46,8 +53,9 @@ def rigid(model: Model, links: tuple[Link, ...], first: int, groups: int, shape:
     for k, link in enumerate(links):
         if link.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
             place = shape[link.index]
-            mine = bunch_parts(model, link.index, place, np.full(len(place), first + k), groups + k)
-            batches += [dataclasses.replace(b, bunch=-1) for b in mine]
+            which, on = np.array([link.index]), np.full(len(place), first + k)
+            mine = bunches(model, which, [place], [on], np.array([groups + k]), ripeness)
+            batches += [dataclasses.replace(b, bunch=np.full(len(b), -1)) for b in mine]
             continue
         usual = _USUAL.get(link.organ, "paint")
         name = label(link.organ, link.index)

@@ -17,7 +17,7 @@ from vinesim.sensors import renderers, textures
 from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
 from vinesim.sensors.grounds import fixed, litter, meadow, rows_of
 from vinesim.sensors.links import rigid
-from vinesim.sensors.vines import bunch_parts, canes, foliage, pieces_of
+from vinesim.sensors.vines import Ripeness, bunches, canes, foliage, pieces_of
 from vinesim.world.ids import Organ
 from vinesim.world.model import Model
 from vinesim.world.state import State
@@ -32,11 +32,19 @@ _CLUSTER = 24
 class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.shapes`)."""
 
-    def __init__(self, model: Model, *, grass: float = 90.0, device: str = "cpu", renderer: str = "warp") -> None:
-        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``renderer``:
-        who draws (:data:`~vinesim.sensors.renderers.RENDERERS`).
+    def __init__(
+        self,
+        model: Model,
+        *,
+        grass: float = 90.0,
+        device: str = "cpu",
+        ripeness: Ripeness | None = None,
+        renderer: str = "warp",
+    ) -> None:
+        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
+        the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.renderers`).
         """
-        self.model, self.device = model, device
+        self.model, self.device, self._ripeness = model, device, ripeness
         self.raster = renderers.raster_of(renderer, device)
         """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.Visibility` does so itself."""
         bodies = len(model.body_mass)
@@ -46,10 +54,9 @@ class Primitives:
         low, high = (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
         trees = len(model.tree_first)
         batches = [canes(model, bodies), *foliage(model)]
-        for bunch, body in enumerate(model.bunch_body):
-            pieces = pieces_of(model, bunch)
-            own = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(pieces), 1))
-            batches += bunch_parts(model, bunch, own, pieces, int(model.body_tree[body]))
+        every = np.arange(len(model.bunch_body))
+        pieces = [pieces_of(model, bunch) for bunch in every]
+        batches += bunches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
         self._tree_batches = len(batches)
         around = [fixed(model, bodies)]
         if grass > 0.0:
@@ -98,18 +105,18 @@ class Primitives:
 
     def _build(self, links: tuple[Link, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
-        moving = rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links))
+        moving = rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links), self._ripeness)
         batches = self._plants + moving
         first_rigid = len(self._plants)
         pieces: dict[str, list[np.ndarray]] = {
             name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
         }
-        kinds, firsts, sizes, owners, bunches, rigids = [], [], [], [], [], []
+        kinds, firsts, sizes, owners, of_bunch, rigids = [], [], [], [], [], []
         total = 0
         for number, batch in enumerate(batches):
-            order = np.argsort(batch.group, kind="stable")
-            group = batch.group[order]
-            starts = np.flatnonzero(np.r_[True, group[1:] != group[:-1]])
+            order = np.lexsort((batch.bunch, batch.group))
+            group, bunch = batch.group[order], batch.bunch[order]
+            starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])
             runs = np.diff(np.r_[starts, len(group)])
             parts = (runs + _CLUSTER - 1) // _CLUSTER
             inner = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
@@ -120,7 +127,7 @@ class Primitives:
             sizes.append(size)
             kinds.append(np.full(len(first), batch.kind))
             owners.append(np.full(len(first), -1) if still or number >= first_rigid else group[first])
-            bunches.append(np.full(len(first), batch.bunch))
+            of_bunch.append(bunch[first])
             rigids.append(np.full(len(first), number >= first_rigid))
             for name, pile in pieces.items():
                 pile.append(getattr(batch, name)[order])
@@ -130,7 +137,7 @@ class Primitives:
             whole["c"][: len(self._baked_c)] = self._baked_c
         self.label, self.organ = whole["label"].astype(np.int32), whole["organ"].astype(np.int32)
         self.cluster_first, self.cluster_size, self.cluster_kind, self._owner, self._cluster_bunch = (
-            np.concatenate(x).astype(np.int32) for x in (firsts, sizes, kinds, owners, bunches)
+            np.concatenate(x).astype(np.int32) for x in (firsts, sizes, kinds, owners, of_bunch)
         )
         self.rigid_clusters = np.flatnonzero(np.concatenate(rigids))
         self.cluster_version = np.zeros(len(self.cluster_first), np.int64)

@@ -118,7 +118,8 @@ _NOON = np.array([3.3, 2.95, 2.35])
 _HIGH = 0.75
 _DEPTH = np.array([0.10, 0.15, 0.27])
 """Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh's and some haze."""
-_SKY, _BOUNCE, _HAZE = np.array([0.52, 0.70, 1.0]), np.array([0.26, 0.21, 0.13]), np.array([0.50, 0.60, 0.72])
+_SKY, _HAZE = np.array([0.52, 0.70, 1.0]), np.array([0.50, 0.60, 0.72])
+_BOUNCE, _LEAVES = np.array([0.26, 0.21, 0.13]), np.array([0.14, 0.19, 0.075])
 _ADAPTED = 0.6
 """Share of the colour of the light that a camera's white balance takes out."""
 
@@ -157,6 +158,8 @@ class Sunlight:
         self._stands = np.zeros(3)
         self.balance = np.ones(3)
         """White balance: factors [3] on linear light."""
+        self.brightness = 1.0
+        """Light that falls on the ground, beside that of a high sun."""
         light = shade.Light()
         light.taps = taps
         k = np.arange(max(taps, 1))
@@ -178,11 +181,13 @@ class Sunlight:
         sun, dim = daylight(direction[2])
         light.sun = _vector(direction)
         light.sun_colour = _vector(sun)
-        light.sky_colour, light.bounce, light.haze = (_vector(c * dim) for c in (_SKY, _BOUNCE, _HAZE))
+        light.sky_colour, light.haze = _vector(_SKY * dim), _vector(_HAZE * dim)
         table = textures.sky(tuple(direction), tuple(sun)) * np.float32(dim)
         light.table = wp.array(table, dtype=wp.vec3, device=self._device)
         falls = sun * max(direction[2], 0.05) + _SKY * dim
         usual = _NOON * _HIGH + _SKY
+        self.brightness = float(falls.mean() / usual.mean())
+        light.bounce, light.leaves = _vector(_BOUNCE * self.brightness), _vector(_LEAVES * self.brightness)
         self.balance = (usual / usual.mean() / (falls / falls.mean())) ** _ADAPTED
         raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])
         raised /= np.linalg.norm(raised)

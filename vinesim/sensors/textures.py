@@ -112,7 +112,7 @@ def blades() -> np.ndarray:
                     reach = 0.55 * length * (1.0 - 0.7 * abs(start - 0.35))
                     away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
                     vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
-                    crease += 0.014 * np.exp(-((away / 0.03) ** 2))
+                    crease += 0.009 * np.exp(-((away / 0.03) ** 2))
         fine, wide = _blurred(rng, 3.0), _blurred(rng, 8.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
         slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / SIDE)

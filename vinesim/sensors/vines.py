@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from vinesim import frames
@@ -112,76 +114,187 @@ def foliage(model: Model) -> list[Batch]:
     return [blade, petiole, node]
 
 
-def bunch_parts(model: Model, bunch: int, place: np.ndarray, carrier: np.ndarray, group: int) -> list[Batch]:
-    """Berries and rachis of one bunch, each in its piece: head, first cluster, ... of poses ``place`` [piece, 7] on
-    ``carrier`` [piece]. A bunch without clusters is one piece.
+_UNRIPE = {"green": np.array([0.085, 0.150, 0.022]), "shot": 0.45}
+"""Colour of a hard green berry (linear RGB reflectance, GUESSED by eye), and the size of a berry without seeds."""
+_SPREAD = 0.10
+"""Standard deviation of ripeness within a bunch: berries soften and colour one by one. GUESSED."""
+_SHOT = 0.06
+"""Share of the berries of a quite unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ripeness:
+    """How ripe fruit is: 0 green and hard, 1 as the variety is harvested."""
+
+    bunch: np.ndarray
+    """[bunch] mean of its berries."""
+    seed: int = 0
+    """Of the differences between berries."""
+
+    @classmethod
+    def random(cls, count: int, seed: int) -> Ripeness:
+        """Of a vineyard before harvest: most bunches ripe, some turning, few green."""
+        rng = np.random.default_rng([seed, 3])
+        return cls(np.round(rng.beta(2.2, 0.7, count), 3), seed)
+
+
+def bunches(
+    model: Model,
+    which: np.ndarray,
+    place: list[np.ndarray] | None,
+    carrier: list[np.ndarray],
+    group: np.ndarray,
+    ripeness: Ripeness | None = None,
+) -> list[Batch]:
+    """Berries and rachises of some bunches [k], each in its pieces: head, first cluster, ... on ``carrier`` [k][piece].
+
+    ``place`` [k][piece, 7] are the poses of the pieces on what carries them, their own frames unless given. A bunch
+    without clusters is one piece. ``group`` [k]; without ``ripeness`` all are ripe.
     """
-    number = int(model.bunch_variety[bunch])
-    variety = VARIETIES[number]
-    one = berries(
-        float(model.bunch_length[bunch]),
-        float(model.bunch_radius[bunch]),
-        int(model.bunch_berries[bunch]),
-        number,
-        int(model.bunch_seed[bunch]),
-    )
-    rng = np.random.default_rng(int(model.bunch_seed[bunch]))
-    n = len(one.radius)
-    colour = np.array(variety.colour) * (1.0 + 0.10 * rng.normal(size=(n, 1)))
-    colour = colour + np.array([0.055, 0.014, 0.010]) * (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(
-        0.5 * rng.normal(size=(n, 1)), 0.0, 1.0
-    )
-    pieces = len(carrier)
-    length = float(model.bunch_length[bunch]) / pieces
-    on_berry = piece_of(one.position, float(model.bunch_length[bunch]), pieces)
+    found: list[Batch] = []
+    for first in range(0, len(which), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        found += _bunches(model, which[part], place and place[part], carrier[part], group[part], ripeness)
+    return found
 
-    def placed(points: np.ndarray, piece: np.ndarray) -> np.ndarray:
-        """Points [k, 3] of the bunch's frame, as drawn, on their carriers."""
-        along = (length * piece)[:, None] * np.array([1.0, 0.0, 0.0])
-        return place[piece, :3] + frames.rotate(place[piece, 3:], points - along)
 
-    away = np.hypot(*one.position[:, 1:].T)
-    depth = np.clip(0.35 + 0.65 * away / max(np.quantile(away, 0.8), 1e-6), 0.0, 1.0)
-    name = label(Organ.BUNCH, bunch)
-    common = {"organ": int(Organ.BUNCH), "label": name, "group": group, "bunch": bunch}
-    turn = place[on_berry, 3:]
-    crowding = _crowding(one.position, one.radius, one.neighbours)
+_AT_ONCE = 256
+"""Bunches that are laid out together: numpy then works on rows, and temporary arrays stay small."""
+
+
+def _bunches(
+    model: Model,
+    which: np.ndarray,
+    place: list[np.ndarray] | None,
+    carrier: list[np.ndarray],
+    group: np.ndarray,
+    ripeness: Ripeness | None,
+) -> list[Batch]:
+    ones = [
+        berries(
+            float(model.bunch_length[b]),
+            float(model.bunch_radius[b]),
+            int(model.bunch_berries[b]),
+            int(model.bunch_variety[b]),
+            int(model.bunch_seed[b]),
+        )
+        for b in which
+    ]
+    pieces = np.array([len(c) for c in carrier])
+    first_piece = np.cumsum(pieces) - pieces
+    on = np.concatenate(carrier)
+    poses = None if place is None else np.concatenate(place)
+    whole = model.bunch_length[which].astype(float)
+
+    def piece_at(position: np.ndarray, owner: np.ndarray) -> np.ndarray:
+        inner = piece_of(position, whole[owner], pieces[owner])
+        return first_piece[owner] + inner
+
+    def placed(points: np.ndarray, piece: np.ndarray, owner: np.ndarray) -> np.ndarray:
+        """Points [k, 3] of the bunches' frames, as drawn, on their carriers."""
+        along = (whole / pieces)[owner] * (piece - first_piece[owner])
+        own = points - along[:, None] * np.array([1.0, 0.0, 0.0])
+        return own if poses is None else poses[piece, :3] + frames.rotate(poses[piece, 3:], own)
+
+    def turned(vectors: np.ndarray, piece: np.ndarray) -> np.ndarray:
+        return vectors if poses is None else frames.rotate(poses[piece, 3:], vectors)
+
+    count = np.array([len(one.radius) for one in ones])
+    owner = np.repeat(np.arange(len(ones)), count)
+    position, radius, axis, foot = (
+        np.concatenate([getattr(one, name) for one in ones]) for name in ("position", "radius", "axis", "foot")
+    )
+    varieties = [VARIETIES[v] for v in model.bunch_variety[which]]
+    elongation = np.array([v.elongation for v in varieties])[owner]
+    ripe = np.array([v.colour for v in varieties])[owner]
+    draws = [np.random.default_rng(int(model.bunch_seed[b])) for b in which]
+    tone, blush = (np.concatenate([rng.normal(size=n) for rng, n in zip(draws, count, strict=True)]) for _ in (0, 1))
+    speck = np.concatenate([rng.uniform(size=n) for rng, n in zip(draws, count, strict=True)])
+    colour = ripe * (1.0 + 0.10 * tone[:, None])
+    reddish = (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(0.5 * blush[:, None], 0.0, 1.0)
+    colour = colour + np.array([0.055, 0.014, 0.010]) * reddish
+    if ripeness is not None:
+        colour, radius = _unripe(colour, radius, ripeness, which, count)
+    away = np.hypot(*position[:, 1:].T)
+    edge = np.array([_reach(a) for a in np.split(away, np.cumsum(count)[:-1])])[owner]
+    depth = np.clip(0.35 + 0.65 * away / np.maximum(edge, 1e-6), 0.0, 1.0)
+    start_row = (np.cumsum(count) - count)[owner][:, None]
+    near = np.concatenate([_padded(one.neighbours) for one in ones])
+    crowding = _crowding(position, radius, np.where(near >= 0, near + start_row, -1))
+    names = label(Organ.BUNCH, 0) + which
+    on_berry = piece_at(position, owner)
+
+    def common(piece: np.ndarray, owner: np.ndarray) -> dict:
+        return {
+            "organ": int(Organ.BUNCH), "label": names[owner], "group": group[owner], "bunch": which[owner],
+            "carrier": on[piece],
+        }  # fmt: skip
+
     fruit = batch(
         SPHEROID,
-        columns(placed(one.position, on_berry), one.radius),
-        b=columns(frames.rotate(turn, one.axis), variety.elongation),
-        c=columns(rng.uniform(size=n), depth, 0.0, 0.0),
-        d=columns(frames.rotate(turn, crowding[:, :3]), crowding[:, 3]),
+        columns(placed(position, on_berry, owner), radius),
+        b=columns(turned(axis, on_berry), elongation),
+        c=columns(speck, depth, 0.0, 0.0),
+        d=columns(turned(crowding[:, :3], on_berry), crowding[:, 3]),
         material=int(materials.BERRY),
         tint=colour,
-        carrier=carrier[on_berry],
-        **common,
+        **common(on_berry, owner),
     )
-    start, end = one.rachis[:, :-1].reshape(-1, 3), one.rachis[:, 1:].reshape(-1, 3)
-    steps = one.rachis.shape[1] - 1
-    taper = np.tile(np.linspace(0.0028, 0.0013, steps), len(one.rachis))
-    middle = piece_of(0.5 * (start + end), float(model.bunch_length[bunch]), pieces)
+    lines = [one.rachis for one in ones]
+    start, end = (np.concatenate([r[:, k : k - 1 or None].reshape(-1, 3) for r in lines]) for k in (0, 1))
+    taper = np.concatenate([np.tile(np.linspace(0.0028, 0.0013, r.shape[1] - 1), len(r)) for r in lines])
+    line_owner = np.repeat(np.arange(len(ones)), [len(r) * (r.shape[1] - 1) for r in lines])
+    middle = piece_at(0.5 * (start + end), line_owner)
     rachis = batch(
         CONE,
-        columns(placed(start, middle), taper),
-        b=columns(placed(end, middle), 0.9 * taper),
+        columns(placed(start, middle, line_owner), taper),
+        b=columns(placed(end, middle, line_owner), 0.9 * taper),
         material=int(materials.STEM),
         tint=_STEM,
-        carrier=carrier[middle],
-        **common,
+        **common(middle, line_owner),
     )
-    berry_end = one.position - one.axis * (one.radius * variety.elongation * 0.95)[:, None]
-    loose = np.linalg.norm(berry_end - one.foot, axis=1) > 0.002
+    berry_end = position - axis * (radius * elongation * 0.95)[:, None]
+    loose = np.linalg.norm(berry_end - foot, axis=1) > 0.002
+    loose_piece, loose_owner = on_berry[loose], owner[loose]
     pedicel = batch(
         CONE,
-        columns(placed(one.foot, on_berry), 0.0010)[loose],
-        b=columns(placed(berry_end, on_berry), 0.0014)[loose],
+        columns(placed(foot[loose], loose_piece, loose_owner), 0.0010),
+        b=columns(placed(berry_end[loose], loose_piece, loose_owner), 0.0014),
         material=int(materials.STEM),
         tint=_STEM,
-        carrier=carrier[on_berry][loose],
-        **common,
+        **common(loose_piece, loose_owner),
     )
     return [b for b in (fruit, rachis, pedicel) if len(b)]
+
+
+def _unripe(
+    colour: np.ndarray, radius: np.ndarray, ripeness: Ripeness, which: np.ndarray, count: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and radii of berries that are not all ripe: each on its way from green, and some that never set out."""
+    owner = np.repeat(np.arange(len(which)), count)
+    draws = zip(which, count, strict=True)
+    draw = np.concatenate([np.random.default_rng([ripeness.seed, 4, int(b)]).uniform(size=(n, 2)) for b, n in draws])
+    mean = ripeness.bunch[which][owner]
+    own = mean + _SPREAD * np.sqrt(12.0) * (draw[:, 0] - 0.5) * np.minimum(4.0 * (1.0 - mean), 1.0)
+    shot = draw[:, 1] < _SHOT * (1.0 - mean)
+    own = np.where(shot, 0.0, np.clip(own, 0.0, 1.0))
+    share = (own * own * (3.0 - 2.0 * own))[:, None]
+    size = np.where(shot, _UNRIPE["shot"], 0.9 + 0.1 * own)
+    return _UNRIPE["green"] * (1.0 - share) + colour * share, radius * size
+
+
+def _reach(away: np.ndarray) -> float:
+    """The 80 % quantile, without the ceremony of np.quantile."""
+    at = 0.8 * (len(away) - 1)
+    low = int(at)
+    ends = np.partition(away, [low, min(low + 1, len(away) - 1)])
+    return float(ends[low] + (at - low) * (ends[min(low + 1, len(away) - 1)] - ends[low]))
+
+
+def _padded(neighbours: np.ndarray) -> np.ndarray:
+    """Eight neighbours of each berry [n, 8], -1 where there are fewer."""
+    missing = 8 - neighbours.shape[1]
+    return np.pad(neighbours, ((0, 0), (0, missing)), constant_values=-1) if missing else neighbours
 
 
 def _crowding(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:

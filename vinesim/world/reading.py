@@ -60,6 +60,8 @@ def _explain(message: str, data: Any, kind: Any) -> str:
     """Place, finding and remedy from msgspec's text, which ends in ``- at `$.a[0].b```."""
     what, _, where = message.partition(" - at `$")
     place = where.rstrip("`").lstrip(".")
+    if "[...]" in place:  # below a name that the file chose, which msgspec does not tell
+        return f"{place}: {what}; correct it there"
     steps = [int(s) if s.isdigit() else s for s in re.findall(r"[^.\[\]]+", place)]
     found: Any = data
     for step in steps:

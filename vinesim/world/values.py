@@ -363,20 +363,22 @@ class CameraFrame:
     """[height, width] float32 m along z; NaN no return, -Inf too near, +Inf too far (REP-118)."""
     labels: np.ndarray
     """[height, width] int32, :func:`vinesim.world.ids.label`; 0 is nothing."""
+    exact_depth: np.ndarray | None = None
+    """[height, width] float32 m along z, whatever the sensor can measure: no noise, no gaps; +Inf for the sky."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LidarScan:
-    """One revolution of a lidar; points that returned nothing are left out."""
+    """One revolution of a lidar; shots that returned nothing are left out."""
 
     time: float
     """Time of the first firing [s]."""
     name: str
     frame_id: str
     pose: np.ndarray
-    """[7] of the lidar in the world."""
+    """[7] of the lidar in the world at ``time``."""
     xyz: np.ndarray
-    """[point, 3] float32 m, lidar frame (x forward, z up)."""
+    """[point, 3] float32 m, in the lidar's frame (x forward, z up) at the firing of each point."""
     intensity: np.ndarray
     """[point] float32 0..255"""
     ring: np.ndarray
@@ -385,6 +387,8 @@ class LidarScan:
     """[point] float32 s after ``time``."""
     labels: np.ndarray
     """[point] int32"""
+    returned: np.ndarray | None = None
+    """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
