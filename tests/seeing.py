@@ -99,3 +99,51 @@ def pixel_rays(info: CameraInfo = SMALL) -> np.ndarray:
     """Rays [height, width, 3] of all pixels in the optical frame, 1 along its axis, float64."""
     u, v = np.meshgrid(np.arange(info.width), np.arange(info.height))
     return np.stack([(u - info.cx) / info.fx, (v - info.cy) / info.fy, np.ones(u.shape)], -1)
+
+
+def finely(primitives: Primitives, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cones, berries and leaves [k] as triangles: vertices [n, 3] m and faces [m, 3]."""
+    shapes = primitives.shapes
+    kind = shapes.kind.numpy()
+    a, b, c, d = (getattr(shapes, name).numpy().astype(float) for name in "abcd")
+    outline = shapes.outline.numpy()
+    ball = trimesh.creation.icosphere(3)
+    v, u = np.meshgrid(np.linspace(-0.74, 1.24, 100), np.linspace(-0.98, 0.98, 99), indexing="ij")
+    corner = np.arange(u.size).reshape(u.shape)
+    quads = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], -1).reshape(-1, 4)
+    parts = []
+    for i in which:
+        if kind[i] == 1:
+            points = ball.vertices * a[i, 3]
+            points = points + np.outer(points @ b[i, :3], b[i, :3]) * (b[i, 3] - 1.0) + a[i, :3]
+            parts.append((points, ball.faces))
+        elif kind[i] == 0:
+            # the hull of two spheres: a prism between the circles where the tangent cone touches them
+            axis = b[i, :3] - a[i, :3]
+            length = np.linalg.norm(axis)
+            axis /= length
+            lean = (a[i, 3] - b[i, 3]) / length
+            for end in (a[i], b[i]):
+                parts.append((ball.vertices * end[3] + end[:3], ball.faces))
+            if abs(lean) < 1.0:
+                side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+                side /= np.linalg.norm(side)
+                angle = np.arange(96) * (2.0 * np.pi / 96)
+                round_ = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(axis, side))
+                normal = axis * lean + round_ * np.sqrt(1.0 - lean * lean)
+                points = np.concatenate([end[:3] + normal * end[3] for end in (a[i], b[i])])
+                k, n = np.arange(96), (np.arange(96) + 1) % 96
+                parts.append((points, np.concatenate([np.stack([k, n, k + 96], 1), np.stack([n, n + 96, k + 96], 1)])))
+        else:
+            rib, up = b[i, :3], c[i, :3]
+            height = d[i, 0] * u**2 + d[i, 1] * v**2 + d[i, 2] * np.abs(u)
+            points = (u[..., None] * np.cross(rib, up) + v[..., None] * rib + height[..., None] * up) * a[i, 3] + a[
+                i, :3
+            ]
+            row = ((v.ravel()[quads].mean(1) + 0.75) * 128.0).astype(int)
+            column = ((u.ravel()[quads].mean(1) + 1.0) * 128.0).astype(int)
+            kept = quads[outline[int(b[i, 3]), row, column] > 0]
+            parts.append((points.reshape(-1, 3), np.concatenate([kept[:, [0, 1, 2]], kept[:, [0, 2, 3]]])))
+    starts = np.cumsum([0] + [len(points) for points, _ in parts])
+    vertices = np.concatenate([points for points, _ in parts])
+    return vertices, np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=False)])

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 import seeing
 
 from vinesim import frames
+from vinesim.kernels import materials
 from vinesim.physics.people import PARTS, figure, hand_shapes, standing
 from vinesim.physics.rigid import Rigid
 from vinesim.physics.yard import CRATE_WALL
+from vinesim.robot import description
 from vinesim.sensors import links
+from vinesim.sensors.camera import Camera
 from vinesim.sensors.picture import looking
 from vinesim.world import figures
 from vinesim.world.figures import FigureError
@@ -186,3 +191,41 @@ def test_a_cone_tapers_the_way_it_says() -> None:
     low, high = (round(seeing.SMALL.cy + z * scale) for z in (0.4, -0.4))
     assert rows[low] == pytest.approx(2 * 0.2 * scale, rel=0.1)
     assert rows[high] == pytest.approx(2 * 0.05 * scale, abs=3)
+
+
+def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
+    """F48: an open hand before a camera shows gaps between fingers and reaches further than a fist."""
+    views = {}
+    for name, bent in (("open", 0.0), ("fist", 1.0)):
+        pose = standing(frames.pose(np.zeros(3)))
+        up = frames.aligned(np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0]))
+        hand = {"right": frames.pose(np.array([0.5, -0.4, 1.4]), up), "right_fingers": (bent,) * 5}
+        rigid = Rigid(seeing.empty())
+        rigid.add_human(HumanSpec("eva", 4, dataclasses.replace(pose, **hand)))
+        primitives, _ = seeing.world(*rigid.links(), at=rigid.link_q())
+        depth, _ = seeing.raster(primitives, looking(np.array([1.1, -0.4, 1.4]), np.array([0.5, -0.4, 1.42])))
+        views[name] = depth < 0.75
+    rows = {name: np.flatnonzero(view.any(1)) for name, view in views.items()}
+    scale = seeing.SMALL.fx / 0.6
+    assert rows["fist"].min() - rows["open"].min() > 0.04 * scale
+    across = [np.abs(np.diff(row.astype(int))).sum() for row in views["open"]]
+    assert max(across) >= 8  # four fingers or more side by side
+    assert max(np.abs(np.diff(row.astype(int))).sum() for row in views["fist"][: rows["fist"].min() + 10]) < 8
+
+
+def test_a_lamp_is_seen_in_its_colour() -> None:
+    """F41: the lit tier of a robot's signal tower is the greenest thing in a picture of it, in the shade too."""
+    rigid = Rigid(seeing.empty())
+    rigid.add_robot(description.load("vinebot").spec("bot"))
+    primitives, _ = seeing.world(*rigid.links(), at=rigid.link_q())
+    pose = looking(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
+    frame = Camera(seeing.IDEAL, seeing.SMALL, sun=(0.6, 0.3, 0.5)).render(primitives, pose)
+    _, seen = seeing.raster(primitives, pose)
+    material = primitives.looks.material.numpy()
+    tint = primitives.looks.tint.numpy()
+    lit = (seen >= 0) & (material[seen] == int(materials.LAMP)) & (tint[seen][..., 1] > 2.0 * tint[seen][..., 0])
+    assert lit.sum() > 20
+    green = frame.rgb[..., 1].astype(int) - frame.rgb[..., 0]
+    assert np.median(green[lit]) > 60
+    robot = (frame.labels >> 20 == int(Organ.ROBOT)) & ~lit
+    assert np.median(green[robot]) < 20

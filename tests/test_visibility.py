@@ -141,6 +141,62 @@ def test_what_crosses_the_pinhole_plane_is_seen(kind: str, side: tuple[float, fl
     assert (primitive == ids).mean() >= 0.999
 
 
+GRAZING = {
+    "sphere": ((0.3,), (0.0, 0.0, 0.302)),
+    "capsule": ((0.05, 0.6), (0.0, 0.0, 0.052)),
+    "cylinder": ((0.05, 0.6), (0.0, 0.0, 0.052)),
+    "box": ((0.6, 0.6, 0.05), (0.0, 0.0, 0.052)),
+    "ellipsoid": ((0.6, 0.3, 0.05), (0.0, 0.0, 0.052)),
+    "mesh": ((1.0, 1.0, 1.0), (0.0, 0.0, 0.052)),
+}
+"""A solid and a point 2 mm above its middle: seen from there, all of it is grazed."""
+
+
+@pytest.mark.parametrize("kind", GRAZING)
+@pytest.mark.parametrize("away", [0.0, 0.7, 1.5])
+def test_what_is_grazed_is_seen(kind: str, away: float, tmp_path) -> None:
+    """Along a surface, from 2 mm above it, from its middle, its end and beyond."""
+    size, above = GRAZING[kind]
+    file = tmp_path / "slab.stl"
+    trimesh.creation.box((1.2, 1.2, 0.1)).subdivide().export(file)
+    turn = frames.exp(np.array([0.0, np.pi / 2.0, 0.0])) if kind in ("capsule", "cylinder") else frames.IDENTITY
+    made = seeing.shape(kind, *size, at=(0.0, 0.0, 1.0), turn=turn, **({"file": str(file)} if kind == "mesh" else {}))
+    primitives, _ = seeing.world(seeing.thing(made))
+    eye = np.array([-away, 0.0, 1.0]) + above
+    pose = looking(eye, eye + np.array([1.0, 0.05, -0.01]))
+    depth, primitive = seeing.raster(primitives, pose)
+    truth, ids = seeing.oracle(primitives, pose)
+    same = primitive == ids
+    assert (ids >= 0).sum() > 50
+    assert same.mean() >= 0.999
+    assert np.median(np.abs(depth[same & (ids >= 0)] - truth[same & (ids >= 0)])) < 2e-5
+
+
+def test_leaves_seen_edge_on() -> None:
+    model = seeing.demo()
+    primitives, view = seeing.world(model=model)
+    blade = frames.compose(view.body_q[model.leaf_body], model.leaf_pose)[::400]
+    shown = 0
+    for pose in blade:
+        eye = pose[:3] + frames.rotate(pose[3:], np.array([-0.25, 0.02, 0.003]))
+        camera = looking(eye, pose[:3] + frames.rotate(pose[3:], np.array([0.05, 0.0, 0.0])))
+        primitive, ids = seeing.raster(primitives, camera)[1], seeing.oracle(primitives, camera)[1]
+        shown += (primitives.organ[ids[ids >= 0]] == int(Organ.LEAF)).any()
+        assert (primitive == ids).mean() >= 0.999
+    assert shown >= len(blade) // 2
+
+
+def test_a_mesh_that_crosses_the_pinhole_plane_is_seen(tmp_path) -> None:
+    file = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(2, radius=0.05).export(file)
+    for side in ((0.0, 0.06), (0.06, 0.0), (-0.05, 0.05)):
+        ball = seeing.shape("mesh", 1.0, 1.0, 1.0, at=(0.01, side[0], 1.0 + side[1]), file=str(file))
+        primitives, _ = seeing.world(seeing.thing(ball))
+        primitive, ids = seeing.raster(primitives, seeing.AHEAD)[1], seeing.oracle(primitives, seeing.AHEAD)[1]
+        assert (ids >= 0).sum() > 50
+        assert (primitive == ids).mean() >= 0.999
+
+
 def test_leaves_that_cross_the_pinhole_plane_are_seen() -> None:
     model = seeing.demo()
     primitives, view = seeing.world(model=model)
@@ -175,3 +231,27 @@ def test_nothing_in_the_world_is_ground_and_sky() -> None:
     assert set(np.unique(primitive)) == {-2, -1}
     row = int(seeing.SMALL.cy) + 60
     assert depth[row, 10] == pytest.approx(seeing.SMALL.fy / (row - seeing.SMALL.cy), rel=1e-5)
+
+
+def test_depth_of_fine_meshes() -> None:
+    """Open3D (Embree) sees berries as icospheres of 1,280 triangles, canes as prisms of 96 sides between such spheres,
+    and leaves as sheets of some 6,000.
+    """
+    o3d = pytest.importorskip("open3d", reason="the peer of this test")
+    primitives, _ = seeing.world(model=seeing.demo())
+    pose = looking(np.array([0.9, 0.75, 1.45]), np.array([1.1, 0.0, 1.5]))
+    depth, primitive = seeing.raster(primitives, pose)
+    shown = np.unique(primitive[primitive >= 0])
+    scene = o3d.t.geometry.RaycastingScene()
+    vertices, faces = seeing.finely(primitives, shown)
+    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32)))
+    rays = frames.rotate(pose[3:], seeing.pixel_rays())
+    rays = np.concatenate([np.broadcast_to(pose[:3], rays.shape), rays], -1).astype(np.float32)
+    theirs = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+    both = (primitive >= 0) & np.isfinite(theirs)
+    assert both.sum() > 0.9 * (primitive >= 0).sum() > 1e4
+    kind = primitives.shapes.kind.numpy()[primitive]
+    error = np.abs(np.where(both, depth, 0.0) - np.where(both, theirs, 0.0))
+    assert np.median(error[both]) <= 2e-4
+    for one in (0, 1, 2):  # cones, berries, leaves
+        assert np.median(error[both & (kind == one)]) <= 2e-4

@@ -425,7 +425,7 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
             box((0.04, 0.152, 0.012), (0.035, 0, 0.015), colour="red", solid=False),
             cylinder(0.006, 0.152, (0.052, 0, 0.024), ACROSS, colour="steel", solid=False),
             cylinder(0.006, 0.152, (0.052, 0, -0.024), ACROSS, colour="steel", solid=False),
-            box((0.004, 0.02, 0.008), (0.061, 0, 0.0), colour="lamp_green", solid=False),
+            box((0.004, 0.02, 0.008), (0.061, 0, 0.0), colour="glass", solid=False),
         ),
         mass=0.75,
     )

@@ -52,6 +52,12 @@ def _eyes() -> Iterator[Measurement]:
     return eyes()
 
 
+def _lidar() -> Iterator[Measurement]:
+    from vinesim.sensors.bench_lidar import lidar
+
+    return lidar()
+
+
 def _sync(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     from vinesim.client.bench_sync import sync
 
@@ -94,6 +100,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "tick": _tick,
     "asleep": _asleep,
     "camera": _camera,
+    "lidar": _lidar,
     "eyes": _eyes,
     "sync": _sync,
     "link": _link,

@@ -16,9 +16,11 @@ from vinesim.kernels.shapes import (
     hit_box,
     hit_sphere,
     hit_triangle,
-    leaf_heights,
+    leaf_bulge,
+    leaf_height,
     xyz,
 )
+from vinesim.kernels.visibility import RUN, Depths, Pixels
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -96,7 +98,9 @@ def cast_shadows(
     depth_out: wp.array(dtype=wp.float32),
 ):
     """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it."""
-    k, lane, row = wp.tid()
+    k, lane, part = wp.tid()
+    texels = Pixels()
+    depths = Depths()
     cluster = which[k]
     kind = clusters.kind[cluster]
     bound = ball[cluster]
@@ -118,7 +122,7 @@ def cast_shadows(
             r = a4[3]
             if kind == SPHEROID:
                 rt = r / m.texel
-                for py in range(wp.max(int(y - rt), 0) + row, wp.min(int(y + rt) + 2, m.side), slices):
+                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
                     for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
                         dx = float(px) - x
                         dy = float(py) - y
@@ -136,7 +140,7 @@ def cast_shadows(
                     per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
                     y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
                     y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, m.side)
-                    for py in range(y0 + row, y1, slices):
+                    for py in range(y0 + part, y1, slices):
                         x0 = wp.min(x, x + ex) - wide
                         x1 = wp.max(x, x + ex) + wide
                         if wp.abs(ey) > 4.0:
@@ -172,43 +176,59 @@ def cast_shadows(
                     uy = (wp.dot(m.up, across) - un * tu) * per_leaf
                     vx = (wp.dot(m.right, rib) - rn * tv) * per_leaf
                     vy = (wp.dot(m.up, rib) - un * tv) * per_leaf
-                    heights = leaf_heights(bend)
+                    # octagon around the blade as the sun sees it: bounds of x, y, x + y, x - y
+                    bulge = leaf_bulge(shapes.hull, number, bend)
                     lx = float(1.0e9)
                     hx = float(-1.0e9)
                     ly = float(1.0e9)
                     hy = float(-1.0e9)
+                    ls = float(1.0e9)
+                    hs = float(-1.0e9)
+                    ld = float(1.0e9)
+                    hd = float(-1.0e9)
                     for n in range(8):
                         corner = shapes.hull[number, n]
+                        flat = across * corner[0] + rib * corner[1]
+                        height = leaf_height(bend, corner[0], corner[1]) - bulge[1]
                         for level in range(2):
-                            w = heights[level]
-                            qx = (
-                                x
-                                + (corner[0] * wp.dot(m.right, across) + corner[1] * wp.dot(m.right, rib) + w * rn)
-                                / per_leaf
-                            )
-                            qy = (
-                                y
-                                + (corner[0] * wp.dot(m.up, across) + corner[1] * wp.dot(m.up, rib) + w * un) / per_leaf
-                            )
+                            q = (flat + up * (height + float(level) * (bulge[0] + bulge[1]))) / per_leaf
+                            qx = x + wp.dot(m.right, q)
+                            qy = y + wp.dot(m.up, q)
                             lx = wp.min(lx, qx)
                             hx = wp.max(hx, qx)
                             ly = wp.min(ly, qy)
                             hy = wp.max(hy, qy)
-                    for py in range(wp.max(int(ly), 0) + row, wp.min(int(hy) + 2, m.side), slices):
-                        fy = float(py) - y
-                        for px in range(wp.max(int(lx), 0), wp.min(int(hx) + 2, m.side)):
-                            fx = float(px) - x
-                            u0 = ux * fx + uy * fy
-                            v0 = vx * fx + vy * fy
-                            if u0 > -1.2 and u0 < 1.2 and v0 > -1.0 and v0 < 1.5:
-                                w = bend[0] * u0 * u0 + bend[2] * wp.abs(u0) + bend[1] * v0 * v0
+                            ls = wp.min(ls, qx + qy)
+                            hs = wp.max(hs, qx + qy)
+                            ld = wp.min(ld, qx - qy)
+                            hd = wp.max(hd, qx - qy)
+                    su = wp.dot(m.sun, across)
+                    sv = wp.dot(m.sun, rib)
+                    for py in range(wp.max(int(ly), 0) + part, wp.min(int(hy) + 2, m.side), slices):
+                        row = float(py)
+                        first_x = wp.max(int(wp.max(wp.max(lx, wp.max(ls - row, ld + row)), 0.0)), 0)
+                        last_x = wp.min(int(wp.max(wp.min(hx, wp.min(hs - row, hd + row)) + 2.0, 0.0)), m.side)
+                        for start in range(first_x, last_x, RUN):
+                            run = wp.min(last_x - start, RUN)
+                            whole = (run + 7) // 8 * 8
+                            lot = wp.int32(0)
+                            while lot < whole:  # without a branch: eight texels at once
+                                fx = float(start + lot) - x
+                                u0 = ux * fx + uy * (row - y)
+                                v0 = vx * fx + vy * (row - y)
+                                w = leaf_height(bend, u0, v0)
                                 u = u0 + tu * w
                                 v = v0 + tv * w
-                                if u > -0.99 and u < 0.99 and v > -0.74 and v < 1.24:
-                                    if int(shapes.outline[number, int((v + 0.75) * 128.0), int((u + 1.0) * 128.0)]) > 0:
-                                        w = bend[0] * u * u + bend[2] * wp.abs(u) + bend[1] * v * v
-                                        toward = wp.dot(m.sun, across) * u + wp.dot(m.sun, rib) * v + slant * w
-                                        darken(m, px, py, z - toward * r, depth_out)
+                                over = u > -0.99 and u < 0.99 and v > -0.74 and v < 1.24
+                                over = over and u0 > -1.2 and u0 < 1.2 and v0 > -1.0 and v0 < 1.5
+                                texel = int((v + 0.75) * 128.0) * 256 + int((u + 1.0) * 128.0)
+                                texels[lot] = wp.where(over, texel, 0)  # no blade has its corner
+                                depths[lot] = z - (su * u + sv * v + slant * leaf_height(bend, u, v)) * r
+                                lot += 1
+                            for lot in range(run):
+                                texel = texels[lot]
+                                inside = int(shapes.outline[number, texel >> 8, texel & 255]) > 0
+                                darken(m, start + lot, py, wp.where(inside, depths[lot], FAR), depth_out)
             else:
                 o = xyz(a4)
                 reach_i = r
@@ -223,7 +243,7 @@ def cast_shadows(
                 x = wp.dot(p, m.right) / m.texel
                 y = wp.dot(p, m.up) / m.texel
                 rt = reach_i / m.texel
-                for py in range(wp.max(int(y - rt), 0) + row, wp.min(int(y + rt) + 2, m.side), slices):
+                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
                     for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
                         from_sun = (
                             m.corner

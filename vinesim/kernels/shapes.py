@@ -99,12 +99,8 @@ def hit_sphere(centre: wp.vec3, r: float, d: wp.vec3) -> float:
     along = wp.dot(d, centre) / dd
     miss = centre - d * along  # the perpendicular: r^2 - |miss|^2 loses no digits far away
     h = (r * r - wp.dot(miss, miss)) / dd
-    t = FAR
-    if h >= 0.0:
-        t = along - wp.sqrt(h)
-        if t <= 0.0:
-            t = FAR
-    return t
+    t = along - wp.sqrt(wp.max(h, 0.0))
+    return wp.where(h >= 0.0 and t > 0.0, t, FAR)
 
 
 @wp.func

@@ -167,6 +167,9 @@ def raster_spheroids(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    xs = Pixels()
+    ys = Pixels()
+    depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
@@ -179,17 +182,26 @@ def raster_spheroids(
                 stretch = 1.0 / b4[3] - 1.0
                 centre = squeeze(p, axis, stretch)
                 nearest = wp.int64(int(wp.max(p[2] - r, 0.0) * 1.0e6)) << wp.int64(32)
-                for y in range(box[2], box[3]):
-                    for x in range(box[0], box[1]):
-                        at = y * lens.width + x
-                        if keys_out[at] > nearest:
-                            keep(
-                                at,
-                                hit_sphere(centre, a4[3], squeeze(ray_of(lens, x, y), axis, stretch)),
-                                i,
-                                lens.reach,
-                                keys_out,
-                            )
+                x = box[0]
+                y = box[2]
+                while y < box[3]:
+                    n = wp.int32(0)
+                    while n < RUN and y < box[3]:
+                        if keys_out[y * lens.width + x] > nearest:
+                            xs[n] = x
+                            ys[n] = y
+                            n += 1
+                        x += 1
+                        if x == box[1]:
+                            x = box[0]
+                            y += 1
+                    whole = (n + 7) // 8 * 8
+                    m = wp.int32(0)
+                    while m < whole:
+                        depths[m] = hit_sphere(centre, a4[3], squeeze(ray_of(lens, xs[m], ys[m]), axis, stretch))
+                        m += 1
+                    for m in range(n):
+                        keep(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
 
 
 @wp.kernel
@@ -233,20 +245,27 @@ def raster_cones(
                 if b[2] < cut and a[2] > cut:
                     cb = a + ba * ((cut - a[2]) / ba[2])
             bound = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
-            fa = ball_bound(lens, ca, r)
-            fb = ball_bound(lens, cb, r)
+            fa = ball_bound(lens, ca, wp.where(a[2] < cut, r, a4[3]))
+            fb = ball_bound(lens, cb, wp.where(b[2] < cut, r, b4[3]))
             if clear:
                 bound = wp.vec4(wp.min(fa[0], fb[0]), wp.max(fa[1], fb[1]), wp.min(fa[2], fb[2]), wp.max(fa[3], fb[3]))
             box = pixels(lens, bound)
-            # In one row a slanted cone covers only a band: the hull of the bounds of its two ends.
+            # In one row a slanted cone covers only a band around the line between the pictures of its ends, as wide as
+            # these ellipses reach across it: support^2 = (n_x h_x)^2 + (n_y h_y)^2 + 2 n_x n_y h_x h_y correlation.
             ya = 0.5 * (fa[2] + fa[3])
             yb = 0.5 * (fb[2] + fb[3])
             xa = 0.5 * (fa[0] + fa[1])
             xb = 0.5 * (fb[0] + fb[1])
             half_x = 0.5 * wp.max(fa[1] - fa[0], fb[1] - fb[0]) + 0.01
             half_y = 0.5 * wp.max(fa[3] - fa[2], fb[3] - fb[2]) + 0.01
-            banded = clear and wp.min(ca[2], cb[2]) - r > 0.01 and wp.abs(yb - ya) > 2.0
-            per_row = wp.where(banded, 1.0 / (yb - ya), 0.0)
+            banded = clear and wp.min(ca[2], cb[2]) > 1.5 * r + 0.01 and wp.abs(yb - ya) > 2.0
+            slope = (xb - xa) / wp.where(banded, yb - ya, 1.0)
+            tilt = wp.max(
+                wp.abs(ca[0] * ca[1]) / wp.max(ca[2] * ca[2] - r * r, 1.0e-6),
+                wp.abs(cb[0] * cb[1]) / wp.max(cb[2] * cb[2] - r * r, 1.0e-6),
+            )
+            across = slope * half_y
+            band = wp.sqrt(half_x * half_x + across * across + 2.0 * wp.abs(half_x * across) * wp.min(tilt, 1.0)) + 0.02
             nearest = wp.int64(int(wp.max(wp.min(a[2], b[2]) - r, 0.0) * 1.0e6)) << wp.int64(32)
             x = wp.int32(0)
             y = box[2] - 1
@@ -265,12 +284,9 @@ def raster_cones(
                         x = box[0]
                         last = box[1]
                         if banded:
-                            s = (float(y) - half_y - ya) * per_row
-                            e = (float(y) + half_y - ya) * per_row
-                            xs_ = xa + (xb - xa) * wp.clamp(s, 0.0, 1.0)
-                            xe = xa + (xb - xa) * wp.clamp(e, 0.0, 1.0)
-                            x = wp.max(x, int(wp.max(wp.min(xs_, xe) - half_x, 0.0)))
-                            last = wp.min(last, int(wp.max(wp.max(xs_, xe) + half_x + 1.0, 0.0)))
+                            centre = xa + slope * (float(y) - ya)
+                            x = wp.max(x, int(wp.max(centre - band, 0.0)))
+                            last = wp.min(last, int(wp.max(centre + band + 1.0, 0.0)))
                         last = wp.where(y < box[3], last, 0)
                 whole = (n + 7) // 8 * 8
                 m = wp.int32(0)
@@ -297,6 +313,8 @@ def raster_leaves(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
+    xs = Pixels()
+    ys = Pixels()
     depths = Depths()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
@@ -354,38 +372,45 @@ def raster_leaves(
                     smooth = 1
                 extent = leaf_extent(shapes.hull, number)
                 nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)
-                for y in range(box[2], box[3]):
-                    x0 = box[0]
-                    x1 = box[1]
-                    fy = float(y)
-                    if not crossing:
-                        x0 = wp.max(x0, int(wp.max(wp.max(sum_low - fy, dif_low + fy) - 0.01, 0.0)))
-                        x1 = wp.min(x1, int(wp.max(wp.min(sum_high - fy, dif_high + fy) + 1.01, 0.0)))
-                    row = dz + dy * fy
-                    at = y * lens.width
-                    while x0 < x1 and keys_out[at + x0] <= nearest:
-                        x0 += 1
-                    while x0 < x1 and keys_out[at + x1 - 1] <= nearest:
-                        x1 -= 1
-                    for start in range(x0, x1, RUN):
-                        n = wp.min(x1 - start, RUN)
-                        whole = (n + 7) // 8 * 8
-                        x = wp.int32(0)
-                        while x < whole:
-                            depths[x] = hit_sheet(bend, extent, eye, row + dx * float(start + x))
+                x = wp.int32(0)
+                y = box[2] - 1
+                last = wp.int32(0)
+                while y < box[3]:
+                    n = wp.int32(0)
+                    while n < RUN and y < box[3]:
+                        if x < last:
+                            if keys_out[y * lens.width + x] > nearest:
+                                xs[n] = x
+                                ys[n] = y
+                                n += 1
                             x += 1
-                        for k in range(n):
-                            t = depths[k]
-                            if t < lens.reach:
-                                ray = row + dx * float(start + k)
-                                if t < 0.0:
-                                    t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
-                                    keep(at + start + k, t, i, lens.reach, keys_out)
-                                elif key_of(t, i) < keys_out[at + start + k]:
-                                    u = eye[0] + t * ray[0]
-                                    v = eye[1] + t * ray[1]
-                                    if inside_outline(shapes.outline, number, u, v, smooth):
-                                        keep(at + start + k, t, i, lens.reach, keys_out)
+                        else:
+                            y += 1
+                            x = box[0]
+                            last = box[1]
+                            fy = float(y)
+                            if not crossing:
+                                x = wp.max(x, int(wp.max(wp.max(sum_low - fy, dif_low + fy) - 0.01, 0.0)))
+                                last = wp.min(last, int(wp.max(wp.min(sum_high - fy, dif_high + fy) + 1.01, 0.0)))
+                            last = wp.where(y < box[3], last, 0)
+                    whole = (n + 7) // 8 * 8
+                    m = wp.int32(0)
+                    while m < whole:
+                        depths[m] = hit_sheet(bend, extent, eye, dz + dx * float(xs[m]) + dy * float(ys[m]))
+                        m += 1
+                    for k in range(n):
+                        t = depths[k]
+                        if t < lens.reach:
+                            at = ys[k] * lens.width + xs[k]
+                            ray = dz + dx * float(xs[k]) + dy * float(ys[k])
+                            if t < 0.0:
+                                t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
+                                keep(at, t, i, lens.reach, keys_out)
+                            elif key_of(t, i) < keys_out[at]:
+                                u = eye[0] + t * ray[0]
+                                v = eye[1] + t * ray[1]
+                                if inside_outline(shapes.outline, number, u, v, smooth):
+                                    keep(at, t, i, lens.reach, keys_out)
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-"""``vinesim bench camera``: depth, labels, pictures and lidar rays beside Open3D's ray caster (Embree), in one process.
+"""``vinesim bench camera``: depth, labels and pictures beside Open3D's ray caster (Embree), in one process.
 
 Both see the same vineyard; Open3D gets it meshed (berries as icospheres of 80 triangles, canes as prisms, leaves as
 quads), about 0.9 million triangles. Cases alternate, medians of CPU time of the whole process are compared: it does not
@@ -7,10 +7,11 @@ matter who uses how many cores.
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,17 +19,17 @@ import trimesh
 from vinesim import frames
 from vinesim.sensors.batches import CONE, LEAF, SPHEROID
 from vinesim.sensors.camera import Camera, CameraSpec, Visibility, pinhole
-from vinesim.sensors.lidar import Lidar, LidarSpec
 from vinesim.sensors.picture import looking
-from vinesim.sensors.primitives import Primitives, still_view
+from vinesim.sensors.primitives import Primitives
 from vinesim.world.generate import generate
+from vinesim.world.model import Model
 from vinesim.world.scene import load
 from vinesim.world.values import CameraInfo, Measurement
 
 _ROUNDS = 7
 
 
-def _alternate(*cases: Callable[[], object]) -> list[float]:
+def alternate(*cases: Callable[[], object]) -> list[float]:
     """Median CPU milliseconds of each case, run in turn."""
     spent: list[list[float]] = [[] for _ in cases]
     for case in cases:
@@ -85,93 +86,52 @@ def meshed(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
 
 
-def camera() -> Iterator[Measurement]:
-    """Rasteriser, picture, lidar and motion; the peer is Open3D where it is installed."""
+def demo() -> tuple[Model, Primitives]:
+    """The vineyard of both benches, without grass."""
     model = generate(load("demo"))
-    primitives = Primitives(model, grass=0.0)
-    view = still_view(model)
+    return model, Primitives(model, grass=0.0)
+
+
+def embree(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Open3D's ray caster over triangles."""
+    import open3d as o3d
+
+    rays = o3d.t.geometry.RaycastingScene()
+    rays.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+    return rays
+
+
+def camera() -> Iterator[Measurement]:
+    """Rasteriser and pictures; the peer is Open3D where it is installed."""
+    _, primitives = demo()
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
     pose = looking(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
     seen, lens = Visibility(info.width, info.height), pinhole(info, pose)
-    eye = Camera(spec, info)
-    lidar = Lidar(LidarSpec.load("vlp16").ideal())
-    stand = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
-    trees = np.unique(model.body_tree[model.bunch_body])[:20]
-    awake = dataclasses.replace(view, moved=trees)
-
-    def follow() -> None:
-        primitives.update(awake)
-        lidar.scan(primitives, stand)
-
-    cases: list[Callable[[], object]] = [
-        lambda: seen.draw(primitives, lens),
-        lambda: eye.render(primitives, pose),
-        lambda: lidar.scan(primitives, stand),
-        follow,
-    ]
-    count = primitives.count
-    try:
+    eyes = {name: Camera(spec, info, quality=name) for name in ("fast", "full")}
+    cases: list[Callable[[], object]] = [lambda: seen.draw(primitives, lens)]
+    cases += [lambda eye=eye: eye.render(primitives, pose) for eye in eyes.values()]
+    name, peer = f"depth and labels 640x480, {primitives.count} primitives", ""
+    if find_spec("open3d") is not None:
         import open3d as o3d
-    except ImportError:
-        raster, frame, scan, moving = _alternate(*cases)
-        yield Measurement("camera", f"depth and labels 640x480, {count} primitives", raster, "CPU ms")
-        yield Measurement("camera", "picture 640x480, cached shadows", frame, "CPU ms")
-        yield Measurement("camera", f"lidar, {len(lidar.offset)} rays", scan, "CPU ms")
-        yield Measurement("camera", f"20 trees moved, lidar, {len(lidar.offset)} rays", moving, "CPU ms")
-        return
-    vertices, faces = meshed(primitives)
 
-    def build() -> object:
-        rays = o3d.t.geometry.RaycastingScene()
-        rays.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
-        return rays
-
-    embree = build()
-    directions = _camera_rays(info, pose)
-    camera_rays = o3d.core.Tensor(directions)
-    lidar_rays = o3d.core.Tensor(_lidar_rays(lidar, stand))
-
-    def rebuild() -> None:
-        build().cast_rays(lidar_rays)
-
-    cases += [lambda: embree.cast_rays(camera_rays), lambda: embree.cast_rays(lidar_rays)]
-    raster, frame, scan, moving, peer_frame, peer_scan = _alternate(*cases)
-    start = time.process_time()
-    rebuild()
-    peer_moving = (time.process_time() - start) * 1e3
-    peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
-    yield Measurement(
-        "camera",
-        f"depth and labels 640x480, {count} primitives",
-        raster,
-        "CPU ms",
-        peer,
-        peer_frame,
-        peer_frame / raster,
-    )
-    yield Measurement("camera", "picture 640x480, cached shadows", frame, "CPU ms")
-    yield Measurement("camera", f"lidar, {len(lidar.offset)} rays", scan, "CPU ms", peer, peer_scan, peer_scan / scan)
-    yield Measurement(
-        "camera",
-        f"20 trees moved, lidar, {len(lidar.offset)} rays",
-        moving,
-        "CPU ms",
-        peer + ", rebuilt",
-        peer_moving,
-        peer_moving / moving,
-    )
+        vertices, faces = meshed(primitives)
+        scene, rays = embree(vertices, faces), o3d.core.Tensor(_rays(info, pose))
+        cases.append(lambda: scene.cast_rays(rays))
+        peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
+    raster, *pictures = alternate(*cases)
+    if peer:
+        theirs = pictures.pop()
+        yield Measurement("camera", name, raster, "CPU ms", peer, theirs, theirs / raster)
+    else:
+        yield Measurement("camera", name, raster, "CPU ms")
+    for quality, spent in zip(eyes, pictures, strict=True):
+        yield Measurement("camera", f"picture 640x480, {quality}, cached shadows", spent, "CPU ms")
 
 
-def _camera_rays(info: CameraInfo, pose: np.ndarray) -> np.ndarray:
+def _rays(info: CameraInfo, pose: np.ndarray) -> np.ndarray:
     """Origins and directions [height, width, 6] of all pixels in the world."""
     u, v = np.meshgrid(np.arange(info.width), np.arange(info.height))
     local = np.stack([(u - info.cx) / info.fx, (v - info.cy) / info.fy, np.ones(u.shape)], -1)
     d = frames.rotate(pose[3:], local)
-    return np.concatenate([np.broadcast_to(pose[:3], d.shape), d], -1).astype(np.float32)
-
-
-def _lidar_rays(lidar: Lidar, pose: np.ndarray) -> np.ndarray:
-    """Origins and directions [shot, 6] of one revolution."""
-    d = lidar.grid.direction.numpy()
     return np.concatenate([np.broadcast_to(pose[:3], d.shape), d], -1).astype(np.float32)

@@ -34,6 +34,8 @@ _RASTER = (
     (visibility.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
     (visibility.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
 )
+_STAGE = np.array([next(i for i, (_, kinds) in enumerate(_RASTER) if kind in kinds) for kind in range(TRIANGLE + 1)])
+"""Which of these draws a kind."""
 
 
 class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -181,8 +183,9 @@ class Visibility:
         self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
-        for kernel, kinds in _RASTER:
-            mine = seen[np.isin(kind, kinds)]
+        stage = _STAGE[kind]
+        for number, (kernel, _) in enumerate(_RASTER):
+            mine = seen[stage == number]
             if len(mine):
                 wp.launch(
                     kernel,
