@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import seeing
 
-from vinesim.sensors.camera import Camera
+from vinesim.sensors.camera import Camera, CameraSpec
 from vinesim.sensors.eyes import Eyes, Mount
 from vinesim.sensors.lidar import Lidar, LidarSpec
 from vinesim.sensors.primitives import still_view
@@ -175,3 +175,18 @@ def test_eyes_open_once_and_close_twice() -> None:
         eyes.start()
     eyes.stop()
     eyes.stop()
+
+
+def test_depth_is_measured_only_for_those_who_look_at_it(view) -> None:
+    inbox, looked_at = Inbox(), threading.Event()
+    spec = CameraSpec.load("d435")
+    camera = Camera(spec, spec.info("optical", 0.1), "head")
+    with Eyes(seeing.empty(), [Mount(camera, inbox, depth_wanted=looked_at.is_set, rate=10.0)]) as eyes:
+        for k in range(2):
+            eyes.see(dataclasses.replace(view, time=0.1 * k), {"head": seeing.AHEAD})
+            inbox.wait(k + 1)
+            looked_at.set()
+    exact, measured = (f.depth[np.isfinite(f.exact_depth) & (f.exact_depth < 5.0)] for f in inbox.frames)
+    truth = inbox.frames[0].exact_depth
+    assert np.array_equal(exact, truth[truth < 5.0])
+    assert not np.array_equal(measured, exact)

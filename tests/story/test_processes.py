@@ -75,7 +75,7 @@ class TestDemo:
         assert depth.dtype == np.uint16
         seen = depth[depth > 0]
         assert seen.size > 0.5 * depth.size
-        assert seen.min() >= 175  # what a D435 can measure
+        assert seen.min() >= 158  # what a D435 can measure
         assert seen.max() <= 10_000
         assert np.percentile(seen, 90) > 1000  # however near an arm stands, vineyard behind it
         for name in ("labels.png", "depth.png", "touch.png"):

@@ -379,19 +379,22 @@ def dataset(
 def bench(
     names: Annotated[list[str], typer.Argument(help="plants, camera, sync; several are run one after the other.")],
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
-    plot: Annotated[pathlib.Path | None, typer.Option(help="Where sync draws what it measured (.png).")] = None,
+    plot: Annotated[
+        pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
+    ] = None,
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
-    Of physics and sensors: plants, contact, tick, asleep, camera. Of the network: sync (what delay does, in simulated
-    time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
-    fuzz (broken messages).
+    Of physics: plants, contact, tick, asleep. Of sensors: camera (speed), sensors (what they measure, beside the
+    truth). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links; needs
+    root), traffic (bytes a client hears), load (many clients), fuzz (broken messages).
 
     \b
     Examples:
       vinesim bench plants --json
       vinesim bench plants camera
       vinesim bench sync --json --plot docs/pictures/network-sync.png
+      vinesim bench sensors --plot docs/pictures
     """
     from vinesim.cli.bench import run
 

@@ -58,6 +58,12 @@ def _lidar() -> Iterator[Measurement]:
     return lidar()
 
 
+def _sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
+    from vinesim.sensors.bench_sensors import sensors
+
+    return sensors(plot)
+
+
 def _sync(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     from vinesim.client.bench_sync import sync
 
@@ -101,6 +107,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "asleep": _asleep,
     "camera": _camera,
     "lidar": _lidar,
+    "sensors": _sensors,
     "eyes": _eyes,
     "sync": _sync,
     "link": _link,
@@ -115,12 +122,16 @@ class NoSuchBench(ValueError):
 
 
 def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None) -> int:
-    """Run the named benches in order and print their measurements as they come; ``plot``: where sync draws its own."""
+    """Run the named benches in order and print their measurements as they come.
+
+    ``plot``: where those draw that draw; sync a file, sensors several into a folder.
+    """
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _sync(plot) if name == "sync" else BENCHES[name]():
+        drawn = {"sync": _sync, "sensors": _sensors}.get(name)
+        for m in drawn(plot) if drawn else BENCHES[name]():
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

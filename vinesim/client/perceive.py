@@ -144,10 +144,11 @@ class _Perception:
             spec = CameraSpec.load(place.type)
             camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, quality="fast", seed=seed)
             wanted = self._wanted(place.name, always=setup.keep_pictures and i == 0)
-            mounts.append(Mount(camera, self._deliver_camera, wanted, setup.sensor_hz))
+            depth = self._wanted(f"{place.name}/depth", always=setup.keep_pictures and i == 0)
+            mounts.append(Mount(camera, self._deliver_camera, wanted, depth, setup.sensor_hz))
         for place in setup.description.lidars:
             lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame, seed=seed)
-            mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name), setup.sensor_hz))
+            mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name), rate=setup.sensor_hz))
         primitives = Primitives(setup.model, renderer=setup.renderer)
         return stack.enter_context(Eyes(setup.model, mounts, primitives=primitives, nice=EYES_NICE))
 

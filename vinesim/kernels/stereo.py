@@ -48,12 +48,6 @@ class Stereo:
 
 
 @wp.func
-def disparity(reach: float, depth: float) -> float:
-    """[px]; 0 for the sky."""
-    return reach / depth
-
-
-@wp.func
 def apart(slope: float, d: float) -> float:
     """From which difference [px] on two disparities near ``d`` are those of two surfaces."""
     return APART + slope * d
@@ -84,9 +78,9 @@ def measure(
     # in
     lens: Pinhole,
     second: Pinhole,
-    depth: wp.array(dtype=wp.float32),
+    disparity: wp.array(dtype=wp.float32),
+    grey: wp.array(dtype=wp.uint8),
     second_depth: wp.array(dtype=wp.float32),
-    rgb: wp.array2d(dtype=wp.uint8),
     luck: wp.array3d(dtype=wp.float32),
     run: int,
     # out
@@ -110,7 +104,7 @@ def measure(
         x = wp.min((left + right) // 2, width - 1)
         y = wp.min((top + bottom) // 2, height - 1)
         pixel = y * width + x
-        own = disparity(reach, depth[pixel])
+        own = disparity[pixel]
         # what stands in the window, and how bright it is
         nearest = own
         farthest = own
@@ -124,13 +118,13 @@ def measure(
             i = wp.clamp(x + (k % 3 - 1) * 2 * stride, 0, width - 1)
             j = wp.clamp(y + (k // 3 - 1) * 2 * stride, 0, height - 1)
             at = j * width + i
-            d = disparity(reach, depth[at])
+            d = disparity[at]
             nearest = wp.max(nearest, d)
             farthest = wp.min(farthest, d)
             total += d
             across += d * float(k % 3 - 1)
             down += d * float(k // 3 - 1)
-            light = 0.299 * float(rgb[at, 0]) + 0.587 * float(rgb[at, 1]) + 0.114 * float(rgb[at, 2])
+            light = float(grey[at])
             bright += light / 9.0
             darkest = wp.min(darkest, light)
             brightest = wp.max(brightest, light)
@@ -143,7 +137,7 @@ def measure(
                 per = 1.0 / (12.0 * float(stride) * reach)
                 a = across * per * lens.fx
                 b = down * per * lens.fy
-                inverse = 1.0 / depth[pixel]
+                inverse = own / reach
                 normal = wp.vec3(a, b, inverse - a * ray[0] - b * ray[1])
                 slant = inverse / (wp.length(normal) * wp.length(ray))
         else:  # an edge: the window goes to the surface that fills most of it
@@ -151,7 +145,7 @@ def measure(
             for k in range(SIDE * SIDE):
                 i = wp.clamp(x + (k % SIDE - SIDE // 2) * stride, 0, width - 1)
                 j = wp.clamp(y + (k // SIDE - SIDE // 2) * stride, 0, height - 1)
-                d = disparity(reach, depth[j * width + i])
+                d = disparity[j * width + i]
                 looks[k] = d
                 nearest = wp.max(nearest, d)
                 farthest = wp.min(farthest, d)
@@ -179,11 +173,11 @@ def measure(
             level = wp.clamp(level, 0, second.height - 1)
             if there < 0 or there >= second.width:
                 kept = False
-            elif disparity(reach, second_depth[level * second.width + there]) > own + apart(slope, own):
+            elif reach > second_depth[level * second.width + there] * (own + apart(slope, own)):
                 kept = False  # something else stands before it there
             lost = 1.0 - rising(stereo.slant_lost, stereo.slant_kept, slant)
             if brightest - darkest < stereo.contrast:
-                lost = wp.max(lost, rising(stereo.projector, 2.0 * stereo.projector, depth[pixel]))
+                lost = wp.max(lost, rising(stereo.projector, 2.0 * stereo.projector, reach / own))
             if bright >= stereo.saturation:
                 lost = 1.0
         kept = kept and likely(luck[1, row, column]) >= lost

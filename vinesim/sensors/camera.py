@@ -261,14 +261,19 @@ class Camera:
         """Frames a second [Hz]."""
         return self.spec.rate.value
 
-    def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> CameraFrame:
-        """The frame seen from ``pose`` [7], the optical frame in the world."""
+    def render(
+        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, measure: bool = True
+    ) -> CameraFrame:
+        """The frame seen from ``pose`` [7], the optical frame in the world.
+
+        Who looks at colours only saves the second view by ``measure=False``: depth is then exact, where in range.
+        """
         pose = np.array(pose, float)
         picture = self.expose(primitives, pose, time)
         shape = (self.info.height, self.info.width)
         rgb, exact, labels = self._fetch(picture, self.visibility.depth, self.visibility.labels)
         rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
-        if self._stereo:
+        if self._stereo and measure:
             lens, dice = pinhole(self.info, pose), specs.dice(self.seed, self.name, self.image)
             depth = self._stereo.measure(primitives, lens, exact, rgb, dice)
         else:

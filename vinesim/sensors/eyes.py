@@ -52,6 +52,8 @@ class Mount:
     deliver: Callable[[CameraFrame | LidarScan], None]
     """Called in the sensing thread with every frame or scan."""
     wanted: Wanted = lambda: True
+    depth_wanted: Wanted = lambda: True
+    """Of a camera: whether anybody looks at its depth, too."""
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
 
@@ -181,7 +183,7 @@ class Eyes:
     def _take(self, mount: Mount, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
         """What a sensor has to deliver at simulation time ``now``."""
         if isinstance(mount.sensor, Camera):
-            yield mount.sensor.render(self.primitives, pose, now)
+            yield mount.sensor.render(self.primitives, pose, now, measure=mount.depth_wanted())
             return
         turning = self._turning[mount.name]
         missed = turning.dropped
