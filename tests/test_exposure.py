@@ -55,12 +55,12 @@ def test_fixed_exposure_stays() -> None:
 
 
 def test_grey_stays_grey_and_balance_takes_a_cast_out() -> None:
-    grey = _even(0.3).develop(PLAIN, 0.0)
-    assert (grey == grey[0, 0, 0]).all()
+    grey = _even(0.3).develop(PLAIN, 0.0).numpy()
+    assert (grey == grey[0, 0]).all()
     film = Exposure(64, 48)
     film.radiance.assign(np.tile([0.4, 0.3, 0.2], (64 * 48, 1)).astype(np.float32))
-    balanced = film.develop(np.array([0.75, 1.0, 1.5]), 0.0)
-    assert np.ptp(balanced[0, 0].astype(int)) <= 1
+    balanced = film.develop(np.array([0.75, 1.0, 1.5]), 0.0).numpy()
+    assert np.ptp(balanced[0].astype(int)) <= 1
 
 
 def test_samples_are_averaged_as_light() -> None:
@@ -69,8 +69,8 @@ def test_samples_are_averaged_as_light() -> None:
     light = np.zeros((32, 32, 3), np.float32)
     light[:, ::2] = 0.4
     film.radiance.assign(light.reshape(-1, 3))
-    mixed = film.develop(PLAIN, 0.0)
-    assert np.array_equal(mixed, _even(0.2, 16, 16, fixed=1.0).develop(PLAIN, 0.0))
+    mixed = film.develop(PLAIN, 0.0).numpy()
+    assert np.array_equal(mixed, _even(0.2, 16, 16, fixed=1.0).develop(PLAIN, 0.0).numpy())
 
 
 def test_a_lamp_has_a_halo_and_nothing_else_has() -> None:

@@ -34,6 +34,9 @@ app.add_typer(certs_app, name="certs")
 
 Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
 Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, harvest, tendone, vsp.")]
+Renderer = Annotated[
+    str, typer.Option(help="Who draws: warp, taichi (all cores) or taichi-gpu (Vulkan, Metal); needs vinesim[taichi].")
+]
 Robot = Annotated[str, typer.Option(help="A URDF file, or the name of one that ships: vinebot, logistic.")]
 
 
@@ -184,6 +187,7 @@ def client(
     sensor_hz: Annotated[
         float | None, typer.Option(min=0.1, help="Pictures and scans a second; each sensor's own rate unless given.")
     ] = None,
+    renderer: Renderer = "warp",
 ) -> None:
     """Join the vineyard as one actor, with a simulation of its own.
 
@@ -316,6 +320,7 @@ def render(
     crate: Annotated[
         list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
     ] = None,
+    renderer: Renderer = "warp",
 ) -> None:
     """Draw one picture, and say all that is true of it: ids, masks, boxes, berries, cut points.
 
@@ -331,7 +336,9 @@ def render(
     from vinesim.cli.render import run
 
     things = {"robots": robot or (), "people": person or (), "crates": crate or ()}
-    raise typer.Exit(run(scene, camera=camera, at=at, look=look, size=size, seed=seed, out=out, **things))
+    raise typer.Exit(
+        run(scene, camera=camera, at=at, look=look, size=size, seed=seed, out=out, renderer=renderer, **things)
+    )
 
 
 @app.command()
@@ -347,6 +354,7 @@ def dataset(
     workers: Annotated[
         int | None, typer.Option(min=1, max=256, help="Processes; half as many as cores unless given.")
     ] = None,
+    renderer: Renderer = "warp",
     actors: Annotated[
         float, typer.Option(help="Share of the images with people, robots, crates and wind; 0 leaves the vines alone.")
     ] = 0.4,
@@ -377,22 +385,22 @@ def bench(
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
-<<<<<<< HEAD
-    Of physics and sensors: plants, contact, tick, asleep, camera, lidar. Of the network: sync (what delay does, in
-    simulated time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
-    fuzz (broken messages).
-=======
-    Of physics: plants, contact, tick, asleep. Of sensors: camera (speed), sensors (what they measure, beside the
-    truth). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links; needs
-    root), traffic (bytes a client hears), load (many clients), fuzz (broken messages).
->>>>>>> main
+    <<<<<<< HEAD
+        Of physics and sensors: plants, contact, tick, asleep, camera, lidar. Of the network: sync (what delay does, in
+        simulated time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
+        fuzz (broken messages).
+    =======
+        Of physics: plants, contact, tick, asleep. Of sensors: camera (speed), sensors (what they measure, beside the
+        truth). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links; needs
+        root), traffic (bytes a client hears), load (many clients), fuzz (broken messages).
+    >>>>>>> main
 
-    \b
-    Examples:
-      vinesim bench plants --json
-      vinesim bench plants camera
-      vinesim bench sync --json --plot docs/pictures/network-sync.png
-      vinesim bench sensors --plot docs/pictures
+        \b
+        Examples:
+          vinesim bench plants --json
+          vinesim bench plants camera
+          vinesim bench sync --json --plot docs/pictures/network-sync.png
+          vinesim bench sensors --plot docs/pictures
     """
     from vinesim.cli.bench import run
 

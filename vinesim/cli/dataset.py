@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vinesim.cli.join import WrongUse
 from vinesim.cli.render import pixels
 from vinesim.client.life import Life
-from vinesim.sensors import dataset
+from vinesim.sensors import dataset, renderers
 from vinesim.sensors.dataset import DatasetError, Plan
 from vinesim.world.scene import load
 
@@ -30,6 +30,7 @@ def run(
     size: str | None,
     workers: int | None,
     actors: float,
+    renderer: str,
 ) -> int:
     """Draw what is not there yet, then gather the annotations of all images."""
     if seed < 0:
@@ -37,7 +38,7 @@ def run(
     if not 0.0 <= actors <= 1.0:
         raise WrongUse(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     life = Life(actors) if actors > 0.0 else None
-    plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), life)
+    plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check(renderer))
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crew: list[Share] = []
     try:

@@ -38,6 +38,7 @@ def run(
     job: str | None, watch: int | None, near: float, jitter_buffer: float,
     device: str,
     threads: int, seconds: float | None, out: pathlib.Path | None, status: str, sensor_hz: float | None,
+    renderer: str,
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
@@ -48,8 +49,10 @@ def run(
         raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
     from vinesim.physics.memory import device_of
+    from vinesim.sensors import renderers
 
     device_of(device)  # refused before anything is built
+    renderers.check(renderer)
     if threads > 1 and device != "cpu":
         raise WrongUse(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
@@ -105,7 +108,7 @@ def run(
                     one, plan, model, description,
                     namespace=namespace if len(names) == 1 else "/".join(filter(None, (namespace, ros_name(one)))),
                     ros=ros, keep_pictures=out is not None and i == 0, sensor_hz=sensor_hz,
-                    clock=not namespace and i == 0,
+                    clock=not namespace and i == 0, renderer=renderer,
                 )
             )
             for i, (one, description) in enumerate(zip(names, descriptions, strict=True))

@@ -25,10 +25,11 @@ def run(
     robots: Sequence[str] = (),
     people: Sequence[str] = (),
     crates: Sequence[str] = (),
+    renderer: str = "warp",
 ) -> int:
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.cli.join import WrongUse
-    from vinesim.sensors import formats, picture, truth
+    from vinesim.sensors import formats, picture, renderers, truth
     from vinesim.sensors.camera import Camera, CameraSpec
     from vinesim.sensors.dataset import sized
     from vinesim.sensors.primitives import Primitives
@@ -37,6 +38,7 @@ def run(
     from vinesim.world.ids import unlabel
     from vinesim.world.scene import load, reseeded
 
+    renderers.check(renderer)
     eye, target = point("--at", at), point("--look", look)
     if np.linalg.norm(target - eye) < 1e-6:
         raise WrongUse(f"--look {look} is where the camera stands; look at another point")
@@ -47,7 +49,7 @@ def run(
     plan, staged = reseeded(load(scene), seed), stage(robots, people, crates)
     model = generate(plan)
     view = staged.set(model)
-    primitives = Primitives(model)
+    primitives = Primitives(model, renderer=renderer)
     primitives.update(view)
     inside = enclosing(primitives, eye)
     if inside >= 0:

@@ -15,7 +15,8 @@ import numpy as np
 def run(
     *, name: str | None, connect: str | None, tls: pathlib.Path | None, scene: str, seed: int | None, spawn: int,
     place: tuple[float, float, float] | None, near: float, device: str, threads: int, seconds: float | None,
-    out: pathlib.Path | None, status: str, sensor_hz: float | None, **_: Any,
+    out: pathlib.Path | None, status: str, sensor_hz: float | None,
+    renderer: str, **_: Any,
 ) -> int:  # fmt: skip
     """Look until told to stop; pictures go to ``out``."""
     from vinesim.cli.join import WrongUse, speak, tick_until
@@ -25,6 +26,7 @@ def run(
     from vinesim.client.status import Status
     from vinesim.net.bus import MemoryHub
     from vinesim.net.zenoh_bus import ZenohBus
+    from vinesim.sensors import renderers
     from vinesim.world.generate import generate
     from vinesim.world.scene import load, reseeded
 
@@ -32,6 +34,7 @@ def run(
         raise WrongUse(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
         raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
+    renderers.check(renderer)
     plan = reseeded(load(scene), seed)
     if place is None:
         start = spawn_pose(plan, spawn)
@@ -48,7 +51,7 @@ def run(
             plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads,
             executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
-        pictures = None if out is None else Pictures(spectator, out, 1.0 / (sensor_hz or 1.0))
+        pictures = None if out is None else Pictures(spectator, out, 1.0 / (sensor_hz or 1.0), renderer)
         stop = threading.Event()
         pace = Pace(spectator.physics.dt)
         reporter = Status(spectator, pace)

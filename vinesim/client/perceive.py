@@ -49,6 +49,7 @@ class Setup:
     keep_pictures: bool
     sensor_hz: float | None
     clock: bool
+    renderer: str = "warp"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -134,6 +135,7 @@ class _Perception:
         from vinesim.sensors.camera import Camera, CameraSpec
         from vinesim.sensors.eyes import Eyes, Mount, load_kernels
         from vinesim.sensors.lidar import Lidar, LidarSpec
+        from vinesim.sensors.primitives import Primitives
 
         load_kernels()
         setup, mounts = self.setup, []
@@ -147,7 +149,8 @@ class _Perception:
         for place in setup.description.lidars:
             lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame, seed=seed)
             mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name), rate=setup.sensor_hz))
-        return stack.enter_context(Eyes(setup.model, mounts, nice=EYES_NICE))
+        primitives = Primitives(setup.model, renderer=setup.renderer)
+        return stack.enter_context(Eyes(setup.model, mounts, primitives=primitives, nice=EYES_NICE))
 
     def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:
         return lambda: always or (self.node is not None and self.node.wanted(name))

@@ -61,6 +61,7 @@ class Senses:
         keep_pictures: bool = False,
         sensor_hz: float | None = None,
         clock: bool | None = None,
+        renderer: str = "warp",
     ) -> None:
         """Starts the process; :meth:`attach` gives it something to perceive.
 
@@ -86,7 +87,7 @@ class Senses:
         self._pipe, theirs = context.Pipe()
         sun = scene.sun.direction
         clock = not namespace if clock is None else clock
-        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz, clock)
+        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz, clock, renderer)
         self._process = context.Process(
             target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {name}", daemon=True
         )

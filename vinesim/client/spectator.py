@@ -83,7 +83,7 @@ class Pictures:
     WIDTH, HEIGHT, ANGLE = 960, 640, 1.2
     """Size [px] and horizontal field of view [rad]."""
 
-    def __init__(self, spectator: Spectator, folder: pathlib.Path, period: float = 1.0) -> None:
+    def __init__(self, spectator: Spectator, folder: pathlib.Path, period: float = 1.0, renderer: str = "warp") -> None:
         """One every ``period`` seconds of simulated time, into a folder that exists."""
         load_kernels()
         focal = 0.5 * self.WIDTH / np.tan(0.5 * self.ANGLE)
@@ -94,7 +94,7 @@ class Pictures:
         self.folder, self.count = folder, 0
         self.last: CameraFrame | None = None
         self._camera = Camera(CameraSpec.load("pinhole"), info, "viewpoint", sun, quality="full", shadow_period=0.0)
-        self._primitives = Primitives(spectator.model)
+        self._primitives = Primitives(spectator.model, renderer=renderer)
         self._moved = np.zeros(len(spectator.model.tree_first), bool)
         self._every = max(round(period / spectator.physics.dt), 1)
         spectator.senses.append(self._see)

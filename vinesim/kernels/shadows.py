@@ -3,6 +3,7 @@
 import warp as wp
 
 from vinesim.kernels.shapes import (
+    BOX,
     CONE,
     CYLINDER,
     FAR,
@@ -11,7 +12,10 @@ from vinesim.kernels.shapes import (
     TRIANGLE,
     Clusters,
     Shapes,
-    hit,
+    as_quat,
+    hit_box,
+    hit_sphere,
+    hit_triangle,
     leaf_bulge,
     leaf_height,
     xyz,
@@ -89,11 +93,12 @@ def cast_shadows(
     m: ShadowMap,
     smallest: float,
     lanes: int,
+    slices: int,
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread draws every ``lanes``-th primitive of one cluster as the sun sees it."""
-    k, lane = wp.tid()
+    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it."""
+    k, lane, part = wp.tid()
     texels = Pixels()
     depths = Depths()
     cluster = which[k]
@@ -117,7 +122,7 @@ def cast_shadows(
             r = a4[3]
             if kind == SPHEROID:
                 rt = r / m.texel
-                for py in range(wp.max(int(y - rt), 0), wp.min(int(y + rt) + 2, m.side)):
+                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
                     for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
                         dx = float(px) - x
                         dy = float(py) - y
@@ -135,7 +140,7 @@ def cast_shadows(
                     per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
                     y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
                     y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, m.side)
-                    for py in range(y0, y1):
+                    for py in range(y0 + part, y1, slices):
                         x0 = wp.min(x, x + ex) - wide
                         x1 = wp.max(x, x + ex) + wide
                         if wp.abs(ey) > 4.0:
@@ -199,7 +204,7 @@ def cast_shadows(
                             hd = wp.max(hd, qx - qy)
                     su = wp.dot(m.sun, across)
                     sv = wp.dot(m.sun, rib)
-                    for py in range(wp.max(int(ly), 0), wp.min(int(hy) + 2, m.side)):
+                    for py in range(wp.max(int(ly), 0) + part, wp.min(int(hy) + 2, m.side), slices):
                         row = float(py)
                         first_x = wp.max(int(wp.max(wp.max(lx, wp.max(ls - row, ld + row)), 0.0)), 0)
                         last_x = wp.min(int(wp.max(wp.min(hx, wp.min(hs - row, hd + row)) + 2.0, 0.0)), m.side)
@@ -227,16 +232,18 @@ def cast_shadows(
             else:
                 o = xyz(a4)
                 reach_i = r
+                half = wp.vec3(r, c4[0], c4[1])
+                ray = wp.quat_rotate_inv(as_quat(b4), -m.sun)
                 if kind == TRIANGLE:
                     o = (xyz(a4) + xyz(b4) + xyz(c4)) / 3.0
                     reach_i = wp.max(wp.max(wp.length(xyz(a4) - o), wp.length(xyz(b4) - o)), wp.length(xyz(c4) - o))
                 else:
-                    reach_i = wp.length(wp.vec3(r, c4[0], c4[1]))
+                    reach_i = wp.length(half)
                 p = o - m.corner
                 x = wp.dot(p, m.right) / m.texel
                 y = wp.dot(p, m.up) / m.texel
                 rt = reach_i / m.texel
-                for py in range(wp.max(int(y - rt), 0), wp.min(int(y + rt) + 2, m.side)):
+                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
                     for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
                         from_sun = (
                             m.corner
@@ -244,7 +251,15 @@ def cast_shadows(
                             + m.up * (float(py) * m.texel)
                             + m.sun * SUN_HEIGHT
                         )
-                        t = hit(shapes, i, from_sun, -m.sun, 0)
+                        t = FAR
+                        if kind == TRIANGLE:
+                            t = hit_triangle(xyz(a4) - from_sun, xyz(b4) - from_sun, xyz(c4) - from_sun, -m.sun)
+                        else:
+                            eye = wp.quat_rotate_inv(as_quat(b4), from_sun - xyz(a4))
+                            if kind == BOX:
+                                t = hit_box(eye, ray, half)
+                            else:
+                                t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
                         if t < FAR:
                             darken(m, px, py, t, depth_out)
 

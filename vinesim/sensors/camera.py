@@ -135,9 +135,12 @@ class Visibility:
         self, primitives: Primitives, lens: visibility.Pinhole, nearest: float = 0.0, farthest: float = REACH
     ) -> None:
         """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
-        distance = self.distances(primitives, lens)
-        seen = np.flatnonzero(distance < float(shapes.FAR))
-        self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        if primitives.raster is None:
+            distance = self.distances(primitives, lens)
+            seen = np.flatnonzero(distance < float(shapes.FAR))
+            self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        else:
+            primitives.raster.fill(primitives, lens, None, self.keys)
         run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
             visibility.resolve,
@@ -169,26 +172,25 @@ class Visibility:
 
     def alone(self, primitives: Primitives, lens: visibility.Pinhole, clusters: np.ndarray) -> np.ndarray:
         """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
-        self._raster(primitives, lens, clusters)
+        if primitives.raster is None:
+            self._raster(primitives, lens, clusters)
+        else:
+            primitives.raster.fill(primitives, lens, clusters, self.keys)
         return self.keys.numpy().reshape(self.height, self.width) < int(visibility.EMPTY)
 
     def _raster(self, primitives: Primitives, lens: visibility.Pinhole, seen: np.ndarray) -> None:
         """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
-        if self.device == "cpu":
-            self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
-        else:
-            self.keys.fill_(int(visibility.EMPTY))
+        self._keys.fill(int(visibility.EMPTY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
-        lanes = 1 if self.device == "cpu" else 48
         stage = _STAGE[kind]
         for number, (kernel, _) in enumerate(_RASTER):
             mine = seen[stage == number]
             if len(mine):
                 wp.launch(
                     kernel,
-                    (len(mine), lanes),
-                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, lanes],
+                    (len(mine), 1),
+                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, 1],
                     outputs=[self.keys],
                     device=self.device,
                 )
@@ -250,6 +252,7 @@ class Camera:
             self._samples = Visibility(width * samples, height * samples, self.device)
         self._sunlight = Sunlight(self.sun, taps=quality.taps, period=period, fine=quality.fine, device=self.device)
         self._exposure = Exposure(width, height, samples, self.exposure, self.device)
+        self._landing: list[wp.array] = []
         reach = self.spec.nearest.value, self.spec.farthest.value
         self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, Visibility, self.device)
 
@@ -266,13 +269,13 @@ class Camera:
         Who looks at colours only saves the second view by ``measure=False``: depth is then exact, where in range.
         """
         pose = np.array(pose, float)
-        lens = pinhole(self.info, pose)
-        seen = self.visibility
-        seen.draw(primitives, lens)
+        picture = self.expose(primitives, pose, time)
         shape = (self.info.height, self.info.width)
-        rgb, exact = self._picture(primitives, lens, pose, time), seen.depth.numpy().reshape(shape).copy()
+        rgb, exact, labels = self._fetch(picture, self.visibility.depth, self.visibility.labels)
+        rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
         if self._stereo and measure:
-            depth = self._stereo.measure(primitives, lens, exact, rgb, specs.dice(self.seed, self.name, self.image))
+            lens, dice = pinhole(self.info, pose), specs.dice(self.seed, self.name, self.image)
+            depth = self._stereo.measure(primitives, lens, exact, rgb, dice)
         else:
             too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
@@ -284,12 +287,27 @@ class Camera:
             pose=pose,
             rgb=rgb,
             depth=depth,
-            labels=seen.labels.numpy().reshape(shape).copy(),
+            labels=labels.reshape(shape),
             exact_depth=exact,
         )
 
-    def _picture(self, primitives: Primitives, lens: visibility.Pinhole, pose: np.ndarray, time: float) -> np.ndarray:
-        """Colour [height, width, 3] uint8 of what :attr:`visibility` has found."""
+    def _fetch(self, *arrays: wp.array) -> list[np.ndarray]:
+        """Copies for the host: from a GPU through memory that it can write to, all at once."""
+        if self.device != "cpu":
+            if not self._landing:
+                self._landing = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
+            for array, place in zip(arrays, self._landing, strict=True):
+                wp.copy(place, array)
+            wp.synchronize_stream(self.device)
+            arrays = tuple(self._landing)
+        return [a.numpy().copy() for a in arrays]
+
+    def expose(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> wp.array:
+        """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for."""
+        pose = np.array(pose, float)
+        lens = pinhole(self.info, pose)
+        seen = self.visibility
+        seen.draw(primitives, lens)
         seen, quality = self._samples, self._quality
         if quality.samples > 1:
             lens = pinhole(finer(self.info, quality.samples), pose)

@@ -94,6 +94,7 @@ class Plan:
     """Width and height [px]; the camera's own unless given."""
     life: Life | None = None
     """Without it plants hang at rest and nobody is there."""
+    renderer: str = "warp"
 
     def settings(self) -> dict[str, Any]:
         """All that decides what the images show, as JSON."""
@@ -104,6 +105,7 @@ class Plan:
             "seed": self.seed,
             "camera": self.camera,
             "size": [info.width, info.height],
+            "renderer": self.renderer,
             "life": None if self.life is None else self.life.settings(),
         }
 
@@ -126,7 +128,7 @@ class Vineyard:
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
         self.still: View = still_view(self.model)
         self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
-        self.primitives = Primitives(self.model, ripeness=self.ripeness)
+        self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer)
         self.primitives.update(self.still)
         self.caster = RayCaster(self.primitives)
         self.spec = CameraSpec.load(plan.camera)

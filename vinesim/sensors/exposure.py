@@ -43,8 +43,8 @@ class Exposure:
         self._tone = wp.array(textures.tone_curve(), dtype=wp.uint8, device=device)
         self._time: float | None = None
 
-    def develop(self, balance: np.ndarray, time: float, brightness: float = 1.0) -> np.ndarray:
-        """The picture [height, width, 3] uint8 of :attr:`radiance`, taken at ``time`` [s].
+    def develop(self, balance: np.ndarray, time: float, brightness: float = 1.0) -> wp.array:
+        """The picture [pixel, 3] uint8 of :attr:`radiance`, taken at ``time`` [s]: it stays on the device.
 
         ``balance`` are factors [3] on linear light; ``brightness`` is that of the daylight beside a sunny noon.
         """
@@ -86,7 +86,7 @@ class Exposure:
             outputs=[self._rgb],
             device=self.device,
         )
-        return self._rgb.numpy().reshape(self.height, self.width, 3).copy()
+        return self._rgb
 
     def halo(self, primitives: Primitives, seen: wp.array) -> None:
         """Spread some light of the lamps among the seen primitives [sample] around them, as a lens does."""

@@ -13,7 +13,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import materials, shadows, shapes
-from vinesim.sensors import textures
+from vinesim.sensors import renderers, textures
 from vinesim.sensors.batches import CONE, KINDS, LEAF, nothing
 from vinesim.sensors.grounds import fixed, litter, meadow, rows_of
 from vinesim.sensors.links import rigid
@@ -33,12 +33,20 @@ class Primitives:
     """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.shapes`)."""
 
     def __init__(
-        self, model: Model, *, grass: float = 90.0, device: str = "cpu", ripeness: Ripeness | None = None
+        self,
+        model: Model,
+        *,
+        grass: float = 90.0,
+        device: str = "cpu",
+        ripeness: Ripeness | None = None,
+        renderer: str = "warp",
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
-        the fruit: all of it is ripe unless given.
+        the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.renderers`).
         """
         self.model, self.device, self._ripeness = model, device, ripeness
+        self.raster = renderers.raster_of(renderer, device)
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.Visibility` does so itself."""
         bodies = len(model.body_mass)
         self._still = bodies
         """Carrier of what stands still; links follow it."""

@@ -17,7 +17,10 @@ from vinesim.sensors.primitives import Primitives
 
 DEFAULT_SUN = (-0.41, -0.52, 0.75)
 """Towards the sun: south-west, half-way up."""
-_LANES = {"cpu": 1}
+
+
+_SPREAD = (8, 16)
+"""Threads that share the primitives of a cluster, and the rows of each of them, on a GPU."""
 
 
 def _vector(v: np.ndarray) -> wp.vec3:
@@ -33,6 +36,7 @@ class _Map:
 
     def __init__(self, texel: float, side: int, ahead: float, slack: float, rigid: bool, device: str) -> None:
         self.ahead, self.slack, self.rigid, self.device = ahead, slack, rigid, device
+        self._every, self._known = wp.empty(0, dtype=wp.int32, device=device), -1
         self.struct = shadows.ShadowMap()
         self.struct.depth = wp.empty(side * side, dtype=float, device=device)
         self.struct.texel, self.struct.side = float(texel), side
@@ -71,23 +75,34 @@ class _Map:
             inside[primitives.rigid_clusters] = False
         return np.flatnonzero(inside)
 
+    def _casting(self, primitives: Primitives) -> wp.array:
+        """Clusters that this map shows, wherever they are."""
+        if self._known != primitives.built:
+            every = np.arange(len(primitives.cluster_first), dtype=np.int32)
+            mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
+            self._every, self._known = wp.array(mine, device=self.device), primitives.built
+        return self._every
+
     def _draw(self, primitives: Primitives) -> None:
         self.struct.corner = _vector(self.focus - self.half * (self.right + self.up))
         self.struct.depth.fill_(1.0e9)
-        which = self._inside(primitives).astype(np.int32)
+        if self.device == "cpu":
+            which, lanes, slices = wp.array(self._inside(primitives).astype(np.int32), device="cpu"), 1, 1
+        else:  # a GPU culls faster than it can be told what to draw, and wants a thread for every row
+            which, (lanes, slices) = self._casting(primitives), _SPREAD
         if len(which):
-            lanes = _LANES.get(self.device, 32)
             wp.launch(
                 shadows.cast_shadows,
-                (len(which), lanes),
+                (len(which), lanes, slices),
                 inputs=[
                     primitives.shapes,
                     primitives.clusters,
                     primitives.ball,
-                    wp.array(which, device=self.device),
+                    which,
                     self.struct,
                     0.25,
                     lanes,
+                    slices,
                 ],
                 outputs=[self.struct.depth],
                 device=self.device,
