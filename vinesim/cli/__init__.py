@@ -385,22 +385,16 @@ def bench(
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
-    <<<<<<< HEAD
-        Of physics and sensors: plants, contact, tick, asleep, camera, lidar. Of the network: sync (what delay does, in
-        simulated time), link (real clients over emulated links; needs root), traffic (bytes a client hears), load (many clients),
-        fuzz (broken messages).
-    =======
-        Of physics: plants, contact, tick, asleep. Of sensors: camera (speed), sensors (what they measure, beside the
-        truth). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links; needs
-        root), traffic (bytes a client hears), load (many clients), fuzz (broken messages).
-    >>>>>>> main
+    Of physics: plants, contact, tick, asleep. Of sensors: camera and lidar (speed), sensors (what they measure, beside
+    the truth), eyes (the tick beside pictures). Of the network: sync (what delay does, in simulated time), link (real
+    clients over emulated links; needs root), traffic (bytes a client hears), load (many clients), fuzz (broken messages).
 
-        \b
-        Examples:
-          vinesim bench plants --json
-          vinesim bench plants camera
-          vinesim bench sync --json --plot docs/pictures/network-sync.png
-          vinesim bench sensors --plot docs/pictures
+    \b
+    Examples:
+      vinesim bench plants --json
+      vinesim bench plants camera
+      vinesim bench sync --json --plot docs/pictures/network-sync.png
+      vinesim bench sensors --plot docs/pictures
     """
     from vinesim.cli.bench import run
 
