@@ -387,7 +387,8 @@ def bench(
 
     Of physics: plants, contact, tick, asleep. Of sensors: camera and lidar (speed), sensors (what they measure, beside
     the truth), eyes (the tick beside pictures). Of the network: sync (what delay does, in simulated time), link (real
-    clients over emulated links; needs root), traffic (bytes a client hears), load (many clients), fuzz (broken messages).
+    clients over emulated links; needs root), traffic (bytes a client hears), load (many clients), fuzz (broken
+    messages).
 
     \b
     Examples:
