@@ -136,8 +136,9 @@ def ground_surface(looks: Looks, p: wp.vec3, pixel: float, slant: float) -> Surf
     # seen at a grazing angle, spots would be drawn out into bands: far away only their mean is left
     blur = 1.0 / (1.0 + slant * slant * 1.5)
     mean = wp.vec4(0.5, 0.5, 0.5, 0.5)
-    coarse = (smooth(looks.noise, p[0] * 0.21, p[1] * 0.21) - mean) * blur + mean
-    fields = smooth(looks.noise, p[0] * 0.011, p[1] * 0.011 + 0.37)
+    coarse = mean
+    if blur > 0.01:
+        coarse = (smooth(looks.noise, p[0] * 0.21, p[1] * 0.21) - mean) * blur + mean
     detail = 1.0 / (1.0 + pixel * pixel * 20000.0)
     tone = float(0.5)
     sod = float(0.5)
@@ -166,11 +167,13 @@ def ground_surface(looks: Looks, p: wp.vec3, pixel: float, slant: float) -> Surf
     green = smoothstep(
         0.38, 0.60, 0.55 * coarse[0] + 0.2 * coarse[2] + 0.25 * sod + sown(looks.rows, p[1]) * inside * blur
     )
-    beyond = smoothstep(0.35, 0.65, fields[1])
-    green = wp.min(green * 0.85 + (0.22 + 0.45 * beyond) * (1.0 - inside), 0.92)
+    green = green * 0.85
     earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
     turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
-    turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
+    if inside < 1.0:
+        fields = smooth(looks.noise, p[0] * 0.011, p[1] * 0.011 + 0.37)
+        green = wp.min(green + (0.22 + 0.45 * smoothstep(0.35, 0.65, fields[1])) * (1.0 - inside), 0.92)
+        turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
     s.albedo = mix(earth, turf, green) * (0.8 + 0.4 * coarse[1])
     s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
     s.gloss = 0.0

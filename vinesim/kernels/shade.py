@@ -45,7 +45,7 @@ class Light:
     """Through the canopy."""
     haze: wp.vec3
     taps: int
-    """Shadow samples a pixel."""
+    """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""
     spiral: wp.array(dtype=wp.vec2)
     """[taps] Vogel's spiral in the unit disc."""
     turns: wp.array(dtype=wp.vec2)
@@ -189,22 +189,24 @@ def shade(
     # out
     radiance_out: wp.array(dtype=wp.vec3),
 ):
-    """One thread lights ``run`` neighbouring blocks of pixels; in a block, each primitive is lit once, at its middle."""
-    across = (lens.width + block - 1) // block
+    """One thread lights ``run`` neighbouring blocks, 1 or 2 pixels wide; there each primitive is lit once, at its middle."""
+    half = block - 1  # corners are told apart by bits: divisions would cost as much as the light
+    across = (lens.width + half) >> half
     first = wp.tid() * run
     corners = block * block
     back = wp.transpose(lens.turn)
     for n in range(first, first + run):
-        left = (n % across) * block
-        top = (n // across) * block
+        down = n // across
+        left = (n - down * across) * block
+        top = down * block
         for c in range(corners):
             i = wp.int32(-3)
-            x = left + c % block
-            y = top + c // block
+            x = left + (c & half)
+            y = top + (c >> half)
             if x < lens.width and y < lens.height:
                 i = primitive[y * lens.width + x]
                 for k in range(c):  # whoever comes first speaks for all that see the same
-                    if primitive[(top + k // block) * lens.width + left + k % block] == i:
+                    if primitive[(top + (k >> half)) * lens.width + left + (k & half)] == i:
                         i = -3
             if i != -3:
                 ray = wp.vec3(0.0, 0.0, 0.0)
@@ -212,8 +214,8 @@ def shade(
                 depth = float(0.0)
                 share = float(0.0)
                 for k in range(c, corners):
-                    x = left + k % block
-                    y = top + k // block
+                    x = left + (k & half)
+                    y = top + (k >> half)
                     if x < lens.width and y < lens.height:
                         pixel = y * lens.width + x
                         if primitive[pixel] == i:
@@ -255,8 +257,8 @@ def shade(
                         s = ground_surface(looks, p, footprint, footprint * z * scale / lens.eye[2])
                     colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
                 for k in range(c, corners):
-                    x = left + k % block
-                    y = top + k // block
+                    x = left + (k & half)
+                    y = top + (k >> half)
                     if x < lens.width and y < lens.height:
                         if primitive[y * lens.width + x] == i:
                             radiance_out[y * lens.width + x] = colour

@@ -283,16 +283,18 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.ar
         if gap > 0.0:
             spread = wp.clamp(SUN_RADIUS * gap / m.texel, 1.0, 6.0)
         z -= spread * m.texel * 0.3
-        lit = wp.where(gap > 0.0, 0.0, 1.0)
-        if taps == 0:  # a box of two texels, or of four where what casts the shadow is far; smooth without noise
+        if taps <= 0:  # a box of two texels, or of four where what casts the shadow is far; smooth without noise
             i = int(x)
             j = int(y)
             a = x - float(i)
             b = y - float(j)
-            for k in range(4):
-                at = (j + (k & 1) * 4 - 2) * m.side + i + (k & 2) * 2 - 2
-                gap = wp.max(gap, z - m.depth[at])
-            half = wp.where(SUN_RADIUS * gap > 1.5 * m.texel, 2, 1)
+            half = wp.int32(1)
+            if taps == 0:
+                for k in range(4):
+                    at = (j + (k & 1) * 4 - 2) * m.side + i + (k & 2) * 2 - 2
+                    gap = wp.max(gap, z - m.depth[at])
+                if SUN_RADIUS * gap > 1.5 * m.texel:
+                    half = 2
             lit = float(0.0)
             for row in range(-half, half + 1):
                 at = (j + row) * m.side + i
@@ -306,12 +308,12 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.ar
                         line += 1.0
                 lit += line * wp.where(row == -half, 1.0 - b, wp.where(row == half, b, 1.0))
             lit = lit * 0.25 / float(half * half)
-        for k in range(taps):
-            v = spiral[k] * spread
-            if (
-                m.depth[int(y + v[0] * turn[1] + v[1] * turn[0]) * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])]
-                > z
-            ):
-                lit += 1.0
-        lit = lit / (float(taps) + 1.0)
+        else:
+            lit = wp.where(gap > 0.0, 0.0, 1.0)
+            for k in range(taps):
+                v = spiral[k] * spread
+                row = int(y + v[0] * turn[1] + v[1] * turn[0])
+                if m.depth[row * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])] > z:
+                    lit += 1.0
+            lit = lit / (float(taps) + 1.0)
     return lit

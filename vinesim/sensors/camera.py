@@ -201,7 +201,7 @@ class Quality:
     """How much a picture may cost. Depth and labels are the same in all."""
 
     taps: int
-    """Shadow samples a pixel; 0: a small smooth filter."""
+    """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""
     block: int
     """Pixels, squared, in which one primitive is lit once."""
     samples: int
@@ -211,7 +211,7 @@ class Quality:
 
 
 QUALITIES = {
-    "fast": Quality(taps=0, block=2, samples=1, fine=1),
+    "fast": Quality(taps=-1, block=2, samples=1, fine=1),
     "full": Quality(taps=0, block=1, samples=1, fine=1),
     "still": Quality(taps=12, block=2, samples=2, fine=2),
 }

@@ -150,7 +150,7 @@ class Sunlight:
     ) -> None:
         """``sun`` points towards the sun, or says where it is when.
 
-        ``taps`` are shadow samples a pixel, 0 for a small smooth filter; ``period`` [s] as in :class:`Camera`;
+        ``taps`` are as in :class:`vinesim.kernels.shade.Light`; ``period`` [s] as in :class:`Camera`;
         ``fine`` divides the texels of the shadow map nearby.
         """
         self._path: SunPath = sun if callable(sun) else lambda time: sun
