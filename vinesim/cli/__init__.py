@@ -311,6 +311,9 @@ def render(
         str | None, typer.Option(help="WxH [px] at the same horizontal field of view; the camera's own unless given.")
     ] = None,
     seed: Seed = None,
+    hour: Annotated[
+        float | None, typer.Option(min=0.0, max=24.0, help="Solar time [h], instead of the scene's own sun.")
+    ] = None,
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its truth.")] = pathlib.Path("render"),
     robot: Annotated[list[str] | None, typer.Option(help="NAME@X,Y[,YAW]: a robot there [m, rad]; may repeat.")] = None,
     person: Annotated[
@@ -336,9 +339,8 @@ def render(
     from vinesim.cli.render import run
 
     things = {"robots": robot or (), "people": person or (), "crates": crate or ()}
-    raise typer.Exit(
-        run(scene, camera=camera, at=at, look=look, size=size, seed=seed, out=out, renderer=renderer, **things)
-    )
+    view = {"camera": camera, "at": at, "look": look, "size": size, "hour": hour}
+    raise typer.Exit(run(scene, **view, seed=seed, out=out, renderer=renderer, **things))
 
 
 @app.command()

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ def run(
     robots: Sequence[str] = (),
     people: Sequence[str] = (),
     crates: Sequence[str] = (),
+    hour: float | None = None,
     renderer: str = "warp",
 ) -> int:
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
@@ -47,6 +49,7 @@ def run(
     spec = CameraSpec.load(camera)
     info = sized(spec, None if size is None else pixels(size))
     plan, staged = reseeded(load(scene), seed), stage(robots, people, crates)
+    sun = plan.sun if hour is None else msgspec.structs.replace(plan.sun, hour=hour)
     model = generate(plan)
     view = staged.set(model)
     primitives = Primitives(model, renderer=renderer)
@@ -58,7 +61,7 @@ def run(
     pose = picture.looking(eye, target)
     seen = truth.look(primitives, info, pose)
     truths = truth.of_bunches(primitives, view, seen)
-    frame = Camera(spec, info, "camera", plan.sun.direction(), quality="still").render(primitives, pose)
+    frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
         "depth": picture.depth_millimetres(frame.exact_depth),

@@ -21,7 +21,7 @@ from vinesim.kernels.materials import (
 )
 from vinesim.kernels.shadows import ShadowMap, lit_share
 from vinesim.kernels.shapes import LEAF, SPHEROID, Shapes
-from vinesim.kernels.visibility import Pinhole, ray_of
+from vinesim.kernels.visibility import Pinhole
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -209,8 +209,8 @@ def shade(
                     if primitive[(top + (k >> half)) * lens.width + left + (k & half)] == i:
                         i = -3
             if i != -3:
-                ray = wp.vec3(0.0, 0.0, 0.0)
-                reach = wp.vec3(0.0, 0.0, 0.0)
+                u = float(0.0)
+                v = float(0.0)
                 depth = float(0.0)
                 share = float(0.0)
                 for k in range(c, corners):
@@ -219,25 +219,22 @@ def shade(
                     if x < lens.width and y < lens.height:
                         pixel = y * lens.width + x
                         if primitive[pixel] == i:
-                            r = back * ray_of(lens, x, y)
-                            z = float(keys[pixel] >> wp.int64(32)) * 1.0e-6
-                            if i == -2:
-                                z = -lens.eye[2] / r[2]
-                            if i == -1:
-                                z = 1.0
-                            ray += r
-                            reach += r * z
-                            depth += z
+                            u += float(x)
+                            v += float(y)
+                            depth += float(keys[pixel] >> wp.int64(32))
                             share += 1.0
                 per = 1.0 / share
-                z = depth * per
-                scale = wp.length(ray) * per
-                d = ray * (per / scale)
+                ray = back * wp.vec3((u * per - lens.cx) / lens.fx, (v * per - lens.cy) / lens.fy, 1.0)
+                z = depth * per * 1.0e-6
+                if i == -2:
+                    z = -lens.eye[2] / ray[2]
+                scale = wp.length(ray)
+                d = ray / scale
                 colour = wp.vec3(0.0, 0.0, 0.0)
                 if i == -1:
                     colour = sky_light(light, d)
                 else:
-                    p = lens.eye + reach * per
+                    p = lens.eye + ray * z
                     footprint = z * float(block) / lens.fx
                     # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
                     f = 0.06711056 * float(left) + 0.00583715 * float(top)
