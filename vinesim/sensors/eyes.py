@@ -199,7 +199,7 @@ class Eyes:
                 self._turning[name].stop(now)
             return False
         if name in self._turning:
-            return True
+            return self._turning[name].due(now)
         due, period = self._due[name], 1.0 / (mount.rate or mount.sensor.rate)
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf

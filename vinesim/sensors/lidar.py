@@ -30,8 +30,11 @@ MOST_RAYS = 8
 """Of one shot."""
 FOOTPRINT_AT = 3.0
 """All rays leave from one point; beams are as wide as in life at this range [m], thinner nearer, wider beyond."""
-NEARLY_STILL, NEARLY_STRAIGHT = 2e-3, 1e-3
-"""Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place."""
+NEARLY_STILL, NEARLY_STRAIGHT = 4e-3, 3.5e-3
+"""Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place, their middle one.
+
+That is at most half a step of the head aside, and saves the finding of what is near for every few firings.
+"""
 _RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 

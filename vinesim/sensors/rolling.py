@@ -69,6 +69,10 @@ class Rolling:
         self._start = None
         self.track.forget(now)
 
+    def due(self, now: float) -> bool:
+        """Whether there is something to fire at ``now`` [s]: a head that waits for its next revolution has nothing."""
+        return self._start is None or now >= self._start - 1e-9 or now < self._start - self._period
+
     def go(self, primitives: Primitives, now: float) -> Iterator[LidarScan]:
         """Fire what is due at ``now`` [s] of simulation time; yields the revolutions that are complete with it."""
         if self._start is None or now < self._start - self._period:
