@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import rays
 from vinesim.sensors.camera import CameraSpec, Visibility, pinhole
 from vinesim.sensors.picture import looking
 from vinesim.sensors.primitives import Primitives, still_view
@@ -81,18 +79,7 @@ def raster(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -
 
 def oracle(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -> tuple[np.ndarray, np.ndarray]:
     """The same by the ray caster."""
-    count = info.width * info.height
-    depth, primitive = wp.empty(count, dtype=float, device="cpu"), wp.empty(count, dtype=wp.int32, device="cpu")
-    caster = RayCaster(primitives)
-    wp.launch(
-        rays.cast_camera,
-        count,
-        inputs=[primitives.shapes, caster.hierarchies(), pinhole(info, pose)],
-        outputs=[depth, primitive],
-        device="cpu",
-    )
-    shape = (info.height, info.width)
-    return depth.numpy().reshape(shape), primitive.numpy().reshape(shape)
+    return RayCaster(primitives).see(pinhole(info, pose))
 
 
 def pixel_rays(info: CameraInfo = SMALL) -> np.ndarray:

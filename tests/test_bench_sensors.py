@@ -8,7 +8,7 @@ import pytest
 from vinesim.sensors import bench_sensors
 from vinesim.sensors.bench_sensors import Depths, formula, plane, ranges
 from vinesim.sensors.camera import CameraSpec
-from vinesim.sensors.primitives import Primitives
+from vinesim.sensors.primitives import Primitives, still_view
 from vinesim.world.generate import generate
 from vinesim.world.scene import load
 
@@ -37,6 +37,20 @@ def test_a_real_lidar_loses_some_returns_and_mixes_some() -> None:
     assert 0.7 < scan.returned < 1.2
     assert 0.02 < scan.mixed < 0.5
     assert len(scan.real) == pytest.approx(scan.returned * len(scan.exact))
+
+
+def test_renderers_see_what_rays_meet(tmp_path) -> None:
+    model = generate(load("demo"))
+    pictures = bench_sensors.backends(CameraSpec.load("d435"), model, still_view(model))
+    assert {"warp", "rays"} <= pictures.keys()
+    cast = pictures["rays"]
+    for name, look in pictures.items():
+        same = look.primitive == cast.primitive
+        assert same.mean() > 0.999, name
+        both = same & np.isfinite(cast.depth)
+        assert np.median(np.abs(look.depth[both] - cast.depth[both])) < 1e-5, name
+    bench_sensors._compare(tmp_path, pictures)
+    assert (tmp_path / "sensors-backends.png").stat().st_size > 10_000
 
 
 def test_pictures_are_drawn(tmp_path) -> None:

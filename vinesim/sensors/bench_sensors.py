@@ -1,7 +1,8 @@
 """``vinesim bench sensors``: how well the modelled sensors measure a vineyard whose truth is known, with plots.
 
 Depth error and fill rate of a D435 against range (plane, leaves, bunches) beside the maker's formula, ranges of lidars,
-berries that are seen against how much of their bunch is hidden. Everything is seeded: the same figures every time.
+berries that are seen against how much of their bunch is hidden, renderers beside the ray caster. Everything is seeded:
+the same figures every time.
 """
 
 from __future__ import annotations
@@ -10,15 +11,18 @@ import dataclasses
 import pathlib
 from collections.abc import Iterator
 
+import cv2
 import msgspec
 import numpy as np
 
 from vinesim import frames
 from vinesim.sensors import truth
-from vinesim.sensors.camera import Camera, CameraSpec
+from vinesim.sensors.camera import Camera, CameraSpec, Visibility, pinhole
 from vinesim.sensors.lidar import Lidar, LidarSpec
-from vinesim.sensors.picture import looking
+from vinesim.sensors.picture import depth_colours, looking, write_png
 from vinesim.sensors.primitives import Primitives, still_view
+from vinesim.sensors.raycast import RayCaster
+from vinesim.sensors.renderers import NoRenderer
 from vinesim.world.generate import generate
 from vinesim.world.ids import LABEL_STRIDE, Organ
 from vinesim.world.model import Model
@@ -33,6 +37,8 @@ LIDARS = ("vlp16", "os1_64")
 OFF = 0.05
 """A lidar's echo counts as mixed if it lies farther than this from what the middle of its beam meets [m]."""
 SEED = 7
+GAZE = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
+"""Where renderers are compared: from, to [m]."""
 
 
 @dataclasses.dataclass
@@ -155,6 +161,34 @@ def ranges(name: str, primitives: Primitives) -> Ranges:
     return Ranges(exact, noisy, len(noisy) / len(exact), mixed)
 
 
+@dataclasses.dataclass
+class Pixels:
+    """What the pixels of one view see, each [height, width]."""
+
+    depth: np.ndarray
+    """[m], inf for nothing."""
+    primitive: np.ndarray
+
+
+def backends(spec: CameraSpec, model: Model, view: View) -> dict[str, Pixels]:
+    """One view by every renderer that runs here on the CPU, and by the ray caster, which is the measure of all."""
+    info, pose = spec.info("optical"), looking(*GAZE)
+    lens, found = pinhole(info, pose), {}
+    for name in ("warp", "taichi"):
+        try:
+            primitives = Primitives(model, renderer=name)
+        except NoRenderer:
+            continue
+        primitives.update(view)
+        seen = Visibility(info.width, info.height)
+        seen.draw(primitives, lens)
+        depth, primitive = (a.numpy().reshape(info.height, info.width) for a in (seen.depth, seen.primitive))
+        found[name] = Pixels(depth, primitive)
+        if name == "warp":
+            cast = Pixels(*RayCaster(primitives).see(lens))
+    return found | {"rays": cast}
+
+
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     """Figures of all sensor models; ``plot``: a folder for the pictures."""
     model = generate(load("demo"))
@@ -179,8 +213,26 @@ def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
         if mine.any():
             case = f"berries seen, bunch hidden by {100 * low:.0f} to {100 * high:.0f} %"
             yield Measurement("sensors", case, float(np.median(seen[mine, 1])), "1")
+    pictures = backends(spec, model, view)
+    cast = pictures["rays"].primitive
+    for name, look in pictures.items():
+        if name != "rays":
+            same = float((look.primitive == cast).mean())
+            yield Measurement("sensors", f"{name}: pixels that see what their rays meet", same, "1")
     if plot is not None:
         _draw(plot, spec, depths, scans, seen)
+        _compare(plot, pictures)
+
+
+def _compare(folder: pathlib.Path, pictures: dict[str, Pixels]) -> None:
+    """``sensors-backends.png``: depth by each renderer; magenta where it sees another primitive than the rays."""
+    tiles = []
+    for look in pictures.values():
+        image = depth_colours(look.depth, 5.0)
+        wrong = (look.primitive != pictures["rays"].primitive).astype(np.uint8)
+        image[cv2.dilate(wrong, np.ones((5, 5), np.uint8)) > 0] = (255, 0, 255)
+        tiles.append(cv2.resize(image, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA))
+    write_png(folder / "sensors-backends.png", np.hstack(tiles))
 
 
 def _draw(

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import rays
+from vinesim.kernels import rays, visibility
 from vinesim.sensors.batches import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID
 from vinesim.sensors.camera import REACH
 from vinesim.sensors.primitives import Primitives
@@ -98,3 +98,18 @@ class RayCaster:
         )
         found = primitive.numpy()
         return np.where(found == -1, np.inf, distance.numpy()), found
+
+    def see(self, lens: visibility.Pinhole) -> tuple[np.ndarray, np.ndarray]:
+        """Depth [height, width] m (inf: nothing) and primitives [height, width] of a camera; as :meth:`cast`."""
+        p, count = self.primitives, lens.width * lens.height
+        depth = wp.empty(count, dtype=float, device=p.device)
+        primitive = wp.empty(count, dtype=wp.int32, device=p.device)
+        wp.launch(
+            rays.cast_camera,
+            count,
+            inputs=[p.shapes, self.hierarchies(), lens],
+            outputs=[depth, primitive],
+            device=p.device,
+        )
+        shape, found = (lens.height, lens.width), primitive.numpy()
+        return np.where(found == -1, np.inf, depth.numpy()).reshape(shape), found.reshape(shape)
