@@ -57,7 +57,6 @@ class Primitives:
         every = np.arange(len(model.bunch_body))
         pieces = [pieces_of(model, bunch) for bunch in every]
         batches += bunches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
-        self._tree_batches = len(batches)
         around = [fixed(model, bodies)]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
