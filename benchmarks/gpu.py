@@ -20,11 +20,11 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.physics.plants import Plants
-from vinesim.world.grow import Tree, Wood, assemble
-from vinesim.world.ids import Organ
-from vinesim.world.model import Model
-from vinesim.world.state import State
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
 
 TICKS = 100
 PER_TREE = 17

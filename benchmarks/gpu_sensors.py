@@ -21,17 +21,17 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import rays
-from vinesim.sensors.camera import REACH, Camera, CameraSpec, pinhole
-from vinesim.sensors.lidar import Lidar, LidarSpec
-from vinesim.sensors.picture import looking
-from vinesim.sensors.primitives import Primitives, still_view
-from vinesim.sensors.raycast import RayCaster
-from vinesim.world.generate import generate
-from vinesim.world.ids import Organ
-from vinesim.world.model import Model
-from vinesim.world.scene import load
-from vinesim.world.values import Link, Shape, View
+from vinesim.kernels.raster import ray_cast
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.spec import load
+from vinesim.scene.values import Link, Shape, View
+from vinesim.sensors.camera.camera import REACH, Camera, CameraSpec, pinhole
+from vinesim.sensors.export.images import looking
+from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.ray_caster import RayCaster
 
 VIEWS = {
     "along a row": ((-0.6, 1.0, 1.45), (8.0, 1.35, 1.45)),
@@ -185,7 +185,7 @@ def measure(say: Report, model: Model, device: str) -> None:
 
         def cast(start: wp.array = start, direction: wp.array = direction, found: list[wp.array] = found) -> None:
             inputs = [primitives.shapes, tree.hierarchies(), start, direction, REACH]
-            wp.launch(rays.cast, len(start), inputs=inputs, outputs=found, device=device)
+            wp.launch(ray_cast.cast, len(start), inputs=inputs, outputs=found, device=device)
 
         say(f"{lasers} lasers, {len(d)} rays at once", len(d) / milliseconds(cast, device) / 1e6, "G rays/s")
     trees = np.unique(model.body_tree[model.bunch_body])[:20]

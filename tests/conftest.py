@@ -10,9 +10,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def pytest_collection_modifyitems(items):
-    from vinesim.ros import environment
+    from vinesim.ros import ros_setup
 
-    reason = environment.available()
+    reason = ros_setup.available()
     if reason:
         skip = pytest.mark.skip(reason=f"ROS 2 is not usable here: {reason}")
         for item in items:

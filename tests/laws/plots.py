@@ -1,6 +1,6 @@
 """``make validation``: draws what the laws compare and writes their figures into docs/validation.md.
 
-Everything comes from the functions that the tests call: ``tests/beams.py`` and the scenes of ``tests/touch_scenes.py``.
+Everything comes from the functions that the tests call: ``tests/support/beam_theory.py`` and the scenes of ``tests/support/contact_scenes.py``.
 """
 
 from __future__ import annotations
@@ -10,16 +10,15 @@ import os
 import pathlib
 import platform
 
-import beams
 import matplotlib
 import mujoco
 import numpy as np
-import test_contact
-import test_rod_in_space
 import warp as wp
-from touch_scenes import bunch_scene, grasp, gripper
 
-from vinesim.physics.oracle import Whole
+from tests.laws import test_contact, test_rod_in_space
+from tests.support import beam_theory
+from tests.support.contact_scenes import bunch_scene, grasp, gripper
+from vinesim.bench.mujoco_reference import Whole
 from vinesim.physics.step import Physics
 
 matplotlib.use("Agg")
@@ -55,19 +54,19 @@ def elastica() -> Table:
     """Canes at rest over alpha: bodies on the elastica, and how far their tips are from it."""
     figure, (shapes, errors) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(1.15, 1), layout="constrained")
     loads = (0.5, 1.0, 2.0, 3.5, 6.6, 10.0, 20.0)
-    drawn = [beams.of_load(alpha, 1.0, beta=0.3) for alpha in loads]
-    plants = beams.settle([beam.tree(i) for i, beam in enumerate(drawn)])
+    drawn = [beam_theory.of_load(alpha, 1.0, beta=0.3) for alpha in loads]
+    plants = beam_theory.settle([beam.tree(i) for i, beam in enumerate(drawn)])
     colours = plt.cm.viridis(np.linspace(0.0, 0.85, len(loads)))
     for i, (alpha, beam, colour) in enumerate(zip(loads, drawn, colours, strict=True)):
-        line = beams.elastica_line(beam)
+        line = beam_theory.elastica_line(beam)
         shapes.plot(*line, color=colour, lw=1.4)
-        joints = plants.state.body_q[plants.model.bodies_of(i)][:, [0, 2]] - np.array([0.0, beams.HEIGHT])
+        joints = plants.state.body_q[plants.model.bodies_of(i)][:, [0, 2]] - np.array([0.0, beam_theory.HEIGHT])
         shapes.plot(*joints.T, "o", ms=3.2, color=colour)
         shapes.annotate(f"{alpha:g}", line[:, -1], xytext=(5, -4), textcoords="offset points", fontsize=9)
     shapes.set(aspect="equal", xlabel="forward [m]", ylabel="up [m]", xlim=(-0.03, 1.12))
     shapes.set_title("elastica (lines) and 16 bodies (dots) under a tip load, by alpha")
 
-    cases, truth, seen = beams.elastica_sweep()
+    cases, truth, seen = beam_theory.elastica_sweep()
     alpha, share, angle = np.array(cases).T
     straight = np.stack([np.cos(angle), np.sin(angle)], 1)
     off = 100 * np.linalg.norm(seen - truth, axis=1) / np.linalg.norm(truth - straight, axis=1)
@@ -89,33 +88,33 @@ def convergence() -> Table:
     """Errors over pieces and over time steps, with the slope of two."""
     figure, (pieces, steps) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     rows = []
-    joined = beams.errors_over_pieces_of_joined()
-    cases = [*beams.errors_over_pieces().items(), *joined.items()]
+    joined = beam_theory.errors_over_pieces_of_joined()
+    cases = [*beam_theory.errors_over_pieces().items(), *joined.items()]
     for (case, errors), colour in zip(cases, COLOURS * 2, strict=True):
-        slope = beams.order([1 / n for n in beams.PIECES], errors)
+        slope = beam_theory.order([1 / n for n in beam_theory.PIECES], errors)
         style = "s:" if case in joined else "o-"
-        pieces.loglog(beams.PIECES, 1e3 * errors, style, color=colour, ms=4, label=f"{case}: {slope:.2f}")
+        pieces.loglog(beam_theory.PIECES, 1e3 * errors, style, color=colour, ms=4, label=f"{case}: {slope:.2f}")
         rows.append((case, *(f"{1e3 * e:.3g}" for e in errors), f"{slope:.2f}"))
-    n = np.array(beams.PIECES, float)
+    n = np.array(beam_theory.PIECES, float)
     pieces.loglog(n, 60 * (n / n[0]) ** -2, color=GREY, ls="--", lw=1)
     pieces.annotate("slope 2", (n[2], 60 * (n[2] / n[0]) ** -2), xytext=(6, 4), textcoords="offset points", fontsize=9)
-    pieces.set(xlabel="bodies of a cane", ylabel="tip off [mm]", xticks=n, xticklabels=beams.PIECES)
+    pieces.set(xlabel="bodies of a cane", ylabel="tip off [mm]", xticks=n, xticklabels=beam_theory.PIECES)
     pieces.minorticks_off()
     pieces.set_title("resting tip against the elastica: order")
     pieces.legend(fontsize=7, loc="lower left")
 
-    over_dt, dt = beams.errors_over_dt(), 1e3 * np.array(beams.STEPS)
-    slope = beams.order(beams.STEPS, over_dt["frequency"])
+    over_dt, dt = beam_theory.errors_over_dt(), 1e3 * np.array(beam_theory.STEPS)
+    slope = beam_theory.order(beam_theory.STEPS, over_dt["frequency"])
     steps.loglog(dt, 100 * over_dt["frequency"], "o", color=GRAPE, label=f"frequency, % (order {slope:.2f})")
     steps.loglog(dt, 100 * over_dt["theory"], color=GRAPE, lw=1, ls="--", label="(ω dt)² / 12, the trapezoidal rule's")
-    slope_tip = beams.order(beams.STEPS, over_dt["tip"])
+    slope_tip = beam_theory.order(beam_theory.STEPS, over_dt["tip"])
     steps.loglog(dt, 1e3 * over_dt["tip"], "s-", color=LEAF, label=f"tip after 0.5 s, mm (order {slope_tip:.2f})")
     steps.set(xlabel="dt [ms]", ylabel="error", xticks=dt, xticklabels=[f"{x:g}" for x in dt])
     steps.minorticks_off()
     steps.set_title("a cane of 5 Hz, phi 1/2")
     steps.legend(fontsize=9)
     save(figure, "convergence")
-    lines = table(("tip off [mm] with so many bodies", *map(str, beams.PIECES), "order"), rows)
+    lines = table(("tip off [mm] with so many bodies", *map(str, beam_theory.PIECES), "order"), rows)
     head = ("phi 1/2, dt [ms]", *(f"{x:g}" for x in dt), "order")
     lines += ["", *table(head, [
         ("frequency off [%]", *(f"{100 * e:.3g}" for e in over_dt["frequency"]), f"{slope:.2f}"),
@@ -126,8 +125,8 @@ def convergence() -> Table:
 
 def damping() -> Table:
     """Damping ratio asked against seen, at 100 Hz and the shipping phi."""
-    seen, frequency, floor = beams.damping_sweep()
-    asked = np.array(beams.ZETAS)
+    seen, frequency, floor = beam_theory.damping_sweep()
+    asked = np.array(beam_theory.ZETAS)
     figure, axes = plt.subplots(figsize=(5.4, 4.4), layout="constrained")
     axes.plot([0, 0.21], [0, 0.21], color=GREY, lw=1, ls="--")
     axes.fill_between([0, 0.21], [-0.005, 0.205], [0.005, 0.215], color=GREY, alpha=0.18, lw=0, label="gate: 0.005")
@@ -141,7 +140,7 @@ def damping() -> Table:
         ("damping ratio asked", *(f"{z:g}" for z in asked)),
         [("seen", *(f"{z:.4f}" for z in seen)), ("frequency", *(f"{100 * (f - 1):+.2f} %" for f in frequency))],
     )
-    f_seen, f_truth = beams.measured_frequencies()
+    f_seen, f_truth = beam_theory.measured_frequencies()
     off = [f"{100 * (a / b - 1):+.2f} %" for a, b in zip(f_seen, f_truth, strict=True)]
     return [*lines, "", *table(("frequency at 1 ms", "first", "second", "third"), [("off", *off)])]
 

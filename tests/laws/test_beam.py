@@ -1,34 +1,34 @@
 """A rod of 16 bodies against the beam it stands for: elastica, taper, two woods, frequencies, damping, buckling.
 
-Theory is computed in ``tests/beams.py``; ``make validation`` draws what is compared here.
+Theory is computed in ``tests/support/beam_theory.py``; ``make validation`` draws what is compared here.
 """
 
 from __future__ import annotations
 
 import dataclasses
 
-import beams
 import numpy as np
 import pytest
-from beams import Beam
 from scipy.optimize import brentq
 from scipy.special import jv
 
+from tests.support import beam_theory
+from tests.support.beam_theory import Beam
 from vinesim import frames
-from vinesim.world.grow import Tree, Wood
+from vinesim.scene.builder import Tree, Wood
 
 
 @pytest.mark.parametrize("alpha", [0.1, 1.0, 5.0, 20.0])
 def test_the_elastica_agrees_with_its_elliptic_integrals(alpha: float) -> None:
     """The truth of the tests below, by another way: Bisshopp and Drucker 1945."""
     beam = Beam(density=1e-6, tip=1.0)
-    beam = dataclasses.replace(beam, modulus=beams.G / alpha / (beam.rigidity / beam.modulus))
-    assert beams.elastica(beam) == pytest.approx(beams.elastica_by_integrals(alpha), abs=1e-6)
+    beam = dataclasses.replace(beam, modulus=beam_theory.G / alpha / (beam.rigidity / beam.modulus))
+    assert beam_theory.elastica(beam) == pytest.approx(beam_theory.elastica_by_integrals(alpha), abs=1e-6)
 
 
 def test_elastica_at_any_load() -> None:
     """Tips of 135 canes, alpha 0.05 to 20, by own weight, a bunch, or both, clamped from -57 to 57 degrees: 0.5 %."""
-    cases, truth, seen = beams.elastica_sweep()
+    cases, truth, seen = beam_theory.elastica_sweep()
     off = np.linalg.norm(seen - truth, axis=1)
     angle = np.array([case[2] for case in cases])
     travel = np.linalg.norm(truth - np.stack([np.cos(angle), np.sin(angle)], 1), axis=1)
@@ -41,13 +41,13 @@ def test_elastica_drawn_at_random() -> None:
     """Nothing chosen: lengths, radii, tapers, densities and loads of forty canes."""
     rng = np.random.default_rng(1)
     drawn = [
-        beams.of_load(
+        beam_theory.of_load(
             rng.uniform(0.1, 20.0), rng.uniform(0.0, 0.95), length=rng.uniform(0.2, 2.0), angle=rng.uniform(-1.2, 1.0),
             radius=rng.uniform(0.002, 0.02), density=rng.uniform(400.0, 1200.0),
         )
         for _ in range(40)
     ]  # fmt: skip
-    truth, seen = np.array([beams.elastica(beam) for beam in drawn]), beams.resting_tips(drawn)
+    truth, seen = np.array([beam_theory.elastica(beam) for beam in drawn]), beam_theory.resting_tips(drawn)
     straight = np.array([[np.cos(b.angle), np.sin(b.angle)] * np.array(b.length) for b in drawn])
     off = np.linalg.norm(seen - truth, axis=1) / np.linalg.norm(truth - straight, axis=1)
     assert off.max() < 0.005, drawn[int(off.argmax())]
@@ -56,50 +56,50 @@ def test_elastica_drawn_at_random() -> None:
 def test_a_tapered_cane() -> None:
     """Radius down to 0.4 of the clamp's, against the elastica with EI(s) and w(s): 0.5 % of the tip's travel."""
     drawn = [
-        beams.of_load(alpha, share, taper=taper)
+        beam_theory.of_load(alpha, share, taper=taper)
         for alpha in (0.2, 1.0, 2.0)
         for share in (0.0, 0.3)
         for taper in (0.85, 0.6, 0.4)
     ]
-    truth, seen = np.array([beams.elastica(beam) for beam in drawn]), beams.resting_tips(drawn)
+    truth, seen = np.array([beam_theory.elastica(beam) for beam in drawn]), beam_theory.resting_tips(drawn)
     off = np.linalg.norm(seen - truth, axis=1) / np.linalg.norm(truth - [1.0, 0.0], axis=1)
     assert off.max() < 0.005, (drawn[int(off.argmax())], off.max())
 
 
-@pytest.mark.parametrize("case", beams.CONVERGING)
+@pytest.mark.parametrize("case", beam_theory.CONVERGING)
 def test_error_falls_with_the_square_of_the_pieces(case: str) -> None:
-    errors = beams.errors_over_pieces()[case]
+    errors = beam_theory.errors_over_pieces()[case]
     assert (np.log2(errors[:-1] / errors[1:]) > 1.8).all(), errors
 
 
 def test_the_elastica_of_parts_agrees_with_that_of_the_whole() -> None:
     """The truth of the test below: a tapered cane cut in three where it does not matter."""
-    beam = beams.of_load(2.0, 0.3, taper=0.5, angle=0.3)
+    beam = beam_theory.of_load(2.0, 0.3, taper=0.5, angle=0.3)
     thin = [1.0 - 0.5 * s for s in (0.0, 0.3, 0.6, 1.0)]
     parts = [
         dataclasses.replace(beam, length=length, radius=beam.radius * a, taper=b / a)
         for length, a, b in zip((0.3, 0.3, 0.4), thin, thin[1:], strict=False)
     ]
-    assert beams.elastica_of_parts(parts) == pytest.approx(beams.elastica(beam), abs=1e-6)
+    assert beam_theory.elastica_of_parts(parts) == pytest.approx(beam_theory.elastica(beam), abs=1e-6)
 
 
-@pytest.mark.parametrize("case", beams.JOINED)
+@pytest.mark.parametrize("case", beam_theory.JOINED)
 def test_error_falls_with_the_square_of_the_pieces_where_woods_join(case: str) -> None:
-    errors = beams.errors_over_pieces_of_joined()[case]
+    errors = beam_theory.errors_over_pieces_of_joined()[case]
     assert (np.log2(errors[:-1] / errors[1:]) > 1.8).all(), errors
 
 
 def test_error_falls_with_the_square_of_the_step() -> None:
     """phi 1/2: order 1.8 and more, in frequency by the factor that theory gives the trapezoidal rule."""
-    errors = beams.errors_over_dt()
-    assert beams.order(beams.STEPS, errors["frequency"]) > 1.8
-    assert beams.order(beams.STEPS, errors["tip"]) > 1.8
+    errors = beam_theory.errors_over_dt()
+    assert beam_theory.order(beam_theory.STEPS, errors["frequency"]) > 1.8
+    assert beam_theory.order(beam_theory.STEPS, errors["tip"]) > 1.8
     np.testing.assert_allclose(errors["frequency"], errors["theory"], rtol=0.25)
 
 
 def test_first_three_frequencies() -> None:
     """Against Euler and Bernoulli: 1, 3, 5 % (dt small enough that time is not the error)."""
-    seen, truth = beams.measured_frequencies()
+    seen, truth = beam_theory.measured_frequencies()
     np.testing.assert_array_less(abs(seen / truth - 1.0), [0.01, 0.03, 0.05])
 
 
@@ -108,10 +108,10 @@ def test_damping_seen_is_damping_asked() -> None:
 
     Below its floor the solver shows the floor, and ``Plants.damping_floor`` says which it is.
     """
-    seen, frequency, floor = beams.damping_sweep()
-    asked = np.maximum(beams.ZETAS, floor)
+    seen, frequency, floor = beam_theory.damping_sweep()
+    asked = np.maximum(beam_theory.ZETAS, floor)
     np.testing.assert_allclose(seen, asked, atol=0.005)
-    below = np.array(beams.ZETAS) < floor
+    below = np.array(beam_theory.ZETAS) < floor
     assert below.sum() >= 2
     np.testing.assert_allclose(seen[below], floor[below], rtol=0.02)
     np.testing.assert_allclose(frequency, 1.0, atol=0.01)
@@ -121,14 +121,14 @@ def test_damping_seen_is_damping_asked() -> None:
 def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
     """A side load on the tip: P/3E1I (L^3 - l^3) + P l^3 / 3E2I, each joint with its own spring."""
     load, half = 0.002, 0.5
-    tree = beams.two_woods(stiff_first, density=8.0)  # too light for its weight to matter
+    tree = beam_theory.two_woods(stiff_first, density=8.0)  # too light for its weight to matter
     tree.settle()
     for body in tree.bodies:
         body["damping"] = 0.3 * np.asarray(body["stiffness"])
-    plants = beams.standing([tree], phi=1.0, dt=0.02)
+    plants = beam_theory.standing([tree], phi=1.0, dt=0.02)
     plants.body_load[15] = [0.0, load, 0.0, 0.0, 0.0, load / 16]
     before = plants.state.body_q[15].copy()
-    beams.run(plants, 1500)
+    beam_theory.run(plants, 1500)
     plants.kinematics()
     tips = [
         frames.compose(pose.astype(float), frames.pose([1 / 16, 0, 0])) for pose in (before, plants.state.body_q[15])
@@ -142,7 +142,7 @@ def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
 @pytest.mark.parametrize("pieces", [2, 8])
 def test_a_cane_of_two_thicknesses_twists_as_two(pieces: int) -> None:
     """A small weight beside the tip: W a (l / GJ + l' / G'J'), exactly, since the moment is the same all along."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, beams.HEIGHT])))
+    tree = Tree(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
     thick = tree.rod(-1, 0.4, (0.005, 0.005), Wood(5e9, 8.0, 0.3), pieces)
     thin = tree.rod(thick[-1], 0.6, (0.003, 0.003), Wood(2e9, 8.0, 0.3, shear=1e9), pieces)
     mass, beside, half = 0.002, 0.05, tree.bodies[thin[-1]]["far"]
@@ -150,21 +150,21 @@ def test_a_cane_of_two_thicknesses_twists_as_two(pieces: int) -> None:
         thin[-1], offset=(0.6 / pieces, 0, 0), mass=mass, com=(0, beside, 0), inertia=[mass * 1e-4] * 3, length=1e-3,
         stiffness=half, damping=0.3 * half,
     )  # fmt: skip
-    plants = beams.settle([tree])
+    plants = beam_theory.settle([tree])
     side = frames.rotate(plants.state.body_q[-1, 3:].astype(float), np.array([0.0, 1.0, 0.0]))
     polar = np.pi / 2 * np.array([0.005, 0.003]) ** 4
-    truth = mass * beams.G * beside * (0.4 / (5e9 / 2.6 * polar[0]) + 0.6 / (1e9 * polar[1]))
+    truth = mass * beam_theory.G * beside * (0.4 / (5e9 / 2.6 * polar[0]) + 0.6 / (1e9 * polar[1]))
     assert -np.arcsin(side[2]) == pytest.approx(truth, rel=0.003)
 
 
 @pytest.mark.parametrize("beta", [(0.006, 0.0), (0.0, 0.006), (0.003, 0.009)])
 def test_damping_of_each_segment_counts(beta: tuple[float, float]) -> None:
     """Two woods damped differently: the damping ratio is that of the chain's quadratic eigenvalue problem."""
-    tree = beams.two_woods(True, beta=beta)
-    frequency, zeta = (values[0] for values in beams.chain_modes(tree))
-    plants = beams.standing([tree], phi=0.5, dt=0.002)
-    swing = beams.run(plants, 2000, watch=np.array([15]))[:, 0, 2]
-    seen = beams.fitted_swing(np.arange(2000)[200:] * 0.002, swing[200:], frequency)
+    tree = beam_theory.two_woods(True, beta=beta)
+    frequency, zeta = (values[0] for values in beam_theory.chain_modes(tree))
+    plants = beam_theory.standing([tree], phi=0.5, dt=0.002)
+    swing = beam_theory.run(plants, 2000, watch=np.array([15]))[:, 0, 2]
+    seen = beam_theory.fitted_swing(np.arange(2000)[200:] * 0.002, swing[200:], frequency)
     assert seen[0] == pytest.approx(frequency, rel=0.02)
     assert seen[1] == pytest.approx(zeta, rel=0.03)
 
@@ -173,10 +173,10 @@ def test_damping_of_each_segment_counts(beta: tuple[float, float]) -> None:
 def test_greenhill(share: float, stands: bool) -> None:
     """A rod of more than the self-buckling length falls over: rho g A L^3 / EI = 9/4 j^2, J_-1/3(j) = 0."""
     critical = 2.25 * brentq(lambda z: jv(-1.0 / 3.0, z), 1.5, 2.2) ** 2
-    beam = beams.of_load(critical * share**3, 0.0, angle=np.pi / 2, beta=0.05)
-    plants = beams.standing([beam.tree()])
+    beam = beam_theory.of_load(critical * share**3, 0.0, angle=np.pi / 2, beta=0.05)
+    plants = beam_theory.standing([beam.tree()])
     plants.state.joint_qd[0, 1] = 0.02
-    beams.run(plants, 6000)
+    beam_theory.run(plants, 6000)
     plants.kinematics()
     lean = np.hypot(*plants.state.body_q[beam.pieces, :2])
     assert lean < 0.02 if stands else lean > 0.2

@@ -5,13 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from touch_scenes import cane
 
+from tests.support.contact_scenes import cane
 from vinesim import frames
+from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.physics.step import Physics
-from vinesim.physics.yard import FRICTION
-from vinesim.world.grow import GRAVITY, assemble
-from vinesim.world.values import Drive, RobotSpec
+from vinesim.scene.builder import GRAVITY, assemble
+from vinesim.scene.values import Drive, RobotSpec
 
 WEIGHT = -GRAVITY[2]
 SIZE = (0.6, 0.4, 0.3)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid import Rigid
-from vinesim.robot.description import Description, load
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.robot.description.description import Description, load
 from vinesim.robot.drives import Robot
-from vinesim.world.grow import assemble
-from vinesim.world.ids import Organ
+from vinesim.scene.builder import assemble
+from vinesim.scene.ids import Organ
 
 DT = 0.01
 ARM = tuple(f"arm_left_{i}_joint" for i in range(1, 8))

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from touch_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 
+from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from vinesim import frames
-from vinesim.physics.oracle import Whole
+from vinesim.bench.mujoco_reference import Whole
+from vinesim.physics.contact.contact_solver import STIFFNESS, Touching
 from vinesim.physics.step import Physics
-from vinesim.physics.touching import STIFFNESS, Touching
-from vinesim.world.grow import assemble
-from vinesim.world.ids import Organ
-from vinesim.world.values import Drive
+from vinesim.scene.builder import assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.values import Drive
 
 FINGERS = ("left", "right")
 

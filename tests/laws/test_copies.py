@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid import Rigid
-from vinesim.robot.description import Description, load
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.robot.description.description import Description, load
 from vinesim.robot.drives import Embodied, RemoteRobot, Robot
-from vinesim.world.grow import assemble
-from vinesim.world.values import Drive, RobotSpec, RobotUpdate
+from vinesim.scene.builder import assemble
+from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
 
 STIFFNESS, DAMPING = 4000.0, 400.0
 INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'

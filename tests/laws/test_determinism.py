@@ -10,10 +10,10 @@ import sys
 
 import numpy as np
 
-from vinesim.physics import bench_scenes as scenes
+from vinesim.bench import scenes as scenes
 from vinesim.physics.step import Physics
-from vinesim.world.generate import generate
-from vinesim.world.scene import load
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
 
 HERE = pathlib.Path(__file__)
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rollout import Rollout, Track
-from vinesim.world.grow import Tree, Wood, assemble
-from vinesim.world.model import Model
+from vinesim.physics.plants.rollout import Rollout, Track
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.model import Model
 
 
 def forked() -> Model:

@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from touch_scenes import bar, cane, grasp, gripper
 
+from tests.support.contact_scenes import bar, cane, grasp, gripper
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.world.grow import assemble
-from vinesim.world.values import RobotSpec
+from vinesim.scene.builder import assemble
+from vinesim.scene.values import RobotSpec
 
 TICKS = 260
 BOXES = {

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loose_world import BOX, BUNCH, Server, vineyard
 
+from tests.support.shared_vineyard import BOX, BUNCH, Server, vineyard
 from vinesim import frames
-from vinesim.net.authority import Claim
-from vinesim.net.bus import MemoryHub
-from vinesim.net.exchange import Exchange
-from vinesim.net.messages import Hello
-from vinesim.world.ids import is_tree
-from vinesim.world.values import RobotUpdate
+from vinesim.net.codec.messages import Hello
+from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.exchange import Exchange
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.scene.ids import is_tree
+from vinesim.scene.values import RobotUpdate
 
 TICK = 0.01
 DELAY, JITTER = 0.03, 0.02

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import beams
 import numpy as np
-from beams import Beam
 
-from vinesim.physics.plants import Plants
-from vinesim.world.generate import generate
-from vinesim.world.ids import Organ
-from vinesim.world.scene import load
-from vinesim.world.state import State
+from tests.support import beam_theory
+from tests.support.beam_theory import Beam
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
+from vinesim.scene.spec import load
+from vinesim.scene.state import State
 
 CANE_MODULUS = 5.89e9
 """[Pa] Flexural, three-point bending of grapevine canes: Bu et al. 2025, BioResources 20(3):6662."""
@@ -29,11 +29,11 @@ BARE_DAMPING = (0.01, 0.08)
 def test_a_cane_of_published_wood_swings_within_the_published_band_of_branches() -> None:
     """Half a metre of the published modulus and diameter, 100 Hz: within two standard deviations of 11.8 Hz."""
     beam = Beam(modulus=CANE_MODULUS, radius=CANE_DIAMETER / 2, length=0.5, density=950.0)
-    f = beams.cantilever_frequencies(beam, 1)[0]
+    f = beam_theory.cantilever_frequencies(beam, 1)[0]
     beam = Beam(**(vars(beam) | {"beta": BRANCH_DAMPING / (np.pi * f)}))
-    plants = beams.standing([beam.tree()])
-    swing = beams.run(plants, 200, watch=beams.last_bodies(plants))[:, 0, 2]
-    seen, zeta = beams.fitted_swing(np.arange(200) * plants.dt, swing, f)
+    plants = beam_theory.standing([beam.tree()])
+    swing = beam_theory.run(plants, 200, watch=beam_theory.last_bodies(plants))[:, 0, 2]
+    seen, zeta = beam_theory.fitted_swing(np.arange(200) * plants.dt, swing, f)
     assert abs(seen - BRANCH_FREQUENCY) < 2 * BRANCH_SPREAD
     assert abs(zeta - BRANCH_DAMPING) < 0.01  # what the branches had is what was asked
 
@@ -43,10 +43,10 @@ def test_a_branch_of_the_published_modal_mass_and_stiffness() -> None:
     beam = Beam(
         density=8.0, tip=BRANCH_MASS, length=0.5, modulus=BRANCH_STIFFNESS * 0.5**3 / 3 / (np.pi * 0.004**4 / 4)
     )
-    plants = beams.standing([beam.tree()], phi=0.5, dt=0.001)
+    plants = beam_theory.standing([beam.tree()], phi=0.5, dt=0.001)
     plants.state.joint_qd[0, 2] = 0.3
-    swing = beams.run(plants, 2000, watch=beams.last_bodies(plants))[:, 0, 1]
-    seen, _ = beams.fitted_swing(np.arange(2000) * plants.dt, swing, 12.07)
+    swing = beam_theory.run(plants, 2000, watch=beam_theory.last_bodies(plants))[:, 0, 1]
+    seen, _ = beam_theory.fitted_swing(np.arange(2000) * plants.dt, swing, 12.07)
     assert abs(seen - np.sqrt(BRANCH_STIFFNESS / BRANCH_MASS) / (2 * np.pi)) < 0.15
     assert abs(seen - BRANCH_FREQUENCY) < BRANCH_SPREAD
 
@@ -61,7 +61,7 @@ def test_shoots_of_the_shipped_vineyard_damp_within_the_published_bands() -> Non
     rest = plants.state.body_q[tips, :3].copy()
     for tree in chosen:
         plants.state.joint_qd[model.tree_first[tree], 1:] = 0.5
-    swing = np.linalg.norm(beams.run(plants, 400, watch=np.array(tips)) - rest, axis=2)
+    swing = np.linalg.norm(beam_theory.run(plants, 400, watch=np.array(tips)) - rest, axis=2)
     ratios = []
     for path in swing.T:
         peaks = np.flatnonzero((path[1:-1] > path[:-2]) & (path[1:-1] >= path[2:]) & (path[1:-1] > 5e-4)) + 1

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import beams
 import mujoco
 import numpy as np
 import pytest
-from beams import Rod
-from test_trees import energy, forked
 
+from tests.laws.test_trees import energy, forked
+from tests.support import beam_theory
+from tests.support.beam_theory import Rod
 from vinesim import frames
-from vinesim.physics.oracle import compile_plants, copy_state
-from vinesim.physics.plants import Plants
-from vinesim.world.grow import Tree, Wood, assemble
-from vinesim.world.state import State
+from vinesim.bench.mujoco_reference import compile_plants, copy_state
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.state import State
 
 PIECES = 32
 SECOND_MOMENT = np.pi * 0.004**4 / 4
@@ -21,12 +21,12 @@ SECOND_MOMENT = np.pi * 0.004**4 / 4
 
 def rod(turn: float, weight: float, beside: float, *, modulus: float = 5e9, shear: float | None = None) -> Tree:
     """A level rod of a metre, relaxed along an arc to the left by ``turn`` [rad]; a weight beside its tip [N, m]."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, beams.HEIGHT])))
+    tree = Tree(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
     share = np.full(PIECES, turn / PIECES)
     share[0] /= 2  # pieces are chords: the first leaves the clamp at half an angle
     bends = frames.yaw(share)
     last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(modulus, 8.0, 0.3, shear), PIECES, bends=bends)[-1]
-    mass = max(weight / beams.G, 1e-6)
+    mass = max(weight / beam_theory.G, 1e-6)
     half = 2.0 * np.asarray(
         tree.bodies[last]["stiffness"]
     )  # half an element lies between the last joint and the weight
@@ -41,7 +41,7 @@ def theory(turn: float, weight: float, beside: float, modulus: float = 5e9, shea
     shear = modulus / 2.6 if shear is None else shear
     return Rod(
         bend=modulus * SECOND_MOMENT, twist=shear * 2 * SECOND_MOMENT, turn=turn, weight=weight, beside=beside,
-        line_weight=8.0 * np.pi * 0.004**2 * beams.G,
+        line_weight=8.0 * np.pi * 0.004**2 * beam_theory.G,
     )  # fmt: skip
 
 
@@ -49,8 +49,8 @@ def test_twist_of_an_offset_weight_is_moment_times_length_over_GJ() -> None:
     """Small: W a L / GJ, and as much more if the shear modulus is less."""
     shears = (None, 1e9, 4e9)
     trees = [rod(0.0, 0.02, 0.1, shear=shear) for shear in shears] + [rod(0.0, 0.02, 0.0)]
-    plants = beams.settle(trees)
-    q = plants.state.body_q[beams.last_bodies(plants)][:, 3:].astype(float)
+    plants = beam_theory.settle(trees)
+    q = plants.state.body_q[beam_theory.last_bodies(plants)][:, 3:].astype(float)
     side = frames.rotate(q, np.array([0.0, 1.0, 0.0]))
     roll = -np.arcsin(side[:, 2])  # the weight's side goes down
     truth = [0.02 * 0.1 / ((5e9 / 2.6 if shear is None else shear) * 2 * SECOND_MOMENT) for shear in shears]
@@ -69,14 +69,14 @@ def test_a_bent_cane_twisted_by_an_offset_weight_rests_where_kirchhoffs_rod_does
     A joint's axes of twist and bending are those of the piece behind it, half a bend from its middle: on a curved rod
     whose GJ is not EI, the error falls with the pieces, not with their square (0.5 % at 32 on a quarter arc).
     """
-    plants = beams.standing([rod(*case) for case in SPATIAL])
-    tips = beams.last_bodies(plants)
+    plants = beam_theory.standing([rod(*case) for case in SPATIAL])
+    tips = beam_theory.last_bodies(plants)
     drawn = plants.state.body_q[tips].astype(float)
-    plants = beams.settle([rod(*case) for case in SPATIAL])
+    plants = beam_theory.settle([rod(*case) for case in SPATIAL])
     for case, start, end in zip(SPATIAL, drawn, plants.state.body_q[tips].astype(float), strict=True):
         turn = case[0]
         relaxed = [np.sin(turn) / turn, (1 - np.cos(turn)) / turn, 0.0] if turn else [1.0, 0.0, 0.0]
-        place, q = beams.kirchhoff(theory(*case))
+        place, q = beam_theory.kirchhoff(theory(*case))
         travel = place - relaxed
         bound = 0.01 if turn else 0.005
         assert np.linalg.norm(end[:3] - start[:3] - travel) < bound * np.linalg.norm(travel), case
@@ -88,7 +88,7 @@ def test_a_bent_cane_twisted_by_an_offset_weight_rests_where_kirchhoffs_rod_does
 def test_kirchhoffs_rod_agrees_with_the_quarter_arc() -> None:
     """The truth of the test above: a quarter arc sags by P R^3 (pi/4 / EI + (3 pi/4 - 2) / GJ)."""
     arc = Rod(turn=np.pi / 2, weight=1e-3)
-    place, _ = beams.kirchhoff(arc)
+    place, _ = beam_theory.kirchhoff(arc)
     radius = arc.length / arc.turn
     sag = arc.weight * radius**3 * (np.pi / 4 / arc.bend + (3 * np.pi / 4 - 2) / arc.twist)
     assert -place[2] == pytest.approx(sag, rel=1e-4)
@@ -119,7 +119,7 @@ def test_forked_trees_rest_where_mujocos_do() -> None:
 def drift(tree: Tree, kick: np.ndarray, *, phi: float = 0.5, seconds: float = 60.0) -> tuple[np.ndarray, float]:
     """Energy above that at rest [J] every 50 ms of an undamped tree whose joints start with ``kick`` [rad/s], and the
     fastest turning of any body in all that time [rad/s]."""
-    rest, plants = (beams.standing([tree], phi=phi) for _ in range(2))
+    rest, plants = (beam_theory.standing([tree], phi=phi) for _ in range(2))
     rest.free()
     plants.state.joint_qd[:] = kick
     seen, fastest = [], 0.0
@@ -187,11 +187,11 @@ def test_survives_violence_for_ten_seconds(phi: float, rate: float) -> None:
     thrashing, and what carries nothing is back where it hung."""
     rng = np.random.default_rng(29)
     light = [forked(rng, beta=0.004, soft=5.0) for _ in range(6)]
-    light += [beams.Beam(beta=0.004, taper=taper).tree() for taper in (1.0, 0.5)]
+    light += [beam_theory.Beam(beta=0.004, taper=taper).tree() for taper in (1.0, 0.5)]
     for tree in light:
         tree.settle()
-    loaded = [beams.Beam(beta=0.004, tip=tip).tree() for tip in (0.05, 0.2, 0.5, 0.05, 0.2, 0.5)]
-    plants = beams.standing(light + loaded, phi=phi)
+    loaded = [beam_theory.Beam(beta=0.004, tip=tip).tree() for tip in (0.05, 0.2, 0.5, 0.05, 0.2, 0.5)]
+    plants = beam_theory.standing(light + loaded, phi=phi)
     plants.kinematics()
     home = plants.state.body_q[:, :3].copy()
     plants.state.joint_qd[:] = rate * frames.normalize(rng.normal(size=plants.state.joint_qd.shape))
@@ -234,7 +234,7 @@ def test_limp_threads_calm_down(beta: float) -> None:
         for stiffness in (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
         for _ in range(3)
     ]
-    rest, plants = (beams.standing(trees) for _ in range(2))
+    rest, plants = (beam_theory.standing(trees) for _ in range(2))
     rest.free()
     rng = np.random.default_rng(31)
     plants.state.joint_qd[:] = 20.0 * frames.normalize(rng.normal(size=plants.state.joint_qd.shape))
@@ -251,10 +251,10 @@ def test_limp_threads_calm_down(beta: float) -> None:
 
 def test_a_thrown_tree_keeps_phi_1_until_it_has_been_calm_for_a_second() -> None:
     """Not so a quiet one, nor one that is touched while it swings below ``brisk``."""
-    trees = [beams.Beam(beta=0.004).tree(i) for i in range(3)]
+    trees = [beam_theory.Beam(beta=0.004).tree(i) for i in range(3)]
     for tree in trees:
         tree.settle()
-    plants = beams.standing(trees)
+    plants = beam_theory.standing(trees)
     thrown, quiet, touched = (plants.model.bodies_of(i) for i in range(3))
     plants.state.joint_qd[thrown, 2] = 8.0
     plants.state.joint_qd[quiet, 2] = plants.state.joint_qd[touched, 2] = 0.2

@@ -5,12 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from touch_scenes import cane
 
+from tests.support.contact_scenes import cane
 from vinesim import frames
+from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.physics.step import Physics
-from vinesim.physics.yard import FRICTION
-from vinesim.world.grow import GRAVITY, assemble
+from vinesim.scene.builder import GRAVITY, assemble
 
 MASSES = 0.4 + 0.03 * np.arange(10)
 CRATE = 2.0

@@ -7,14 +7,14 @@ import hashlib
 import mujoco
 import numpy as np
 import pytest
-from clustered import fall, momenta
 
+from tests.support.clustered_trees import fall, momenta
 from vinesim import frames
-from vinesim.physics.oracle import compile_plants, copy_state
-from vinesim.physics.plants import Plants
-from vinesim.world.grow import GRAVITY, Tree, Wood, assemble
-from vinesim.world.model import Model
-from vinesim.world.state import State
+from vinesim.bench.mujoco_reference import compile_plants, copy_state
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.scene.builder import GRAVITY, Tree, Wood, assemble
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
 
 DT = 0.01
 

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from ends import Served, wait
 
-from vinesim.net.puppet import Stage
+from tests.support.live_server import Served, wait
+from vinesim.bench.support.fake_client import Stage
 
 PLACES = {"ada": 1.0, "bob": 2.0, "cleo": 3.0, "dan": 2.5}
 SKEWS = {"ada": 2.0, "bob": -2.0}

@@ -8,23 +8,25 @@ import sys
 import time
 
 import numpy as np
-from ends import Served, wait
 
+from tests.support.live_server import Served, wait
+from vinesim.bench import fuzz
+from vinesim.bench.fuzz import EVIL, storm
+from vinesim.bench.support.fake_client import Puppet, Stage, row
 from vinesim.client.client import Client
-from vinesim.client.places import spawn_pose
-from vinesim.net import bench_fuzz, messages, smooth
-from vinesim.net.bench_fuzz import EVIL, storm
-from vinesim.net.bus import MemoryHub
-from vinesim.net.puppet import Puppet, Stage, row
-from vinesim.net.zenoh_bus import ZenohBus
-from vinesim.robot.description import load as load_robot
-from vinesim.world.generate import generate
-from vinesim.world.scene import load
+from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.net.codec import messages
+from vinesim.net.replication import dead_reckoning
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.zenoh_bus import ZenohBus
+from vinesim.robot.description.description import load as load_robot
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
 
 
 def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
     """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
-    ada, bob, _, arrived = bench_fuzz.play(3_000, seed=11)
+    ada, bob, _, arrived = fuzz.play(3_000, seed=11)
     said = [record.message for record in caplog.records if EVIL in record.message and "dropped" in record.message]
     assert len(said) == 2, "once by each of the two who hear it"
     counters = ada.exchange.counters
@@ -65,7 +67,7 @@ def test_one_record_from_the_far_future_does_not_silence_its_author_for_ever():
     hub.advance(0.01)
     bob.tick(hub.time)
     ada.place[0] = 1.5
-    run(smooth.FUTURE + 0.5)
+    run(dead_reckoning.FUTURE + 0.5)
     assert bob.robots["ada"].base_q[0] > 1.49
     before = bob.heard[0]
     run(0.3)

@@ -11,11 +11,11 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from ends import Served, need_links, wait
 
-from vinesim.net.emulator import Count, Emulator, Line
-from vinesim.net.puppet import Stage
-from vinesim.world.ids import Kind, thing
+from tests.support.live_server import Served, need_links, wait
+from vinesim.bench.support.fake_client import Stage
+from vinesim.bench.support.network_emulator import Count, Emulator, Line
+from vinesim.scene.ids import Kind, thing
 
 WINDOW = 1.0
 """How long is counted [s]."""
@@ -26,7 +26,7 @@ clock, keepalives, acknowledgements. What is touched here would cost ten times a
 
 UNMATCHED = """
 import json, sys, time
-from vinesim.net.zenoh_bus import ZenohBus
+from vinesim.net.transport.zenoh_bus import ZenohBus
 
 with ZenohBus("ada", connect=sys.argv[1]) as bus:
     publisher = bus.publisher("c/0/0/ada")

@@ -9,12 +9,12 @@ import pytest
 
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.places import QUEUE, bunch_centres, bunch_in_reach, spawn_pose, start_pose
-from vinesim.net.bus import MemoryHub
-from vinesim.robot.description import load as load_robot
-from vinesim.robot.reach import ReachAndPush
-from vinesim.world.generate import generate
-from vinesim.world.scene import load
+from vinesim.client.tasks.start_poses import QUEUE, bunch_centres, bunch_in_reach, spawn_pose, start_pose
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
 
 DT = 0.01
 
@@ -120,7 +120,7 @@ def test_each_has_its_topics_under_its_name():
         *(f"/farm_{i}/{topic}" for i in (1, 2) for topic in ("joint_states", "mobile_base_controller/odom", "tf")),
     ]
     witness = subprocess.Popen(
-        [sys.executable, "-m", "vinesim.ros.witness", *(word for topic in topics for word in ("--topic", topic))],
+        [sys.executable, "-m", "vinesim.ros.tools.topic_monitor", *(word for topic in topics for word in ("--topic", topic))],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

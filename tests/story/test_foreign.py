@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from touch_scenes import cane
 
+from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.robot.description import Description, DescriptionError, load
+from vinesim.robot.description.description import Description, DescriptionError, load
 from vinesim.robot.drives import Robot
-from vinesim.robot.reach import ReachAndPush
-from vinesim.world.grow import assemble
+from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.scene.builder import assemble
 
 BUNCH = np.array([0.65, 0.25, 1.25])
 """Middle of a hanging bunch, ahead of the robot's left shoulder [m]."""

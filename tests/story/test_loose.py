@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from loose_world import BOX, BUNCH, World, apart, heard, pose_of, sent, vineyard
 
+from tests.support.shared_vineyard import BOX, BUNCH, World, apart, heard, pose_of, sent, vineyard
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.physics.people import standing
-from vinesim.world.ids import Kind, Organ, thing_named
-from vinesim.world.values import HumanPose
+from vinesim.physics.rigid.human_body import standing
+from vinesim.scene.ids import Kind, Organ, thing_named
+from vinesim.scene.values import HumanPose
 
 
 def drive(client: Client, speed: float) -> None:

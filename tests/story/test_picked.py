@@ -5,18 +5,18 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from weighing import pressed_on_ground
 
+from tests.support.contact_forces import pressed_on_ground
 from vinesim import frames
-from vinesim.client import picking, places
 from vinesim.client.client import Client
-from vinesim.net.bus import MemoryHub
-from vinesim.robot.description import load
-from vinesim.robot.pick import Pick
-from vinesim.world.generate import generate
-from vinesim.world.ids import Kind, thing
-from vinesim.world.scene import load as load_scene
-from vinesim.world.scene import reseeded
+from vinesim.client.tasks import pick_planning, start_poses
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.robot.description.description import load
+from vinesim.robot.tasks.pick import Pick
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Kind, thing
+from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import reseeded
 
 DT = 0.01
 GRAVITY = 9.81
@@ -27,7 +27,7 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     now = [100.0]
     scene = reseeded(load_scene("harvest"), 7)
     model, vinebot, hub = generate(scene), load("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
-    task = next(picking.tasks(model, places.spawn_pose(scene, 0)[:2]))
+    task = next(pick_planning.tasks(model, start_poses.spawn_pose(scene, 0)[:2]))
     box = thing(Kind.BOX, task.box)
     beside = model.box_pose[task.box, :2] + [0.0, 1.6]
     worker, visitor = (

@@ -15,15 +15,15 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from recorded import TICK, Light
 
-from vinesim.client.record import Recorder
-from vinesim.net import messages
-from vinesim.net.access import Role
-from vinesim.net.certificates import new as new_certificate
-from vinesim.net.recording import NotARecording, Recording, Tape, read
-from vinesim.net.server import Server
-from vinesim.net.zenoh_bus import ZenohBus
+from tests.support.recorded_world import TICK, Light
+from vinesim.client.recording.recorder import Recorder
+from vinesim.net.codec import messages
+from vinesim.net.recording.mcap_file import NotARecording, Recording, Tape, read
+from vinesim.net.server.server import Server
+from vinesim.net.transport.access_control import Role
+from vinesim.net.transport.certificates import new as new_certificate
+from vinesim.net.transport.zenoh_bus import ZenohBus
 
 PATIENCE = 20.0
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from vinesim.client.client import Client
-from vinesim.client.places import bunch_centres, bunch_in_reach, spawn_pose
-from vinesim.client.trace import Trace, remote_error, touch_to_motion
-from vinesim.net.bus import MemoryHub
-from vinesim.robot.description import load as load_robot
-from vinesim.robot.reach import ReachAndPush
-from vinesim.world.generate import generate
-from vinesim.world.scene import load
+from vinesim.client.recording.trace import Trace, remote_error, touch_to_motion
+from vinesim.client.tasks.start_poses import bunch_centres, bunch_in_reach, spawn_pose
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
 
 DT = 0.01
 DELAY = 0.02

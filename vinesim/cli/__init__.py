@@ -132,7 +132,7 @@ def server(
       vinesim server --connect tcp/192.168.1.5:7447
     """
     options = dict(locals())
-    from vinesim.cli.serve import run
+    from vinesim.cli.server import run
 
     raise typer.Exit(run(**options))
 
@@ -202,14 +202,14 @@ def client(
     """
     options = dict(locals())
     if role == "human":
-        from vinesim.cli.human import run as visit
+        from vinesim.cli.human_client import run as visit
 
         raise typer.Exit(visit(**options))
     if role == "spectator":
-        from vinesim.cli.spectate import run as look
+        from vinesim.cli.spectator_client import run as look
 
         raise typer.Exit(look(**options))
-    from vinesim.cli.join import run
+    from vinesim.cli.robot_client import run
 
     raise typer.Exit(run(**{name: value for name, value in options.items() if name not in ("walk", "reach", "height")}))
 
@@ -335,7 +335,7 @@ def render(
       vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7
       vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
       vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick --crate 1.8,0.75,0,0.4
-    """  # noqa: E501  # a command line that can be copied
+    """  # a command line that can be copied
     from vinesim.cli.render import run
 
     things = {"robots": robot or (), "people": person or (), "crates": crate or ()}

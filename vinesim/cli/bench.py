@@ -7,24 +7,24 @@ import json
 import pathlib
 from collections.abc import Callable, Iterator
 
-from vinesim.world.values import Measurement
+from vinesim.scene.values import Measurement
 
 
 def _plants() -> Iterator[Measurement]:
-    from vinesim.physics.bench_plants import plants
+    from vinesim.bench.plants import plants
 
     return plants()
 
 
 def _contact() -> Iterator[Measurement]:
-    from vinesim.physics.bench_contact import contact
+    from vinesim.bench.contact import contact
 
     return contact()
 
 
 def _tick() -> Iterator[Measurement]:
-    from vinesim.physics.bench_contact import tick
-    from vinesim.robot.description import load
+    from vinesim.bench.contact import tick
+    from vinesim.robot.description.description import load
 
     robot = load("vinebot")
     raised = robot.home.copy()
@@ -34,62 +34,62 @@ def _tick() -> Iterator[Measurement]:
 
 
 def _asleep() -> Iterator[Measurement]:
-    from vinesim.physics.bench_asleep import asleep
-    from vinesim.robot.description import load
+    from vinesim.bench.vineyard import asleep
+    from vinesim.robot.description.description import load
 
     return asleep(load("vinebot").spec("robot"))
 
 
 def _camera() -> Iterator[Measurement]:
-    from vinesim.sensors.bench_camera import camera
+    from vinesim.bench.camera import camera
 
     return camera()
 
 
 def _eyes() -> Iterator[Measurement]:
-    from vinesim.client.bench_eyes import eyes
+    from vinesim.bench.live_camera import eyes
 
     return eyes()
 
 
 def _lidar() -> Iterator[Measurement]:
-    from vinesim.sensors.bench_lidar import lidar
+    from vinesim.bench.lidar import lidar
 
     return lidar()
 
 
 def _sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    from vinesim.sensors.bench_sensors import sensors
+    from vinesim.bench.sensor_accuracy import sensors
 
     return sensors(plot)
 
 
 def _sync(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    from vinesim.client.bench_sync import sync
+    from vinesim.bench.sync import sync
 
     return sync(plot=plot)
 
 
 def _traffic() -> Iterator[Measurement]:
-    from vinesim.net.bench_traffic import traffic
+    from vinesim.bench.traffic import traffic
 
     return traffic()
 
 
 def _load() -> Iterator[Measurement]:
-    from vinesim.net.bench_load import load
+    from vinesim.bench.load import load
 
     return load()
 
 
 def _fuzz() -> Iterator[Measurement]:
-    from vinesim.net.bench_fuzz import fuzz
+    from vinesim.bench.fuzz import fuzz
 
     return fuzz()
 
 
 def _link() -> Iterator[Measurement]:
-    from vinesim.client.bench_link import link
+    from vinesim.bench.link import link
 
     return link()
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pathlib
 
-from vinesim.net.access import SERVER, Role
-from vinesim.net.certificates import new as new_certificate
+from vinesim.net.transport.access_control import SERVER, Role
+from vinesim.net.transport.certificates import new as new_certificate
 
 
 class WrongUse(ValueError):

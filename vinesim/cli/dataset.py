@@ -10,12 +10,13 @@ from multiprocessing.connection import Connection, wait
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vinesim.cli.join import WrongUse
 from vinesim.cli.render import pixels
-from vinesim.client.life import Life
-from vinesim.sensors import dataset, renderers
-from vinesim.sensors.dataset import DatasetError, Plan
-from vinesim.world.scene import load
+from vinesim.cli.robot_client import WrongUse
+from vinesim.client.composition.randomizer import Life
+from vinesim.scene.spec import load
+from vinesim.sensors.camera import renderers
+from vinesim.sensors.export import dataset
+from vinesim.sensors.export.dataset import DatasetError, Plan
 
 Share = tuple[multiprocessing.process.BaseProcess, Connection]
 

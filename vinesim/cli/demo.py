@@ -23,12 +23,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vinesim.client import plot
-from vinesim.client.trace import Rows, remote_error
-from vinesim.robot.description import Mount
-from vinesim.ros import environment
-from vinesim.world.model import Model
-from vinesim.world.scene import Scene
+from vinesim.client.recording import touch_plot
+from vinesim.client.recording.trace import Rows, remote_error
+from vinesim.robot.description.description import Mount
+from vinesim.ros import ros_setup
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene
 
 PUSHER, VISITOR = "picker", "visitor"
 GRACE = 1.6
@@ -141,10 +141,10 @@ def company() -> Iterator[list[Process]]:
 
 def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
     """Run the demo and write ``out``; 0 if all went well."""
-    from vinesim.robot.description import load as load_robot
-    from vinesim.world.generate import generate
-    from vinesim.world.scene import load as load_scene
-    from vinesim.world.scene import reseeded
+    from vinesim.robot.description.description import load as load_robot
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.scene.spec import load as load_scene
+    from vinesim.scene.spec import reseeded
 
     console = Console(stderr=True)
     plan = reseeded(load_scene(scene), seed)
@@ -154,7 +154,7 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
     for folder in (out, out / PUSHER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
-    no_ros = environment.available()
+    no_ros = ros_setup.available()
     if no_ros:
         console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
 
@@ -170,7 +170,9 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
         server = start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0")
         endpoint = server.line(20.0).removeprefix("listening on ")
         stranger = (
-            None if no_ros else start("stranger", "-m", "vinesim.ros.witness", *heard_topics(robot_named.cameras))
+            None
+            if no_ros
+            else start("stranger", "-m", "vinesim.ros.tools.topic_monitor", *heard_topics(robot_named.cameras))
         )
         console.print(
             f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (a first run compiles kernels)"
@@ -207,10 +209,10 @@ def do(
     out: pathlib.Path,
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
-    from vinesim.client.jobs import UnknownJob
-    from vinesim.robot.description import load as load_robot
-    from vinesim.world.scene import load as load_scene
-    from vinesim.world.scene import reseeded
+    from vinesim.client.tasks.tasks import UnknownJob
+    from vinesim.robot.description.description import load as load_robot
+    from vinesim.scene.spec import load as load_scene
+    from vinesim.scene.spec import reseeded
 
     if job not in JOBS:
         raise UnknownJob(f"no job {job!r}; give push, {' or '.join(JOBS)}")
@@ -220,7 +222,7 @@ def do(
     load_robot(robot)  # say now, and once, what is wrong with it
     out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
-    no_ros = environment.available()
+    no_ros = ros_setup.available()
     quiet_ros = {} if "ROS_AUTOMATIC_DISCOVERY_RANGE" in os.environ else {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with company() as processes:
         server = Process.start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0", **quiet_ros)
@@ -280,11 +282,11 @@ def do(
 
 def onlooker(plan: Scene) -> list[str] | None:
     """Where a visitor watches a job, as options: aside from where it starts, on the way to the second start place."""
-    from vinesim.client import places
+    from vinesim.client.tasks import start_poses
 
     if len(plan.spawns) < 2:
         return None
-    here, there = (places.spawn_pose(plan, i)[:2] for i in (0, 1))
+    here, there = (start_poses.spawn_pose(plan, i)[:2] for i in (0, 1))
     way = (there - here) / max(float(np.linalg.norm(there - here)), 1e-9)
     place = here + ASIDE * way
     return ["--place", f"{place[0]:.4f}", f"{place[1]:.4f}", f"{math.atan2(-way[1], -way[0]):.4f}"]
@@ -292,13 +294,13 @@ def onlooker(plan: Scene) -> list[str] | None:
 
 def set_the_stage(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:
     """The bunch to push, and where both robots start, as options: the scene's places if a bunch is in reach there."""
-    from vinesim.client import places
+    from vinesim.client.tasks import start_poses
 
     try:
-        return places.bunch_in_reach(model, places.spawn_pose(plan, 0)), (["--spawn", "0"], ["--spawn", "1"])
-    except places.NoPlace:
-        bunch, pusher = places.stand_before_a_bunch(model, places.spawn_pose(plan, 0)[:2])
-    poses = (pusher, places.way_to(model, pusher, WAY))
+        return start_poses.bunch_in_reach(model, start_poses.spawn_pose(plan, 0)), (["--spawn", "0"], ["--spawn", "1"])
+    except start_poses.NoPlace:
+        bunch, pusher = start_poses.stand_before_a_bunch(model, start_poses.spawn_pose(plan, 0)[:2])
+    poses = (pusher, start_poses.way_to(model, pusher, WAY))
     pusher_at, visitor_at = (
         ["--place", *(f"{v:.4f}" for v in (p[0], p[1], 2.0 * math.atan2(p[5], p[6])))] for p in poses
     )
@@ -387,7 +389,7 @@ def summarise(
     """Put the clients' reports together; ``summary.json``, ``touch.png`` and the pusher's pictures go to ``out``."""
     report = {name: json.loads((out / name / "report.json").read_text()) for name in (PUSHER, VISITOR)}
     traces = {name: Rows.load(out / name / "trace.npz") for name in (PUSHER, VISITOR)}
-    plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PUSHER}, seen by {VISITOR}")
+    touch_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PUSHER}, seen by {VISITOR}")
     for picture in (out / PUSHER).glob("*.png"):
         shutil.copyfile(picture, out / picture.name)
     mine, other = report[PUSHER], report[VISITOR]

@@ -11,9 +11,9 @@ import sys
 import threading
 import time
 
-from vinesim.client.record import FAMILIES, Recorder, Stand, grid
-from vinesim.net.recording import Recording, free_path
-from vinesim.net.zenoh_bus import ZenohBus
+from vinesim.client.recording.recorder import FAMILIES, Recorder, Stand, grid
+from vinesim.net.recording.mcap_file import Recording, free_path
+from vinesim.net.transport.zenoh_bus import ZenohBus
 
 POLL = 0.004
 """Between two looks at what arrived [s]."""
@@ -81,8 +81,8 @@ def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
         if seed is not None:
             raise WrongUse(f"--seed {seed}: a seed is of a scene, give --scene too")
         return {}
-    from vinesim.world.generate import generate
-    from vinesim.world.scene import load, reseeded
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.scene.spec import load, reseeded
 
     plan = reseeded(load(scene), seed)
     return {"scene": plan.name, "seed": str(plan.seed), "digest": generate(plan).digest()}

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 if TYPE_CHECKING:
-    from vinesim.client.stage import Stage
+    from vinesim.client.composition.composer import Stage
 
 
 def run(
@@ -30,15 +30,18 @@ def run(
     renderer: str = "warp",
 ) -> int:
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
-    from vinesim.cli.join import WrongUse
-    from vinesim.sensors import formats, picture, renderers, truth
-    from vinesim.sensors.camera import Camera, CameraSpec
-    from vinesim.sensors.dataset import sized
-    from vinesim.sensors.primitives import Primitives
-    from vinesim.sensors.raycast import enclosing
-    from vinesim.world.generate import generate
-    from vinesim.world.ids import unlabel
-    from vinesim.world.scene import load, reseeded
+    from vinesim.cli.robot_client import WrongUse
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.scene.ids import unlabel
+    from vinesim.scene.spec import load, reseeded
+    from vinesim.sensors.camera import renderers
+    from vinesim.sensors.camera.camera import Camera, CameraSpec
+    from vinesim.sensors.export import annotations as formats
+    from vinesim.sensors.export import images as picture
+    from vinesim.sensors.export.dataset import sized
+    from vinesim.sensors.scene.primitives import Primitives
+    from vinesim.sensors.scene.ray_caster import enclosing
+    from vinesim.sensors.truth import truth
 
     renderers.check(renderer)
     eye, target = point("--at", at), point("--look", look)
@@ -89,10 +92,10 @@ def run(
 
 def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> Stage:
     """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
-    from vinesim.cli.join import WrongUse
-    from vinesim.client.stage import CrateAt, PersonAt, RobotAt, Stage
-    from vinesim.robot import description
-    from vinesim.world import figures
+    from vinesim.cli.robot_client import WrongUse
+    from vinesim.client.composition.composer import CrateAt, PersonAt, RobotAt, Stage
+    from vinesim.robot.description import description
+    from vinesim.scene import appearance
 
     placed_robots, placed_people, placed_crates = [], [], []
     for text in robots:
@@ -104,8 +107,8 @@ def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -
     for text in people:
         parts = text.split(",")
         posture = parts.pop() if len(parts) > 1 and parts[-1].strip().isidentifier() else "stand"
-        if posture not in figures.postures():
-            raise WrongUse(f"--person {text}: posture {posture!r} is none of {', '.join(figures.postures())}")
+        if posture not in appearance.postures():
+            raise WrongUse(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.postures())}")
         x, y, yaw = (*_place("--person", ",".join(parts), 3), 0.0)[:3]
         placed_people.append(PersonAt(x, y, yaw, posture))
     for text in crates:
@@ -118,7 +121,7 @@ def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -
 
 def _place(option: str, text: str, most: int) -> list[float]:
     """``X,Y[,YAW[,...]]`` as two to ``most`` numbers."""
-    from vinesim.cli.join import WrongUse
+    from vinesim.cli.robot_client import WrongUse
 
     try:
         values = [float(part) for part in text.split(",")]
@@ -132,7 +135,7 @@ def _place(option: str, text: str, most: int) -> list[float]:
 
 def point(option: str, text: str) -> np.ndarray:
     """``X,Y,Z`` as a point [3] m."""
-    from vinesim.cli.join import WrongUse
+    from vinesim.cli.robot_client import WrongUse
 
     try:
         value = np.array([float(part) for part in text.split(",")])
@@ -145,7 +148,7 @@ def point(option: str, text: str) -> np.ndarray:
 
 def pixels(text: str) -> tuple[int, int]:
     """``WxH`` as width and height [px]."""
-    from vinesim.cli.join import WrongUse
+    from vinesim.cli.robot_client import WrongUse
 
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if match is None:

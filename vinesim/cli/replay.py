@@ -12,9 +12,9 @@ import time
 
 import numpy as np
 
-from vinesim.net import messages
-from vinesim.net.poses import decode_pose
-from vinesim.net.recording import NotARecording, Tape, read, sender_of
+from vinesim.net.codec import messages
+from vinesim.net.codec.human import decode_pose
+from vinesim.net.recording.mcap_file import NotARecording, Tape, read, sender_of
 
 POLL = 0.004
 """Between two looks at what is due [s]."""
@@ -54,9 +54,9 @@ def _tell(
     start: float, end: float | None,
 ) -> int:  # fmt: skip
     """Play to a network."""
-    from vinesim.client.replay import Replay
-    from vinesim.net.server import Server
-    from vinesim.net.zenoh_bus import ZenohBus
+    from vinesim.client.recording.replay import Replay
+    from vinesim.net.server.server import Server
+    from vinesim.net.transport.zenoh_bus import ZenohBus
 
     with contextlib.ExitStack() as stack:
         if listen is not None:
@@ -85,10 +85,10 @@ def _look(
     scene: str | None, seed: int | None, speed: float, start: float, end: float | None,
 ) -> int:  # fmt: skip
     """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
-    from vinesim.client.replay import ReplayBus
+    from vinesim.client.recording.replay import ReplayBus
     from vinesim.client.spectator import Pictures, Spectator, looking_at, viewpoint
-    from vinesim.world.generate import generate
-    from vinesim.world.scene import SceneError, load, reseeded
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.scene.spec import SceneError, load, reseeded
 
     if scene is None and "scene" not in tape.about:
         raise WrongUse(f"{tape.path} does not say which scene it is of: give --scene")

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from vinesim.ros import environment
+from vinesim.ros import ros_setup
 
 
 def build(quiet: bool) -> int:
     """Build what has no wheel. Without ROS there is nothing to build, which is an error only if one asks aloud."""
-    reason = environment.available()
+    reason = ros_setup.available()
     if reason is not None:
         if not quiet:
             print(f"ROS 2 is not usable here: {reason}")
         return 0 if quiet else 3
-    from vinesim.ros import interfaces
+    from vinesim.ros.messages import interfaces
 
     for package in interfaces.known():
         interfaces.build(package)

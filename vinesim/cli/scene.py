@@ -7,11 +7,11 @@ import pathlib
 from rich.console import Console
 from rich.table import Table
 
-from vinesim.sensors.picture import portrait
-from vinesim.sensors.primitives import still_view
-from vinesim.world.generate import generate
-from vinesim.world.scene import load, reseeded
-from vinesim.world.show import table as rows_of
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load, reseeded
+from vinesim.scene.summary import table as rows_of
+from vinesim.sensors.export.images import portrait
+from vinesim.sensors.scene.primitives import still_view
 
 
 def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:

@@ -21,23 +21,23 @@ from concurrent.futures import Executor
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.arrivals import Arrivals
-from vinesim.client.person import Person, RemotePerson
-from vinesim.client.things import PULL, Things
-from vinesim.client.trace import Trace
-from vinesim.net import interest
-from vinesim.net.bus import Bus
-from vinesim.net.exchange import Exchange, Inbox
-from vinesim.net.messages import Hello
-from vinesim.physics.people import standing
+from vinesim.client.humans import Person, RemotePerson
+from vinesim.client.recording.trace import Trace
+from vinesim.client.remote.objects import PULL, Things
+from vinesim.client.remote.spawner import Arrivals
+from vinesim.net.codec.messages import Hello
+from vinesim.net.replication import interest
+from vinesim.net.replication.exchange import Exchange, Inbox
+from vinesim.net.transport.bus import Bus
+from vinesim.physics.plants.wind import Wind
+from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
-from vinesim.physics.urdf import RobotError
-from vinesim.physics.wind import Wind
-from vinesim.robot.description import Description
+from vinesim.robot.description.description import Description
 from vinesim.robot.drives import RemoteRobot, Robot
-from vinesim.world.model import Model
-from vinesim.world.scene import Scene
-from vinesim.world.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene
+from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
 
 log = logging.getLogger(__name__)
 

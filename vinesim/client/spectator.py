@@ -9,15 +9,15 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.client import Client, label_index
-from vinesim.net.bus import Bus
-from vinesim.net.exchange import ONLOOKER, Exchange
-from vinesim.net.messages import Hello
-from vinesim.robot.description import Description
-from vinesim.sensors import picture
-from vinesim.sensors.camera import Camera, CameraSpec
-from vinesim.sensors.eyes import load_kernels
-from vinesim.sensors.primitives import Primitives
-from vinesim.world.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
+from vinesim.net.codec.messages import Hello
+from vinesim.net.replication.exchange import ONLOOKER, Exchange
+from vinesim.net.transport.bus import Bus
+from vinesim.robot.description.description import Description
+from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
+from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.export import images
+from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.scheduler import load_kernels
 
 EYES = 1.6
 """Height of a standing person's eyes above the ground [m]."""
@@ -111,13 +111,13 @@ class Pictures:
         self._primitives.update(view, np.flatnonzero(self._moved))
         self._moved[:] = False
         ahead = frames.rotate(spectator.pose[3:], np.array([1.0, 0.0, 0.0]))
-        eye = picture.looking(spectator.pose[:3], spectator.pose[:3] + ahead)
+        eye = images.looking(spectator.pose[:3], spectator.pose[:3] + ahead)
         self.last = self._camera.render(self._primitives, eye, view.time)
         self.count += 1
-        picture.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
+        images.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
 
     def save(self, spectator: Spectator) -> None:
         """Draw what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
         self._draw(spectator)
         assert self.last is not None
-        picture.save(self.last, self.folder, "")
+        images.save(self.last, self.folder, "")

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from vinesim.client.client import Client
-from vinesim.client.pace import Pace
-from vinesim.client.trace import touch_to_motion
-from vinesim.robot.script import Script
+from vinesim.client.rate_loop import Pace
+from vinesim.client.recording.trace import touch_to_motion
+from vinesim.robot.tasks.task import Script
 
 
 class Status:

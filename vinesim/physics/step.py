@@ -7,20 +7,20 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.detail import Detail
-from vinesim.physics.guard import Guard
-from vinesim.physics.holding import Holding
-from vinesim.physics.lying import Lying
-from vinesim.physics.parting import Blade, Partings
-from vinesim.physics.plants import Plants
-from vinesim.physics.riding import Riding
-from vinesim.physics.rigid import Rigid
-from vinesim.physics.sleep import Sleep
-from vinesim.physics.touching import Touching
-from vinesim.physics.wind import Wind
-from vinesim.world.model import Model
-from vinesim.world.state import State
-from vinesim.world.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
+from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.detachment import Blade, Partings
+from vinesim.physics.plants.fault_guard import Guard
+from vinesim.physics.plants.level_of_detail import Detail
+from vinesim.physics.plants.sleep import Sleep
+from vinesim.physics.plants.wind import Wind
+from vinesim.physics.rigid.dormant_bunches import Lying
+from vinesim.physics.rigid.hand_grasp import Holding
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.support_tracking import Riding
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
 
 STIRRED = 4.0
 """[m] With robots or people about, wind moves only the trees whose foot is so near to one of them."""

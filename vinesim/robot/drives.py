@@ -23,11 +23,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.parting import Blade
-from vinesim.physics.rigid import Rigid
+from vinesim.physics.plants.detachment import Blade
+from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.robot.description import Description, Mount
-from vinesim.world.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
+from vinesim.robot.description.description import Description, Mount
+from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
 
 SPARE = 0.7
 """Share of its effort that a drive may spend on gaining speed: the rest carries weight and meets resistance."""

@@ -26,16 +26,17 @@ from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_node_name import validate_node_name
 from rclpy.validate_topic_name import validate_topic_name
 
-from vinesim.ros import convert, environment, interfaces
-from vinesim.ros.camera import Camera
-from vinesim.ros.clock import Clock
-from vinesim.ros.commands import Commands
-from vinesim.ros.lidar import Lidar
-from vinesim.ros.robot import Robot
-from vinesim.ros.surroundings import Surroundings
-from vinesim.ros.topics import RELIABLE, Build, Offer, Topic
-from vinesim.ros.types import Command
-from vinesim.world.values import CameraFrame, LidarScan, RobotSample
+from vinesim.ros import ros_setup
+from vinesim.ros.commands.subscriptions import Commands
+from vinesim.ros.commands.types import Command
+from vinesim.ros.messages import convert, interfaces
+from vinesim.ros.publishers.camera import Camera
+from vinesim.ros.publishers.clock import Clock
+from vinesim.ros.publishers.ground_truth import Surroundings
+from vinesim.ros.publishers.lidar import Lidar
+from vinesim.ros.publishers.robot import Robot
+from vinesim.ros.topic import RELIABLE, Build, Offer, Topic
+from vinesim.scene.values import CameraFrame, LidarScan, RobotSample
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ class Node:
         except NameValidationException as error:
             # rclpy points at the wrong letter in a second line.
             raise ValueError(" ".join(str(error).replace("^", "").split())) from error
-        environment.prepare()
+        ros_setup.prepare()
         interfaces.ensure(["tf2_msgs"])
         from tf2_msgs.msg import TFMessage
 

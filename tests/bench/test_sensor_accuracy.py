@@ -1,0 +1,62 @@
+"""What ``vinesim bench sensors`` measures, on a few of its cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim.bench import sensor_accuracy
+from vinesim.bench.sensor_accuracy import Depths, formula, plane, ranges
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
+from vinesim.sensors.camera.camera import CameraSpec
+from vinesim.sensors.scene.primitives import Primitives, still_view
+
+
+def test_a_plane_is_measured_as_the_formula_says(monkeypatch) -> None:
+    monkeypatch.setattr(sensor_accuracy, "RANGES", (0.5, 2.0))
+    spec = CameraSpec.load("d435")
+    found = plane(spec)
+    assert list(found.fill.values()) == [1.0, 1.0]
+    for away, error in found.error.items():
+        assert error == pytest.approx(float(formula(spec, np.array(away))), rel=0.2)
+
+
+def test_depths_are_told_only_of_enough_pixels() -> None:
+    depths, exact = Depths(), np.full(1000, 2.0)
+    measured = exact + 0.01 * np.random.default_rng(1).standard_normal(1000)
+    measured[:100] = np.nan
+    depths.add(2.0, exact, measured)
+    depths.add(3.0, exact[:400], measured[:400])
+    assert depths.fill == {2.0: 0.9}
+    assert depths.error[2.0] == pytest.approx(0.01, rel=0.1)
+
+
+def test_a_real_lidar_loses_some_returns_and_mixes_some() -> None:
+    scan = ranges("vlp16", Primitives(generate(load("demo"))))
+    assert 0.7 < scan.returned < 1.2
+    assert 0.02 < scan.mixed < 0.5
+    assert len(scan.real) == pytest.approx(scan.returned * len(scan.exact))
+
+
+def test_renderers_see_what_rays_meet(tmp_path) -> None:
+    model = generate(load("demo"))
+    pictures = sensor_accuracy.backends(CameraSpec.load("d435"), model, still_view(model))
+    assert {"warp", "rays"} <= pictures.keys()
+    cast = pictures["rays"]
+    for name, look in pictures.items():
+        same = look.primitive == cast.primitive
+        assert same.mean() > 0.999, name
+        both = same & np.isfinite(cast.depth)
+        assert np.median(np.abs(look.depth[both] - cast.depth[both])) < 1e-5, name
+    sensor_accuracy._compare(tmp_path, pictures)
+    assert (tmp_path / "sensors-backends.png").stat().st_size > 10_000
+
+
+def test_pictures_are_drawn(tmp_path) -> None:
+    spec = CameraSpec.load("d435")
+    one = Depths({0.5: 0.001, 2.0: 0.02}, {0.5: 1.0, 2.0: 0.9})
+    some = sensor_accuracy.Ranges(np.array([1.0, 2.0]), np.array([1.0]), 0.5, 0.1)
+    sensor_accuracy._draw(tmp_path / "new", spec, {"plane": one}, {"a": some, "b": some}, np.array([[0.1, 0.6]]))
+    names = {"sensors-depth.png", "sensors-lidar.png", "sensors-berries.png"}
+    assert {p.name for p in (tmp_path / "new").iterdir()} == names

@@ -1,0 +1,251 @@
+"""Wrong use: one clear line on standard error, the right exit code, no traceback, nothing half-written."""
+
+import contextlib
+import json
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from vinesim.net.codec import messages
+from vinesim.net.recording.mcap_file import Recording
+from vinesim.net.server.admission import Plan
+from vinesim.net.server.server import Server
+from vinesim.net.transport.zenoh_bus import ZenohBus
+
+
+def vinesim(*arguments, cwd=None):
+    return subprocess.run(
+        [sys.executable, "-m", "vinesim.cli", *arguments], capture_output=True, text=True, timeout=120, cwd=cwd
+    )
+
+
+def refused(done, code, *words):
+    assert done.returncode == code, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("vinesim: ")
+    for word in words:
+        assert word in lines[0]
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_help_shows_every_command_with_examples():
+    top = vinesim("--help").stdout
+    for command in (
+        "demo",
+        "server",
+        "client",
+        "record",
+        "replay",
+        "scene",
+        "bench",
+        "ros",
+        "certs",
+        "render",
+        "dataset",
+    ):
+        assert command in top
+    commands = (["demo"], ["server"], ["client"], ["scene", "show"], ["bench"], ["ros", "build-interfaces"])
+    for command in (*commands, ["certs", "new"], ["record"], ["replay"], ["render"], ["dataset"]):
+        assert "Examples:" in vinesim(*command, "--help").stdout, command
+
+
+def test_no_such_scene():
+    refused(vinesim("scene", "show", "nowhere"), 2, "nowhere", "demo", "tendone", "vsp")
+
+
+def test_bad_scene_names_file_field_and_remedy(tmp_path):
+    (tmp_path / "bad.toml").write_text('name = "bad"\nseed = 1\ntraining = "tendone"\nrow_spacing = 2\n')
+    done = vinesim("scene", "show", "bad.toml", cwd=tmp_path)
+    refused(done, 2, "bad.toml", "row_spacing")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.toml"]
+
+
+def test_bad_urdf(tmp_path):
+    (tmp_path / "bad.urdf").write_text("<robot name='x'><link name='a'/></robot")
+    refused(vinesim("client", "--robot", str(tmp_path / "bad.urdf"), "--out", str(tmp_path / "out")), 2, "bad.urdf")
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_such_device():
+    refused(vinesim("client", "--device", "abacus"), 3, "abacus", "cpu, cuda")
+    refused(vinesim("client", "--device", "cuda:0", "--threads", "2"), *threads_or_no_gpu())
+
+
+def threads_or_no_gpu():
+    import warp as wp
+
+    return (2, "--threads 2") if wp.get_cuda_device_count() else (3, "'cuda:0'", "no NVIDIA GPU", "use cpu")
+
+
+def test_server_gone():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    refused(vinesim("client", "--connect", endpoint, "--seconds", "1", "--no-ros"), 4, endpoint, "vinesim server")
+
+
+def test_port_taken():
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
+        refused(vinesim("server", "--listen", endpoint), 4, endpoint)
+
+
+def test_files_that_cannot_be_replayed(tmp_path):
+    (tmp_path / "scene.toml").write_text('name = "demo"\n')
+    refused(vinesim("replay", "scene.toml", "--out", "pictures", cwd=tmp_path), 2, "scene.toml", "no MCAP file")
+    with Recording(tmp_path / "old.mcap", {"protocol": "0", "release": "0.0.9"}):
+        pass
+    refused(vinesim("replay", "old.mcap", "--out", "pictures", cwd=tmp_path), 2, "version 0", "0.0.9")
+    with Recording(tmp_path / "empty.mcap"):
+        pass
+    refused(vinesim("replay", "empty.mcap", "--out", "pictures", cwd=tmp_path), 2, "empty.mcap", "no message")
+    assert not (tmp_path / "pictures").exists()
+
+
+def test_no_server_to_record_and_nowhere_to_write(tmp_path):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    refused(vinesim("record", "run.mcap", "--connect", endpoint, cwd=tmp_path), 4, endpoint, "vinesim server")
+    assert list(tmp_path.iterdir()) == []
+    with Server("tcp/127.0.0.1:0") as server:
+        refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 4, "no/run.mcap")
+
+
+def test_two_actors_with_one_name():
+    with Server("tcp/127.0.0.1:0") as server:
+        arguments = ["client", "--connect", server.endpoint, "--name", "twin", "--no-ros", "--status", "json"]
+        first = subprocess.Popen(
+            [sys.executable, "-m", "vinesim.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            assert first.stdout.readline()  # its first status: it is in
+            refused(vinesim(*arguments, "--seconds", "1"), 4, "twin")
+        finally:
+            first.terminate()
+            first.communicate(timeout=30)
+        assert first.returncode == 0
+
+
+@contextlib.contextmanager
+def serving(*arguments):
+    """A server process and its first line."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "vinesim.cli", "server", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    try:
+        yield process, process.stdout.readline()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_server_says_who_is_there_and_ends_cleanly(tmp_path):
+    with serving("--listen", "tcp/127.0.0.1:0", "--status", "json", "--keep", str(tmp_path / "kept")) as (
+        process,
+        line,
+    ):
+        figures = json.loads(line)
+        assert figures["actors"] == []
+        (endpoint,) = figures["endpoints"]
+        with ZenohBus("ada", connect=endpoint) as ada:
+            ada.join(messages.encode_hello(messages.Hello("ada", digest="D1")))
+            while (figures := json.loads(process.stdout.readline()))["actors"] != ["vineyard/ada"]:
+                assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) == 0
+        assert process.stderr.read() == ""
+    with serving("--listen", "tcp/127.0.0.1:0", "--listen", "udp/127.0.0.1:0", "--status", "text") as (process, line):
+        assert line.startswith("listening on tcp/127.0.0.1:")
+        assert "udp/127.0.0.1:" in line
+        assert process.stdout.readline().startswith("nobody: 0 links")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+
+
+def test_a_journal_that_is_none_is_left_alone(tmp_path):
+    (tmp_path / "vineyard.facts").write_text("notes on grapes")
+    refused(vinesim("server", "--listen", "tcp/127.0.0.1:0", "--keep", str(tmp_path)), 4, "vineyard.facts", "--keep")
+    assert (tmp_path / "vineyard.facts").read_text() == "notes on grapes"
+
+
+def test_a_client_of_another_scene_is_refused_by_both_digests():
+    with Server("tcp/127.0.0.1:0", plan=Plan("vsp", "0123456789abcdef")) as server:
+        arguments = ["client", "--connect", server.endpoint, "--name", "ada", "--no-ros", "--seconds", "1"]
+        refused(vinesim(*arguments), 4, "'ada'", "'demo'", "'vsp'", "0123456789abcdef", "scene and seed")
+
+
+def test_secured_from_certificate_to_client(tmp_path):
+    certs = tmp_path / "certs"
+    done = vinesim("certs", "new", "ada", "--dir", str(certs))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[-2:] == [str(certs / "ada.key"), str(certs / "ada.pem")]
+    refused(vinesim("certs", "new", "ada", "--dir", str(certs)), 4, "ada.pem", "there already")
+    arguments = ["--listen", "tls/127.0.0.1:0", "--tls", str(certs), "--status", "text", "--scene", "demo"]
+    with serving(*arguments) as (_, line):
+        endpoint = line.split()[-1]
+        common = [
+            "client",
+            "--connect",
+            endpoint,
+            "--tls",
+            str(certs),
+            "--no-ros",
+            "--seconds",
+            "0.5",
+            "--status",
+            "none",
+        ]
+        done = vinesim(*common, "--name", "ada")
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["client", "--role", "spectator", "--status", "xml"], ["xml", "json"]),
+        (["client", "--role", "tractor"], ["tractor", "robot"]),
+        (["client", "--push", "99999", "--no-ros"], ["99999"]),
+        (["client", "--tls", "certs", "--no-ros"], ["--tls certs", "--connect tls/HOST:7447"]),
+        (["server", "--listen", "7447"], ["'7447'", "tcp/HOST:PORT"]),
+        (["server", "--listen", "tls/0.0.0.0:7447"], ["tls/0.0.0.0:7447", "--tls DIR"]),
+        (["server", "--connect", "tcp/127.0.0.1:1", "--keep", "kept"], ["only carries", "--keep"]),
+        (["server", "--status", "xml"], ["xml", "json"]),
+        (["server", "--quota", "0", "1"], ["--quota", "above zero"]),
+        (["server", "--seed", "3"], ["--seed 3", "--scene"]),
+        (["server", "--scene", "nowhere"], ["nowhere"]),
+        (["certs", "new", "a/b"], ["a/b", "letters"]),
+        (["certs", "new", "ada", "--role", "king"], ["king", "robot, human, spectator"]),
+        (["certs", "new", "ada", "--host", "h"], ["only the server's"]),
+        (["client", "--spawn", "99", "--no-ros"], ["99"]),
+        (["client", "--status", "xml"], ["xml", "json"]),
+        (["bench", "nothing"], ["nothing", "plants", "camera"]),
+        (["record", "run.mcap", "--only", "cats"], ["cats", "poses", "trees"]),
+        (["record", "run.mcap", "--area", "0", "0", "-1", "1"], ["area 0 0 -1 1", "X0 < X1"]),
+        (["replay", "nowhere.mcap", "--out", "pictures"], ["nowhere.mcap", "No such file"]),
+        (["replay", "run.mcap"], ["--connect", "--listen", "--out"]),
+        (["demo", "--scene", "nowhere"], ["nowhere"]),
+        (["demo", "--robot", "nobody"], ["nobody"]),
+        (["demo", "--job", "dance"], ["dance", "push", "pick", "exchange"]),
+        (["client", "--job", "dance", "--no-ros"], ["dance", "pick", "exchange"]),
+    ],
+)
+def test_wrong_use(arguments, words, tmp_path):
+    refused(vinesim(*arguments, cwd=tmp_path), 2, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_person_joins_and_goes(tmp_path):
+    ended = vinesim("client", "--role", "human", "--reach", "3", "--seconds", "1", "--out", str(tmp_path), cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["name"].startswith("human-")
+    assert report["time"] == pytest.approx(1.0)

@@ -1,0 +1,242 @@
+"""The recorder over a bus in memory: what it writes, what it must not change, and what it asks for when told to."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from tests.support.recorded_world import TICK, Light, vineyard
+from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Recorder, Stand, grid
+from vinesim.net.codec import messages
+from vinesim.net.codec.messages import Fact
+from vinesim.net.recording.mcap_file import Recording, Tape, read
+from vinesim.net.replication.exchange import Mismatch
+from vinesim.net.replication.interest import NEAR
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.scene.ids import Kind, thing
+
+EPOCH = 1.7e9
+
+
+class World:
+    """Two light clients, a server that tells the time and keeps facts, and a recorder if one is wanted."""
+
+    def __init__(self, path: pathlib.Path | None, apart: float = 2.0, **options) -> None:
+        self.hub = MemoryHub(delay=0.004)
+        server = self.hub.bus("server", live=False)
+        server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + self.hub.time))
+        fact = Fact(thing(Kind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
+        server.serve("snap/0/0", lambda _: messages.encode_facts([fact]))
+        self.ada, self.bob = Light(self.hub.bus("ada"), 0.5), Light(self.hub.bus("bob"), 0.5 + apart)
+        self.clients = [self.ada, self.bob]
+        self.steps = [lambda: None]
+        if path is not None:
+            self.recording = Recording(path, {"world": "memory"})
+            self.recorder = Recorder(
+                self.hub.bus("recorder", live=False), self.recording, clock=lambda: self.hub.time, **options
+            )
+            self.steps.append(self.recorder.step)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK)):
+            self.hub.advance(TICK)
+            for client in self.clients:
+                client.tick(self.hub.time)
+            for step in self.steps:
+                step()
+
+    def touch(self) -> None:
+        """Ada bends a tree for a second, then lets it rest."""
+        for number in range(100):
+            self.ada.bend(0, 0.5 * np.sin(0.1 * number))
+            self.run(TICK)
+        self.ada.touched = set()
+        self.run(0.5)
+
+    def tape(self) -> Tape:
+        self.recording.close()
+        return read(self.recording.path)
+
+
+def families(tape: Tape) -> set[str]:
+    return {entry.key.partition("/")[0] for entry in tape.entries}
+
+
+def test_what_was_said_is_on_the_tape(tmp_path):
+    world = World(tmp_path / "run.mcap")
+    world.run(1.0)
+    world.touch()
+    world.bob.bus.close()
+    world.clients.remove(world.bob)
+    world.run(0.5)
+    tape = world.tape()
+    assert tape.damage == ""
+    assert families(tape) == {"a", "c", "own", "hello", "live", "snap"}
+    about = {"scene": "rows", "seed": "5", "digest": vineyard().digest(), "world": "memory", "protocol": "1"}
+    assert tape.about.items() >= about.items()
+    assert [(e.key, bool(e.payload)) for e in tape.entries if e.key.startswith("live")] == [
+        ("live/ada", True), ("live/bob", True), ("live/bob", False),
+    ]  # fmt: skip
+    assert {messages.decode_hello(e.payload).name for e in tape.entries if e.key.startswith("hello")} == {"ada", "bob"}
+
+    # all that bob heard of trees and events is there, in the same order and to the bit
+    heard = [messages.decode_trees(e.payload) for e in tape.entries if e.key == "c/0/0/ada"]
+    assert len(heard) > 90
+    last = [e for e in tape.entries if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.TREES][-1]
+    rest = messages.decode_trees(last.payload)
+    np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.ada.read(0)[0])
+    np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.bob.read(0)[0])
+
+    # log time is network time: a journey, and a poll, after what the author wrote
+    for entry in tape.entries:
+        if entry.key == "c/0/0/ada":
+            assert 0.0 < entry.time - messages.time_of(entry.payload) < 0.03
+    assert tape.start == pytest.approx(EPOCH, abs=0.2)
+
+
+def test_the_recorder_changes_not_one_byte(tmp_path):
+    """The same second of touching, near and far from the other one, with and without a recorder."""
+    sent = {}
+    for apart in (2.0, 40.0):
+        for path in (None, tmp_path / f"{apart}.mcap"):
+            world = World(path, apart)
+            world.run(2.0)
+            before = [client.bus.bytes_out for client in world.clients]
+            world.touch()
+            sent[apart, path is None] = [c.bus.bytes_out - b for c, b in zip(world.clients, before, strict=True)]
+            if apart > NEAR:
+                assert world.ada.environment() == 0
+            else:
+                assert world.ada.environment() > 5_000
+            if path is not None:
+                tape = world.tape()
+                assert ("c" in families(tape)) == (apart < NEAR)
+                fast = sum(entry.key == "a/ada" for entry in tape.entries)
+                assert (fast > 100) == (apart < NEAR)
+    assert sent[2.0, True] == sent[2.0, False]
+    assert sent[40.0, True] == sent[40.0, False]
+    assert sent[40.0, True][0] > 0  # slow poses
+
+
+def test_an_actor_alone_sends_nothing_for_a_recorder(tmp_path):
+    world = World(tmp_path / "run.mcap")
+    world.bob.bus.close()
+    world.clients.remove(world.bob)
+    world.run(1.0)
+    world.touch()
+    assert world.ada.bus.bytes_out == 0
+    assert families(world.tape()) == {"live", "hello", "snap"}  # what it was told because it asked
+
+
+def test_a_recorder_that_asks_for_everything_hears_one_who_is_alone(tmp_path):
+    world = World(tmp_path / "run.mcap", everything=True)
+    world.bob.bus.close()
+    world.clients.remove(world.bob)
+    digest = vineyard().digest()
+    stand = Stand(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
+    world.recorder.own.add("recorder-1")
+    world.steps.append(lambda: stand.step(world.hub.time))
+    world.run(2.0)
+    world.touch()
+    tape = world.tape()
+    assert families(tape) == {"a", "c", "own", "hello", "live", "snap"}
+    assert sum(entry.key == "a/ada" for entry in tape.entries) > 150
+    assert sum(entry.key == "c/0/0/ada" for entry in tape.entries) > 90
+    assert not any("recorder" in entry.key for entry in tape.entries)
+
+
+def test_two_recorders_do_not_keep_each_other_listening(tmp_path):
+    world = World(tmp_path / "run.mcap")
+    with Recording(tmp_path / "other.mcap") as recording:
+        other = Recorder(world.hub.bus("other", live=False), recording, clock=lambda: world.hub.time)
+        world.steps.append(other.step)
+        world.run(1.0)
+        assert world.ada.exchange._actors._pose.matching
+        world.bob.robot.base_q[0] = 60.0
+        world.run(1.0)
+        assert not world.ada.exchange._actors._pose.matching
+
+
+@pytest.mark.parametrize("only", FAMILIES)
+def test_only(tmp_path, only):
+    world = World(tmp_path / "run.mcap", only=[only])
+    world.run(0.5)
+    world.touch()
+    expected = {
+        "poses": {"a"}, "trees": {"c"}, "things": set(), "events": {"own"}, "facts": {"snap"}, "forces": set(),
+    }  # fmt: skip
+    assert families(world.tape()) == {"live", "hello"} | expected[only]
+
+
+def test_another_vineyard_is_refused_and_a_late_stranger_ignored(tmp_path):
+    world = World(tmp_path / "other.mcap", digest="elsewhere")
+    with pytest.raises(Mismatch, match=r"'(ada|bob)' has scene 'rows' .*elsewhere.*same|used there"):
+        world.run(0.5)
+    world.recording.close()
+
+    world = World(tmp_path / "run.mcap")
+    world.run(0.5)
+    Light(world.hub.bus("eve"), 1.0, digest="elsewhere")  # it serves its greeting
+    world.run(0.5)
+    greetings = {e.key for e in world.tape().entries if e.key.startswith("hello/")}
+    assert greetings == {"hello/ada", "hello/bob"}
+
+
+def test_the_official_reader_reads_words_and_numbers(tmp_path):
+    world = World(tmp_path / "run.mcap")
+    world.run(1.0)
+    world.touch()
+    path = world.tape().path
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert {metadata.name for metadata in reader.iter_metadata()} == {"vinesim"}
+        messages_of: dict[str, list] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert (channel.message_encoding, schema.encoding) == ("json", "jsonschema")
+            body = json.loads(message.data)
+            described = json.loads(schema.data)
+            assert described["type"] == "object"
+            assert body.keys() <= described["properties"].keys(), channel.topic
+            messages_of.setdefault(channel.topic, []).append((schema.name, message, body))
+    assert summary.statistics.message_count == sum(map(len, messages_of.values()))
+    name, message, pose = messages_of["a/ada"][-1]
+    assert name == "foxglove.PoseInFrame"
+    assert pose["frame_id"] == "map"
+    assert pose["pose"]["position"] == {"x": 0.5, "y": 0.0, "z": 0.0}
+    assert pose["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    assert pose["joint_position"] == pytest.approx([0.1, -0.2])
+    stamp = pose["timestamp"]["sec"] * 10**9 + pose["timestamp"]["nsec"]
+    assert stamp == message.publish_time <= message.log_time
+    assert messages_of["c/0/0/ada"][0][2]["trees"][0]["tree"] == 0
+    assert messages_of["own/0/0/ada"][0][2]["claims"][0] == {
+        "kind": "tree", "index": 0, "ownership": 0, "authority": 1, "owner": "ada", "touched": True,
+    }  # fmt: skip
+    assert messages_of["snap/0/0"][0][2]["facts"][0]["kind"] == "bunch"
+    assert messages_of["hello/ada"][0][2]["scene"] == "rows"
+
+
+def test_the_grid_leaves_nothing_out():
+    for area in ((0.0, 0.0, 1.0, 1.0), (-3.0, -3.0, 25.0, 25.0), (0.0, 0.0, 100.0, 5.0)):
+        stands = np.array(grid(area))
+        x, y = np.meshgrid(np.linspace(area[0], area[2], 60), np.linspace(area[1], area[3], 60))
+        away = np.hypot(x[..., None] - stands[:, 0], y[..., None] - stands[:, 1]).min(-1)
+        assert away.max() <= NEAR
+    for wrong in ((0.0, 0.0, 40.0, 40.0), (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, float("nan"), 1.0)):
+        with pytest.raises(AreaTooLarge, match="give"):
+            grid(wrong)
+
+
+def test_nonsense_is_kept_and_counted(tmp_path):
+    world = World(tmp_path / "run.mcap")
+    fool = world.hub.bus("fool").publisher("own/0/0/fool")
+    world.run(0.5)
+    assert fool.put(b"not a message")
+    world.run(0.1)
+    tape = world.tape()
+    assert [entry.payload for entry in tape.entries if entry.key == "own/0/0/fool"] == [b"not a message"]
+    assert world.recorder.malformed == 1

@@ -1,0 +1,153 @@
+"""Robots that join while the ticks go on: nobody waits for them, and what stood stays where it stands."""
+
+from __future__ import annotations
+
+import concurrent.futures
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import cane
+from vinesim import frames
+from vinesim.client.remote.spawner import Arrivals, described
+from vinesim.net.codec.messages import Hello
+from vinesim.physics.step import Physics
+from vinesim.robot.description.description import Description, load
+from vinesim.scene.builder import assemble
+from vinesim.scene.values import RobotUpdate
+
+
+class Later(concurrent.futures.Executor):
+    """Does what it is asked to when the test says so."""
+
+    def __init__(self) -> None:
+        self.waiting: list[tuple[Callable, concurrent.futures.Future]] = []
+
+    def submit(self, work: Callable) -> concurrent.futures.Future:
+        future: concurrent.futures.Future = concurrent.futures.Future()
+        self.waiting.append((work, future))
+        return future
+
+    def work(self) -> None:
+        for work, future in self.waiting:
+            try:
+                future.set_result(work())
+            except ValueError as error:
+                future.set_exception(error)
+        self.waiting.clear()
+
+
+@pytest.fixture(scope="module")
+def vinebot() -> Description:
+    return load("vinebot")
+
+
+def greeting(description: Description, name: str = "guest", **change) -> Hello:
+    usual = {"robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7}
+    return Hello(name, **{**usual, **change})
+
+
+def standing(description: Description, x: float) -> RobotUpdate:
+    position = description.home.copy()
+    position[0] += 0.05
+    return RobotUpdate("guest", 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), position, np.zeros_like(position))
+
+
+def world(description: Description) -> Physics:
+    physics = Physics(assemble([cane((5.0, 5.0, 1.0), radius=0.005)]))
+    physics.rigid.add_robot(description.spec("host", 1, frames.pose([0.0, 3.0, 0.0])))
+    return physics
+
+
+def test_no_tick_waits_and_then_it_stands_where_it_is_by_now(vinebot):
+    physics, later = world(vinebot), Later()
+    arrivals = Arrivals(physics.rigid, vinebot, later)
+    arrivals.expect(greeting(vinebot))
+    for tick in range(5):
+        assert arrivals.embody("guest", standing(vinebot, 0.1 * tick)) is None
+        physics.step()
+    assert physics.rigid.robots == ("host",)
+    later.work()
+    guest = arrivals.embody("guest", standing(vinebot, 0.5))
+    assert guest is not None
+    assert guest.name == "guest"
+    assert "guest" not in arrivals
+    position, velocity, *_ = physics.rigid.read("guest")
+    np.testing.assert_allclose(position, standing(vinebot, 0.5).position, atol=1e-12)
+    assert not velocity.any()
+    assert physics.rigid.base("guest")[0][0] == pytest.approx(0.5)
+
+
+def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_came_at_once(vinebot):
+    def run(prepared: bool) -> bytes:
+        physics = world(vinebot)
+        physics.rigid.command("host", vinebot.home + 0.2)
+        draft = physics.rigid.prepare(vinebot.spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
+        for _ in range(20):
+            physics.step()
+        if draft is None:
+            physics.rigid.add_robot(vinebot.spec("guest", 7, frames.pose([1.0, 0.0, 0.0])))
+        else:
+            assert physics.rigid.admit(draft)
+        for _ in range(20):
+            physics.step()
+        return physics.rigid.data.qpos.tobytes() + physics.rigid.data.qvel.tobytes()
+
+    assert run(True) == run(False)
+
+
+def test_a_world_that_changed_meanwhile_is_prepared_anew(vinebot):
+    physics, later = world(vinebot), Later()
+    arrivals = Arrivals(physics.rigid, vinebot, later)
+    arrivals.expect(greeting(vinebot))
+    update = standing(vinebot, 0.0)
+    arrivals.embody("guest", update)
+    later.work()
+    physics.rigid.add_robot(vinebot.spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
+    assert arrivals.embody("guest", update) is None
+    assert physics.rigid.robots == ("host", "other")
+    assert arrivals.embody("guest", update) is None
+    later.work()
+    assert arrivals.embody("guest", update) is not None
+    assert physics.rigid.robots == ("host", "other", "guest")
+
+
+def test_who_leaves_before_being_ready_never_comes(vinebot):
+    physics, later = world(vinebot), Later()
+    arrivals = Arrivals(physics.rigid, vinebot, later)
+    arrivals.expect(greeting(vinebot))
+    arrivals.embody("guest", standing(vinebot, 0.0))
+    arrivals.forget("guest")
+    later.work()
+    assert "guest" not in arrivals
+    assert physics.rigid.robots == ("host",)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"joints": 3}, "announces 3 joints"),
+        ({"urdf": "<robot name='x'/>", "robot": "x"}, "cannot be shown"),
+        ({"urdf": "no xml", "robot": "../../tmp/x"}, "cannot be shown"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_named_once_and_the_world_goes_on(vinebot, caplog, change, words):
+    physics = world(vinebot)
+    arrivals = Arrivals(physics.rigid, vinebot)
+    arrivals.expect(greeting(vinebot, **change))
+    assert arrivals.embody("guest", standing(vinebot, 0.0)) is None
+    assert "guest" not in arrivals
+    (record,) = caplog.records
+    assert words in record.getMessage()
+    physics.step()
+    assert physics.rigid.robots == ("host",)
+
+
+def test_a_strangers_word_is_no_path(vinebot, tmp_path, monkeypatch):
+    """The name in a greeting names a file; it must stay in the folder made for it."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    text = vinebot.urdf.replace("<robot ", "<!-- another --><robot ", 1)
+    found = described(greeting(vinebot, urdf=text, robot="../escaped"), vinebot)
+    assert found.joints == vinebot.joints
+    assert list(tmp_path.rglob("*")) == []

@@ -1,0 +1,166 @@
+"""The spectator: sees what happens near it, live and from a tape, and touches nothing."""
+
+from __future__ import annotations
+
+import pathlib
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.client.test_recorder import World
+from tests.client.test_replay import recorded_trees
+from tests.support.recorded_world import TICK, Light, vineyard
+from vinesim import frames
+from vinesim.cli.replay import WrongUse
+from vinesim.cli.replay import run as replay
+from vinesim.client.client import Client
+from vinesim.client.recording.recorder import Recorder
+from vinesim.client.recording.replay import ReplayBus
+from vinesim.client.spectator import ASIDE, EYES, Spectator, looking_at, viewpoint
+from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.net.codec import messages
+from vinesim.net.recording.mcap_file import NotARecording, Recording, Tape, read
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.robot.description.description import load as load_robot
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
+
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory) -> Tape:
+    """Ada bends a tree beside Bob and leaves it at rest."""
+    world = World(tmp_path_factory.mktemp("bent") / "run.mcap")
+    world.run(1.0)
+    world.touch()
+    world.run(0.3)
+    return world.tape()
+
+
+def watch(tape: Tape) -> tuple[list[bytes], dict[int, np.ndarray]]:
+    """States of all plants of a spectator beside the tree, tick by tick; those of the tree by the tick's number."""
+    bus = ReplayBus(tape, "viewer")
+    pose = viewpoint(1.5, 0.0, np.pi)
+    spectator = Spectator(load("demo"), vineyard(), None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
+    here = vineyard().bodies_of(0)
+    states, tree = [], {}
+    while not bus.ended:
+        bus.play(TICK)
+        spectator.tick()
+        states.append(spectator.physics.state.joint_q.tobytes() + spectator.physics.state.joint_qd.tobytes())
+        if 0 in spectator._copies:
+            tree[len(states)] = spectator.physics.state.joint_q[here].copy()
+    return states, tree
+
+
+def test_a_replay_moves_the_trees_the_same_way_twice(bent):
+    (first, tree), (second, _) = watch(bent), watch(bent)
+    assert first == second
+    assert len(set(first)) > 80
+    # what it shows follows what was recorded
+    times = {number: bent.start + number * TICK for number in tree}
+    records = recorded_trees(bent)
+    worst = []
+    for number, shown in tree.items():
+        said = [record for record in records if record.time <= times[number] - 0.1]
+        if said and not said[-1].flags[0] & messages.RESTING:
+            nearest = min(
+                float(np.abs((record.joint_q * shown).sum(1)).min() - 1.0) ** 2
+                for record in records
+                if abs(record.time - times[number]) < 0.15
+            )
+            worst.append(nearest)
+    assert len(worst) > 50
+    assert max(worst) < 1e-4
+
+
+def test_a_spectator_owns_nothing_even_when_an_owner_goes():
+    hub = MemoryHub(delay=0.004)
+    ada = Light(hub.bus("ada"), 0.5)
+    onlooker = Light(hub.bus("aaa"), 0.6, kind="spectator", joints=0)
+    bob = Light(hub.bus("bob"), 3.0)
+
+    def run(*clients: Light, seconds: float = 0.5) -> None:
+        for _ in range(round(seconds / TICK)):
+            hub.advance(TICK)
+            for client in clients:
+                client.tick(hub.time)
+
+    run(ada, onlooker, bob)
+    for number in range(30):
+        ada.bend(0, 0.02 * number)
+        run(ada, onlooker, bob, seconds=TICK)
+    assert onlooker.exchange.owner(0) == "ada"
+    bob.moving = onlooker.moving = {0}
+    ada.bus.close()
+    run(onlooker, bob)
+    # it stands nearer, and has the lower name
+    assert bob.exchange.owner(0) == "bob"
+    assert onlooker.exchange.owner(0) == "bob"
+    assert onlooker.environment() == 0
+
+
+def test_eyes():
+    eyes = viewpoint(2.0, 3.0, np.pi / 2)
+    np.testing.assert_allclose(frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0])), [0.0, 1.0, 0.0], atol=1e-9)
+    for yaw in (0.0, 2.5, -1.0):
+        robot = frames.pose([1.0, -2.0, 0.0], frames.yaw(yaw))
+        eyes = looking_at(robot)
+        ahead = frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0]))
+        assert eyes[2] == EYES
+        np.testing.assert_allclose(eyes[:2] + ASIDE * ahead[:2], robot[:2], atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def robot_tape(tmp_path_factory) -> pathlib.Path:
+    """Two seconds of a real robot that turns its head, seen by a live spectator."""
+    path = tmp_path_factory.mktemp("robot") / "run.mcap"
+    hub = MemoryHub(delay=0.004)
+    clock = hub.bus("server", live=False)
+    clock.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e9 + hub.time))
+    scene = load("demo")
+    model = generate(scene)
+    start = spawn_pose(scene, 0)
+    picker = Client(
+        scene, model, load_robot("vinebot"), hub.bus("picker"), name="picker", pose=start, clock=lambda: hub.time
+    )
+    eyes = looking_at(start)
+    spectator = Spectator(scene, model, None, hub.bus("viewer"), name="viewer", pose=eyes, clock=lambda: hub.time)
+    with Recording(path) as recording:
+        recorder = Recorder(hub.bus("recorder", live=False), recording, clock=lambda: hub.time)
+        picker.robot.command_position([0.5], ["head_1_joint"])
+        for _ in range(200):
+            hub.advance(TICK)
+            picker.tick()
+            spectator.tick()
+            recorder.step()
+        assert set(spectator.others) == {"picker"}
+        assert spectator.exchange.counters.environment.bytes_out == 0
+        assert picker.others == {}  # a spectator has no body
+        head = picker.robot.description.joints.index("head_1_joint")
+        assert spectator.physics.rigid.read("picker")[0][head] == pytest.approx(0.5, abs=0.05)
+    return path
+
+
+def options(file: pathlib.Path, out: pathlib.Path, **more) -> dict:
+    given = {"connect": None, "listen": None, "world": "vineyard", "speed": 1.0, "start": 0.0, "end": None}
+    return given | {"file": file, "out": out, "place": None, "scene": None, "seed": None} | more
+
+
+def test_a_replay_is_looked_at(robot_tape, tmp_path, capsys):
+    assert read(robot_tape).about.items() >= {"scene": "demo", "seed": "7"}.items()
+    assert replay(**options(robot_tape, tmp_path, end=1.5)) == 0
+    assert "picker" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir())[:4] == ["depth.png", "depth_mm.png", "labels.png", "rgb.png"]
+    labels = cv2.imread(str(tmp_path / "labels.png"))
+    white = (labels == 235 * np.array([1, 1, 1])).all(-1) | (labels.min(-1) > 160)
+    assert white.sum() > 500  # the robot, in the middle of the picture
+    assert (tmp_path / "view_00001.00.png").exists()
+
+
+def test_another_vineyard_is_refused(robot_tape, tmp_path):
+    with pytest.raises(NotARecording, match=r"digest .*: give its --scene and --seed"):
+        replay(**options(robot_tape, tmp_path / "out", seed=8))
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(WrongUse, match=r"lasts \d"):
+        replay(**options(robot_tape, tmp_path / "out", start=60.0))

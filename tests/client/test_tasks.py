@@ -1,0 +1,137 @@
+"""Jobs in a client: planned from the scene, begun with its robot, done tick by tick; nobody on the network needed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim.client.client import Client
+from vinesim.client.tasks import start_poses
+from vinesim.client.tasks.tasks import LookAt, Obey, UnknownJob, plan_job
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.drives import Robot
+from vinesim.robot.tasks.pick import Pick
+from vinesim.robot.tasks.swap_boxes import Exchange
+from vinesim.robot.tasks.task import Script
+from vinesim.ros.commands.types import Command, JointPositions, JointTrajectory
+from vinesim.scene.builder import assemble
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
+
+
+def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Script]:
+    scene = load("harvest")
+    model = generate(scene)
+    begin, start = plan_job(job, model, start_poses.spawn_pose(scene, spawn))
+    now = iter(range(1_000_000))
+    client = Client(
+        scene, model, load_robot(robot), MemoryHub().bus("worker"), name="worker", pose=start,
+        clock=lambda: 0.01 * next(now),
+    )  # fmt: skip
+    script = begin(client.physics, client.robot)
+    client.jobs += [script.control, LookAt(client.robot, script.focus)]
+    return client, script
+
+
+def test_a_client_picks():
+    client, script = client_with("pick", "vinebot", 0)
+    assert isinstance(script, Pick)
+    while not script.done and script.phase != "tuck":
+        client.tick()
+    assert not script.reason
+    assert client.physics.rigid.loose == (script.task.bunch,)
+    # the bunch is in its hand, and its trouble is its own: the client goes on
+    assert script.report()["phases_s"]["cut"] < 0.1
+
+
+def test_a_client_exchanges():
+    client, script = client_with("exchange", "logistic", 1)
+    assert isinstance(script, Exchange)
+    for _ in range(200):
+        client.tick()
+    assert not script.reason
+    assert script.phase == "to the empty box"
+    assert len(client.physics.rigid.loose) == script.report()["bunches"] == 6
+
+
+def test_an_unknown_job_is_told():
+    scene = load("harvest")
+    with pytest.raises(UnknownJob, match="no job 'dance'; give pick or exchange"):
+        plan_job("dance", generate(scene), start_poses.spawn_pose(scene, 0))
+
+
+# ---------------------------------------------------------------------- what ROS asks
+
+
+JOINTS = ("arm_left_1_joint", "arm_left_2_joint")
+FAR = np.array([0.6, 0.0])
+
+
+class Asked:
+    """A robot alone in the world, and a queue of commands for it."""
+
+    def __init__(self) -> None:
+        self.robot = Robot(Rigid(assemble([])), load_robot("vinebot"), "anna")
+        self.queue: list[Command] = []
+        self.obey = Obey(self.robot, self._take)
+        self.time = 0.0
+        self.at = self.robot.joint_indices(JOINTS)
+
+    def _take(self) -> list[Command]:
+        taken, self.queue = self.queue, []
+        return taken
+
+    def go(self, seconds: float) -> np.ndarray:
+        """Positions [2] of :data:`JOINTS` after so long."""
+        for _ in range(round(100 * seconds)):
+            self.obey(self.time)
+            self.robot.control(self.time)
+            self.robot.rigid.prep()
+            self.robot.rigid.finish()
+            self.time += 0.01
+        return self.robot.rigid.read("anna")[0][self.at]
+
+
+def way(*positions: tuple[float, float], joints: tuple[str, ...] = JOINTS, seconds: float = 1.0) -> JointTrajectory:
+    times = seconds * np.arange(1.0, len(positions) + 1.0)
+    return JointTrajectory("arm_left_controller", 0.0, joints, times, np.reshape(positions, (-1, 2)), None)
+
+
+def test_a_trajectory_goes_straight_from_point_to_point_and_ends_where_it_should():
+    asked = Asked()
+    start = asked.go(0.1)
+    first, last = start + np.array([0.3, -0.2]), start + np.array([0.1, 0.0])
+    asked.queue = [way(first, last)]
+    np.testing.assert_allclose(asked.go(0.5), 0.5 * (start + first), atol=0.01)
+    np.testing.assert_allclose(asked.go(0.5), first, atol=0.01)
+    np.testing.assert_allclose(asked.go(0.5), 0.5 * (first + last), atol=0.01)
+    np.testing.assert_allclose(asked.go(1.5), last, atol=1e-3)
+
+
+def test_a_newer_trajectory_takes_over_an_empty_one_stops_and_positions_count_at_once():
+    asked = Asked()
+    start = asked.go(0.1)
+    asked.queue = [way(start + FAR, seconds=2.0)]
+    middle = asked.go(1.0)
+    asked.queue = [way(start)]
+    np.testing.assert_allclose(asked.go(1.5), start, atol=1e-3)
+    asked.queue = [way(start + FAR, seconds=2.0)]
+    stopped = asked.go(1.0)
+    np.testing.assert_allclose(stopped, middle, atol=0.01)
+    asked.queue = [way()]
+    np.testing.assert_allclose(asked.go(1.0), stopped, atol=0.01)
+    whole = asked.robot.setpoint.copy()
+    whole[asked.at] = start
+    asked.queue = [way(start + FAR, seconds=2.0), JointPositions("forward_position_controller", whole)]
+    np.testing.assert_allclose(asked.go(2.0), start, atol=1e-3)
+
+
+def test_what_makes_no_sense_is_counted_and_changes_nothing():
+    asked = Asked()
+    start = asked.go(0.1)
+    late = JointTrajectory("arm_left_controller", 0.0, JOINTS, np.array([2.0, 1.0]), np.zeros((2, 2)), None)
+    asked.queue = [way(start + 0.2, joints=("arm_left_1_joint", "no_joint")), late, way(start + np.nan)]
+    np.testing.assert_allclose(asked.go(0.5), start, atol=1e-4)
+    assert asked.obey.refused == 3

@@ -1,0 +1,336 @@
+"""Secured links with a real router: who writes under another's name, in another world, or without a certificate."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import pathlib
+import stat
+import time
+
+import pytest
+import zenoh
+
+from vinesim.net.codec import messages
+from vinesim.net.codec.messages import Fact, Hello
+from vinesim.net.server.admission import Plan
+from vinesim.net.server.server import Server
+from vinesim.net.transport import zenoh_bus
+from vinesim.net.transport.access_control import NoCertificate, Role, secured
+from vinesim.net.transport.bus import EVERY, BusError, Refused
+from vinesim.net.transport.certificates import new, roles
+from vinesim.net.transport.endpoints import parse
+from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus, close_session, config, open_session
+from vinesim.scene.ids import Kind, thing
+
+
+def wait(condition, what):
+    end = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < end, f"waited in vain for: {what}"
+        time.sleep(0.002)
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory) -> pathlib.Path:
+    folder = tmp_path_factory.mktemp("pki") / "certs"
+    for name in ("ada", "bob"):
+        new(folder, name)
+    new(folder, "guest", Role.SPECTATOR)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def server(certs):
+    with Server(("tls/127.0.0.1:0", "quic/127.0.0.1:0"), certificates=certs) as running:
+        yield running
+
+
+def bus(name, server, certs, **more):
+    return ZenohBus(name, connect=server.endpoint, certificates=certs, **more)
+
+
+def hello(name, digest="D1"):
+    return messages.encode_hello(Hello(name, digest=digest, scene="vsp"))
+
+
+@contextlib.contextmanager
+def session(name, server, certs):
+    """What a program of its own making could do with a certificate."""
+    endpoint = parse(server.endpoint, secured=True)
+    one = open_session(config("client", connect__endpoints=[endpoint.locator], **secured(certs, name)))
+    try:
+        yield one
+    finally:
+        close_session(one)
+
+
+WRITTEN = ["a/{}", "a/{}/far", "c/0/-1/{}", "own/0/0/{}", "fact/3/4/{}", "force/bob/{}", "voice/0/0/{}"]
+
+
+@contextlib.contextmanager
+def ear(server, certs, pattern="**"):
+    """Everything that reaches bob."""
+    heard = []
+    with session("bob", server, certs) as bob:
+        declared = bob.declare_subscriber(f"vs/1/vineyard/{pattern}", lambda sample: heard.append(str(sample.key_expr)))
+        yield heard
+        declared.undeclare()
+
+
+def tried(certs, server, name, keys):
+    """Of puts under these keys by this certificate, those that reached bob."""
+    with ear(server, certs) as heard, session("ada", server, certs) as ada, session(name, server, certs) as writer:
+        end = ada.declare_publisher("vs/1/vineyard/own/9/9/ada")
+        wait(lambda: end.matching_status.matching, "bob's ear")
+        for key in keys:
+            writer.put(key, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        # what was put before in this session has arrived when the answer to a question has
+        list(writer.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
+        end.put(b"end")
+        wait(lambda: "vs/1/vineyard/own/9/9/ada" in heard, "the end mark")
+        return [key for key in heard if key != "vs/1/vineyard/own/9/9/ada"]
+
+
+def test_an_actor_writes_under_its_own_name_and_no_other(server, certs):
+    own = [f"vs/1/vineyard/{key.format('ada')}" for key in WRITTEN]
+    foreign = [f"vs/1/vineyard/{key.format('bob')}" for key in WRITTEN if key != "force/bob/{}"]
+    strange = [
+        "vs/1/vineyard/anything", "vs/1/vineyard/c/0/0/0/ada", "vs/1/vineyard/force/ada/bob",
+        "vs/1/vineyard/clock", "vs/1/vineyard/hello/bob",
+    ]  # fmt: skip
+    assert tried(certs, server, "ada", [*foreign, *own, *strange]) == own
+
+
+def test_a_spectator_says_where_its_eyes_are_and_nothing_else(server, certs):
+    keys = [f"vs/1/vineyard/{key.format(name)}" for key in WRITTEN for name in ("guest", "ada")]
+    assert tried(certs, server, "guest", keys) == ["vs/1/vineyard/a/guest", "vs/1/vineyard/a/guest/far"]
+
+
+def test_another_world_does_not_exist(server, certs):
+    with session("ada", server, certs) as ada, session("bob", server, certs) as bob:
+        heard = []
+        elsewhere = bob.declare_subscriber("vs/1/other/**", lambda sample: heard.append(str(sample.key_expr)))
+        everywhere = bob.declare_subscriber("**", lambda sample: heard.append(str(sample.key_expr)))
+        ears = bob.declare_subscriber("vs/1/vineyard/own/9/9/*", lambda sample: heard.append(str(sample.key_expr)))
+        end = ada.declare_publisher("vs/1/vineyard/own/9/9/ada")
+        wait(lambda: end.matching_status.matching, "bob's ear")
+        ada.put("vs/1/other/c/0/0/ada", b"x")
+        ada.put("vs/1/vineyard/c/0/0/ada", b"x")
+        end.put(b"end")
+        wait(lambda: heard, "the end mark")
+        assert set(heard) == {"vs/1/vineyard/own/9/9/ada"}
+        for each in (elsewhere, everywhere, ears):
+            each.undeclare()
+    with bus("ada", server, certs, world="other") as ada, pytest.raises(Refused, match="lets nobody named 'ada' in"):
+        ada.join(hello("ada"))
+
+
+def test_nobody_gets_in_without_a_certificate_of_this_authority(server, certs, tmp_path, monkeypatch):
+    monkeypatch.setattr(zenoh_bus, "PATIENCE", 0.7)  # Zenoh tries again for as long as it may
+    address = server.endpoint.partition("/")[2]
+    with pytest.raises(ServerUnreachable):
+        ZenohBus("ada", connect=f"tcp/{address}")
+    bare = {"transport__link__tls": {"root_ca_certificate": str(certs / "ca.pem")}}
+    tries = {
+        "connect__endpoints": [f"tls/{address}"], "connect__timeout_ms": 700, "connect__exit_on_failure": True,
+    }  # fmt: skip
+    with pytest.raises(zenoh.ZError):
+        close_session(open_session(config("client", **tries, **bare)))
+    new(tmp_path, "ada")  # of another authority
+    with pytest.raises(ServerUnreachable):
+        bus("ada", server, tmp_path)
+
+
+def test_a_certificate_the_server_does_not_know_opens_nothing(server, certs):
+    new(certs, "late")
+    try:
+        with (
+            bus("late", server, certs) as late,
+            pytest.raises(Refused, match=r"late\.pem, and it reads them when it starts"),
+        ):
+            late.join(hello("late"))
+    finally:
+        for suffix in (".pem", ".key"):
+            (certs / f"late{suffix}").unlink()
+
+
+def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
+    """The whole bus under access control: names, matching, poses, events, questions, snapshots."""
+    with bus("ada", server, certs) as ada, bus("bob", server, certs) as bob, bus("guest", server, certs) as guest:
+        for each in (ada, bob, guest):
+            each.join(hello(each.name))
+        assert server._agreement.plan("vineyard") == Plan("vsp", "D1")
+        wait(
+            lambda: all(each.alive() == {"ada", "bob", "guest"} for each in (ada, bob, guest)), "all to see each other"
+        )
+        pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
+        alone = ada.publisher("c/0/0/ada")
+        for each in (bob, guest):
+            each.subscribe("a/*")
+            each.subscribe("own/0/0/*", EVERY)
+        wait(lambda: pose.matching and event.matching, "their subscriptions")
+        assert not alone.matching
+        heard: dict[str, set] = {"bob": set(), "guest": set()}
+
+        def both_heard_both():  # one of the two may have subscribed later than matching says
+            pose.put(b"pose")
+            event.put(b"event")
+            time.sleep(0.01)
+            for each in (bob, guest):
+                heard[each.name].update(each.drain())
+            return all(found == {("a/ada", b"pose"), ("own/0/0/ada", b"event")} for found in heard.values())
+
+        wait(both_heard_both, "both samples")
+        fact = Fact(thing(Kind.BOX, 1), 1, 0, "ada")
+        says = ada.publisher("fact/0/0/ada", reliable=True)
+        wait(lambda: says.matching, "the server's ear")
+        says.put(messages.encode_facts([fact]))
+        wait(lambda: server.archive.count() == 1, "the fact to be kept")
+        ada.serve("hello/ada", lambda _: hello("ada"))
+        guest.serve("hello/guest", lambda _: hello("guest"))
+        answers: dict = {}
+
+        def all_answered():
+            for key in ("hello/ada", "clock", "snap/0/0"):
+                guest.ask(key, messages.encode_time(1.0))
+            ada.ask("hello/guest")
+            time.sleep(0.02)
+            answers.update({answer.key: answer.payload for answer in [*guest.answers(), *ada.answers()]})
+            return len(answers) == 4
+
+        wait(all_answered, "four answers")
+        assert messages.decode_facts(answers["snap/0/0"]) == [fact]
+        assert messages.decode_hello(answers["hello/guest"]).name == "guest"
+
+
+def test_nobody_says_that_another_is_there_or_answers_for_him(server, certs):
+    with session("ada", server, certs) as ada, bus("bob", server, certs) as bob:
+        forged = ada.liveliness().declare_token("vs/1/vineyard/live/carl/1")
+        served = ada.declare_queryable("vs/1/vineyard/hello/carl", lambda query: query.reply(str(query.key_expr), b"x"))
+        clock = ada.declare_queryable("vs/1/vineyard/clock", lambda query: query.reply(str(query.key_expr), b"x"))
+        own = ada.liveliness().declare_token("vs/1/vineyard/live/ada/1")
+        wait(lambda: "ada" in bob.alive(), "ada herself")
+        assert "carl" not in bob.alive()
+        bob.ask("hello/carl")
+        bob.ask("clock", messages.encode_time(1.0))
+        answers: list = []
+        wait(lambda: answers.extend(bob.answers()) or answers, "the clock")
+        assert [answer.key for answer in answers] == ["clock"]
+        assert messages.decode_time(answers[0].payload)[0] == 1.0
+        for each in (served, clock, forged, own):
+            each.undeclare()
+
+
+def test_over_quic_poses_are_datagrams_and_events_a_stream(server, certs):
+    port = server.endpoint.rpartition(":")[2]
+    with (
+        ZenohBus("ada", connect=f"quic/127.0.0.1:{port}", certificates=certs) as ada,
+        ZenohBus("bob", connect=f"quic/127.0.0.1:{port}", certificates=certs) as bob,
+    ):
+        assert [link.split()[0].partition("/")[0] + link.partition(" ")[2] for link in ada.links] == [
+            "quicbest effort", "quicreliable", "tlsreliable",
+        ]  # fmt: skip
+        ada.join(hello("ada"))
+        bob.subscribe("a/*")
+        pose = ada.publisher("a/ada")
+        wait(lambda: pose.matching, "bob's subscription")
+        heard: list = []
+
+        def arrived():
+            pose.put(b"pose")
+            time.sleep(0.01)
+            heard.extend(bob.drain())
+            return heard
+
+        wait(arrived, "a pose")
+        assert heard[0] == ("a/ada", b"pose")
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_linked_servers_know_each_other_and_each_its_own_actors(certs, protocol):
+    with (
+        Server(("tls/127.0.0.1:0", "quic/127.0.0.1:0"), certificates=certs) as hub,
+        Server(
+            "tls/127.0.0.1:0", connect=[f"{protocol}/{hub.endpoint.partition('/')[2]}"], certificates=certs
+        ) as relay,
+        bus("ada", relay, certs) as ada,
+        bus("bob", hub, certs) as bob,
+        session("ada", relay, certs) as thief,
+    ):
+        wait(lambda: ada.alive() == bob.alive() == {"ada", "bob"}, "both to see each other")
+
+        def let_in():
+            try:
+                ada.join(hello("ada"))
+            except Refused:  # not yet linked well enough to ask
+                return False
+            return True
+
+        wait(let_in, "the server that keeps to answer over the one that carries")
+        bob.subscribe("own/0/0/*", EVERY)
+        event = ada.publisher("own/0/0/ada", reliable=True)
+        wait(lambda: event.matching, "bob's ear")
+        thief.put("vs/1/vineyard/own/0/0/bob", b"stolen", congestion_control=zenoh.CongestionControl.BLOCK)
+        list(thief.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
+        event.put(b"event")
+        heard: list = []
+        wait(lambda: heard.extend(bob.drain()) or heard, "the event")
+        assert heard == [("own/0/0/ada", b"event")]
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def test_keys_are_private_and_roles_are_read(tmp_path):
+    written = new(tmp_path / "pki", "guest", Role.SPECTATOR)
+    assert [path.name for path in written] == [
+        "ca.key", "ca.pem", "server.key", "server.pem", "guest.key", "guest.pem",
+    ]  # fmt: skip
+    for path in written:
+        assert stat.S_IMODE(path.stat().st_mode) == (0o600 if path.suffix == ".key" else 0o644), path
+    assert [path.name for path in new(tmp_path / "pki", "ada")] == ["ada.key", "ada.pem"]
+    assert roles(tmp_path / "pki") == {"ada": Role.ROBOT, "guest": Role.SPECTATOR, "server": Role.SERVER}
+    before = (tmp_path / "pki" / "ca.pem").read_bytes()
+    new(tmp_path / "pki", "server", Role.SERVER, ["vines.example", "192.168.1.5"])
+    assert (tmp_path / "pki" / "ca.pem").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "hosts", "words"),
+    [
+        ("a/b", Role.ROBOT, [], "letters, digits"),
+        ("ca", Role.ROBOT, [], "not 'ca'"),
+        ("server", Role.ROBOT, [], "only the server"),
+        ("ada", Role.SERVER, [], "only the server"),
+        ("ada", Role.ROBOT, ["host"], "only the server's certificate names hosts"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_and_nothing_is_made(tmp_path, name, role, hosts, words):
+    with pytest.raises(ValueError, match=words):
+        new(tmp_path / "pki", name, role, hosts)
+    assert not (tmp_path / "pki").exists()
+
+
+def test_what_is_wrong_in_the_folder_is_one_line_with_a_remedy(tmp_path, certs):
+    with pytest.raises(NoCertificate, match="vinesim certs new server"):
+        Server("tls/127.0.0.1:0", certificates=tmp_path)
+    new(tmp_path, "ada")
+    with pytest.raises(NoCertificate, match="there already"):
+        new(tmp_path, "ada")
+    (tmp_path / "bob.pem").write_bytes((certs / "bob.pem").read_bytes())
+    with pytest.raises(NoCertificate, match=r"bob\.pem: not signed by ca\.pem"):
+        roles(tmp_path)
+    (tmp_path / "bob.pem").write_text("junk")
+    with pytest.raises(NoCertificate, match="cannot be read as a certificate"):
+        roles(tmp_path)
+    (tmp_path / "bob.pem").write_bytes((tmp_path / "ada.pem").read_bytes())
+    with pytest.raises(NoCertificate, match=r"rename it to ada\.pem"):
+        roles(tmp_path)
+    (tmp_path / "bob.pem").unlink()
+    new(tmp_path, "server", Role.SERVER, days=-1)
+    with pytest.raises(NoCertificate, match=r"server\.pem: not valid.*vinesim certs new server"):
+        roles(tmp_path)
+    with pytest.raises(BusError, match=r"no .*eve\.pem.*vinesim certs new eve"):
+        ZenohBus("eve", connect="tls/127.0.0.1:1", certificates=tmp_path)
+    assert json.dumps(secured(tmp_path, "ada"))

@@ -1,0 +1,164 @@
+"""The bus in memory: what a network may and may not do, by an explicit clock."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vinesim.net.transport.bus import EVERY, NEWEST, RECENT, MemoryHub, NameTaken, Store, matches
+
+
+@pytest.mark.parametrize(
+    ("pattern", "key", "covers"),
+    [
+        ("a/*", "a/x", True),
+        ("a/*", "a/x/far", False),
+        ("a/*/far", "a/x/far", True),
+        ("**", "a/b/c", True),
+        ("a/**", "a", True),
+        ("a/**/z", "a/b/c/z", True),
+        ("a/**/z", "a/b/c", False),
+        ("c/1/-1/*", "c/1/1/x", False),
+    ],
+)
+def test_patterns(pattern, key, covers):
+    assert matches(pattern, key) is covers
+
+
+@given(st.lists(st.tuples(st.sampled_from([("a", NEWEST), ("b", 3), ("e", EVERY)]), st.integers()), max_size=60))
+def test_a_store_keeps_the_newest_of_each_key_in_order(samples):
+    store = Store()
+    for number, ((key, depth), _) in enumerate(samples):
+        store.put(depth, key, number)
+    taken = store.take()
+    assert [number for _, number in taken] == sorted(number for _, number in taken)
+    for wanted, depth in (("a", NEWEST), ("b", 3), ("e", EVERY)):
+        numbers = [n for n, ((key, _), _) in enumerate(samples) if key == wanted]
+        assert [number for key, number in taken if key == wanted] == numbers[-depth:]
+    assert store.take() == []
+
+
+def test_a_flood_is_bounded_and_counted():
+    store = Store()
+    for number in range(EVERY + 5):
+        store.put(EVERY, "e", number)
+    assert len(store.take()) == EVERY
+    assert store.overflowed == 5
+
+
+def test_without_a_listener_nothing_leaves_and_nothing_is_counted():
+    hub = MemoryHub()
+    ada, bob = hub.bus("ada"), hub.bus("bob")
+    publisher = ada.publisher("c/0/0/ada")
+    ada.subscribe("c/0/0/*")
+    assert not publisher.matching
+    assert not publisher.put(b"12345")
+    subscription = bob.subscribe("c/0/0/*")
+    assert publisher.put(b"12345")
+    hub.advance(0.0)
+    assert bob.drain() == [("c/0/0/ada", b"12345")]
+    assert (ada.bytes_out, bob.bytes_in, ada.bytes_in) == (5, 5, 0)
+    subscription.close()
+    assert not publisher.put(b"12345")
+    assert ada.bytes_out == 5
+
+
+def test_a_publisher_needs_an_exact_key():
+    with pytest.raises(ValueError, match="wildcard"):
+        MemoryHub().bus("ada").publisher("c/0/*/ada")
+
+
+def test_reliable_samples_arrive_all_and_in_order_whatever_the_network():
+    hub = MemoryHub(delay=0.05, jitter=0.05, loss=0.5, seed=3)
+    ada, bob = hub.bus("ada"), hub.bus("bob")
+    bob.subscribe("own/**", EVERY)
+    bob.subscribe("c/**", RECENT)
+    events, stream = ada.publisher("own/x", reliable=True), ada.publisher("c/x")
+    for number in range(60):
+        events.put(bytes([number]))
+        stream.put(bytes([number]))
+        hub.advance(0.001)
+    hub.advance(1.0)
+    heard = bob.drain()
+    assert [p[0] for k, p in heard if k == "own/x"] == list(range(60))
+    unreliable = [p[0] for k, p in heard if k == "c/x"]
+    assert 15 < len(unreliable) < 45
+    assert unreliable != sorted(unreliable)
+
+
+def test_the_same_seed_is_the_same_network():
+    def run() -> list:
+        hub = MemoryHub(delay=0.02, jitter=0.02, loss=0.3, seed=11)
+        ada, bob = hub.bus("ada"), hub.bus("bob")
+        bob.subscribe("**", EVERY)
+        publisher, heard = ada.publisher("x"), []
+        for number in range(100):
+            publisher.put(bytes([number]))
+            hub.advance(0.004)
+            heard.append(bob.drain())
+        return heard
+
+    assert run() == run()
+
+
+def test_nothing_arrives_before_its_time():
+    hub = MemoryHub(delay=0.05)
+    ada, bob = hub.bus("ada"), hub.bus("bob")
+    bob.subscribe("x")
+    ada.publisher("x").put(b"1")
+    hub.advance(0.049)
+    assert bob.drain() == []
+    hub.advance(0.002)
+    assert bob.drain() == [("x", b"1")]
+
+
+def test_questions_are_answered_with_their_age():
+    hub = MemoryHub(delay=0.01)
+    ada, bob = hub.bus("ada"), hub.bus("bob")
+    bob.serve("hello/bob", lambda question: question + b"!")
+    ada.ask("hello/*", b"hi")
+    ada.ask("nobody", b"hi")
+    hub.advance(0.015)
+    assert ada.answers() == []
+    hub.advance(0.035)
+    (answer,) = ada.answers()
+    assert answer[:2] == ("hello/bob", b"hi!")
+    assert answer.age == pytest.approx(0.03)
+
+
+def test_names_are_live_once():
+    hub = MemoryHub(delay=0.1)
+    with hub.bus("ada") as ada:
+        with pytest.raises(NameTaken, match="'ada' is already live"):
+            hub.bus("ada")
+        bob = hub.bus("bob")
+        assert bob.alive() == {"ada", "bob"}
+        assert ada.alive() == {"ada"}
+        hub.advance(0.11)
+        assert ada.alive() == {"ada", "bob"}
+    assert bob.alive() == {"ada", "bob"}
+    hub.advance(0.11)
+    assert bob.alive() == {"bob"}
+    hub.bus("ada").close()
+
+
+def test_a_hub_that_is_down_says_so_and_comes_back():
+    hub = MemoryHub()
+    ada, bob = hub.bus("ada"), hub.bus("bob")
+    bob.subscribe("x")
+    publisher = ada.publisher("x")
+    hub.down = True
+    assert not publisher.put(b"1")
+    assert ada.alive() == {"ada"}
+    assert "down" in ada.trouble
+    hub.down = False
+    assert publisher.put(b"2")
+    hub.advance(0.0)
+    assert bob.drain() == [("x", b"2")]
+    assert ada.trouble == ""
+
+
+def test_impossible_networks_are_refused():
+    with pytest.raises(ValueError, match="loss"):
+        MemoryHub(loss=1.5)

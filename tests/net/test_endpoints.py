@@ -1,0 +1,70 @@
+"""Endpoints in words, and which two ways lead to a server."""
+
+from __future__ import annotations
+
+import pytest
+
+from vinesim.net.transport.endpoints import Endpoint, chosen, everywhere, parse, ways
+
+
+@pytest.mark.parametrize(
+    ("text", "secured", "words"),
+    [
+        ("", False, "expected tcp/HOST:PORT or udp/HOST:PORT"),
+        ("192.168.1.5:7447", False, "expected tcp/"),
+        ("tcp/192.168.1.5", False, "expected tcp/"),
+        ("tcp/host:x", False, "port 'x'"),
+        ("tcp/host:65536", False, "port '65536'"),
+        ("tcp/host:7447?rel=1", False, "port"),
+        ("tcp/a?b:1", False, "expected"),
+        ("serial/dev:1", False, "expected tcp/"),
+        ("tls/host:7447", False, "--tls DIR"),
+        ("quic/host:7447", False, "--tls DIR"),
+        ("tcp/host:7447", True, "use tls/ or quic/"),
+        ("udp/host:7447", True, "expected tls/HOST:PORT or quic/HOST:PORT"),
+    ],
+)
+def test_what_is_no_endpoint_is_refused_with_what_would_be_one(text, secured, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        parse(text, secured=secured)
+    assert repr(text) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_endpoint_is_taken_apart_and_put_together():
+    assert parse("tcp/[::1]:7447") == Endpoint("tcp", "[::1]", 7447)
+    for text in ("tcp/host:1", "udp/10.0.0.1:7447"):
+        assert str(parse(text)) == text
+    assert parse("udp/host:1").locator == "udp/host:1?rel=1;mixed_rel=auto"
+    assert parse("quic/host:1", secured=True).locator == "quic/host:1?mixed_rel=auto"
+    assert parse("tcp/host:1").locator == "tcp/host:1"
+
+
+@pytest.mark.parametrize(
+    ("connect", "secured", "bulk", "live"),
+    [
+        ("tcp/192.168.1.5:7447", False, "tcp/192.168.1.5:7447", "udp/192.168.1.5:7447"),
+        ("tls/server:7447", True, "tls/server:7447", "quic/server:7447"),
+        ("tcp/127.0.0.1:7447", False, "tcp/127.0.0.1:7447", "None"),
+        ("tcp/[::1]:7447", False, "tcp/[::1]:7447", "None"),
+        ("tls/localhost:7447", True, "tls/localhost:7447", "None"),
+        ("udp/127.0.0.1:7447", False, "tcp/127.0.0.1:7447", "udp/127.0.0.1:7447"),
+        ("quic/localhost:7447", True, "tls/localhost:7447", "quic/localhost:7447"),
+    ],
+)
+def test_datagrams_where_they_pay_or_are_asked_for(connect, secured, bulk, live):
+    way = ways(connect, secured=secured)
+    assert (str(way.bulk), str(way.live)) == (bulk, live)
+
+
+def test_port_0_is_one_free_number_for_both_ways():
+    stream, datagrams = chosen(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
+    assert stream.port == datagrams.port > 1023
+    assert chosen(["tcp/127.0.0.1:7"]) == (Endpoint("tcp", "127.0.0.1", 7),)
+    with pytest.raises(ValueError, match="listens nowhere"):
+        chosen([])
+
+
+def test_a_server_listens_both_ways_unless_told_otherwise():
+    assert [str(one) for one in chosen(everywhere())] == ["tcp/0.0.0.0:7447", "udp/0.0.0.0:7447"]
+    assert [one.protocol for one in chosen(everywhere(secured=True), secured=True)] == ["tls", "quic"]

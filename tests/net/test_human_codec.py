@@ -1,0 +1,138 @@
+"""What crosses the network of people: to the byte, to the last step, and nothing that cannot be."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vinesim import frames
+from vinesim.net.codec import messages
+from vinesim.net.codec.human import (
+    Push,
+    decode_human,
+    decode_pose,
+    decode_push,
+    encode_human,
+    encode_pose,
+    encode_push,
+    quantised,
+)  # fmt: skip
+from vinesim.net.codec.messages import MessageError
+from vinesim.physics.rigid.human_body import standing
+from vinesim.scene.values import HumanUpdate, RobotUpdate
+
+HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.yaw(2.0))
+
+
+def somebody(seed: int = 0) -> HumanUpdate:
+    rng = np.random.default_rng(seed)
+    pose = standing(HERE, 1.8)
+    points = pose.points
+    points[1:, :3] += rng.uniform(-0.5, 0.5, (6, 3))
+    points[1:, 3:] = frames.normalize(rng.normal(size=(6, 4)))
+    fingers = tuple(rng.uniform(size=5))
+    pose = dataclasses.replace(pose.at(points), left_closed=True, right_busy=True, right_fingers=fingers)
+    return HumanUpdate("eva", 12.5, pose, rng.normal(size=(7, 6)))
+
+
+def same_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.abs((a * b).sum(-1))
+
+
+def test_a_person_is_root_three_inputs_hips_and_feet_in_161_bytes():
+    """F88: the four poses that say where a person is, and F89's hips and feet."""
+    told = somebody()
+    payload = encode_pose(told)
+    assert len(payload) == 161
+    heard = decode_pose(payload, "eva")
+    assert isinstance(heard, HumanUpdate)
+    assert (heard.actor, heard.time) == ("eva", 12.5)
+    for name in ("root", "head", "left", "right", "hips", "left_foot", "right_foot"):
+        one, other = getattr(told.pose, name), getattr(heard.pose, name)
+        np.testing.assert_allclose(other[:3], one[:3], atol=1.01e-4)
+        assert same_turn(one[3:], other[3:]) > np.cos(0.5 * np.radians(0.006))
+    fastest = np.abs(told.velocity.reshape(7, 2, 3)).max(axis=(0, 2))
+    wrong = np.abs(heard.velocity - told.velocity).reshape(7, 2, 3).max(axis=(0, 2))
+    assert (wrong < fastest / 127).all()
+    assert (heard.pose.left_closed, heard.pose.right_closed) == (True, False)
+    assert (heard.pose.left_busy, heard.pose.right_busy) == (False, True)
+    np.testing.assert_allclose(heard.pose.right_fingers, told.pose.right_fingers, atol=0.5 / 255 + 1e-9)
+    assert heard.pose.left_fingers == (0.0,) * 5
+
+
+@given(st.integers(0, 1 << 32))
+@settings(max_examples=30, deadline=None)
+def test_what_copies_hold_is_what_they_would_be_told_again(seed):
+    once = quantised(somebody(seed).pose)
+    assert quantised(once).points.tobytes() == once.points.tobytes()
+
+
+def test_robots_go_the_same_way():
+    update = RobotUpdate("anna", 1.0, HERE, np.zeros(6), np.array([0.1, 0.2]), np.zeros(2))
+    assert decode_pose(encode_pose(update), "anna").position == pytest.approx([0.1, 0.2])
+
+
+@pytest.mark.parametrize("point", [0, 3])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_pose_that_cannot_be_does_not_leave(point, wrong):
+    told = somebody()
+    points = told.pose.points
+    points[point, 1] = wrong
+    with pytest.raises(MessageError, match="not finite"):
+        encode_human(dataclasses.replace(told, pose=told.pose.at(points)))
+    points[point] = 0.0
+    with pytest.raises(MessageError, match="unit quaternion"):
+        encode_human(dataclasses.replace(told, pose=told.pose.at(points)))
+
+
+def test_pushes_arrive_as_they_left():
+    push = Push(3.0, {"arm_left_3_link": np.array([1.0, -2.5, 30.0, 0.5, 0.0, -0.25]), "chassis": np.zeros(6)})
+    payload = encode_push(push)
+    assert len(payload) == 14 + 25 + 15 + 25 + 7
+    heard = decode_push(payload)
+    assert heard.time == 3.0
+    assert heard.wrenches.keys() == push.wrenches.keys()
+    for link, wrench in push.wrenches.items():
+        np.testing.assert_array_equal(heard.wrenches[link], wrench)
+    assert decode_push(encode_push(Push(4.0, {}))).wrenches == {}
+    with pytest.raises(MessageError, match="too strong"):
+        encode_push(Push(0.0, {"arm": np.full(6, 1e4)}))
+
+
+MESSAGES = [encode_human(somebody()), encode_push(Push(1.0, {"arm": np.ones(6), "hand": np.ones(6)}))]
+
+
+@pytest.mark.parametrize("payload", MESSAGES)
+@given(data=st.data())
+@settings(max_examples=150, deadline=None)
+def test_whatever_arrives_is_read_or_refused_in_words(payload, data):
+    """Cut off, longer, or with other bytes in it."""
+    damaged = bytearray(payload[: data.draw(st.integers(0, len(payload)))] + data.draw(st.binary(max_size=8)))
+    for _ in range(data.draw(st.integers(0, 4))):
+        if damaged:
+            damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    for decode in (lambda raw: decode_human(raw, "eva"), decode_push, lambda raw: decode_pose(raw, "eva")):
+        try:
+            heard = decode(bytes(damaged))
+        except MessageError:
+            continue
+        if isinstance(heard, HumanUpdate):
+            assert np.isfinite(heard.pose.points).all()
+            np.testing.assert_allclose(np.linalg.norm(heard.pose.points[:, 3:], axis=1), 1.0, atol=1e-9)
+            assert np.isfinite(heard.velocity).all()
+        elif isinstance(heard, Push):
+            assert all(np.isfinite(wrench).all() for wrench in heard.wrenches.values())
+
+
+@pytest.mark.parametrize("payload", MESSAGES)
+def test_a_message_that_is_cut_off_is_refused(payload):
+    read = decode_push if messages.kind_of(payload) == messages.FORCE else lambda raw: decode_human(raw, "eva")
+    for length in range(len(payload)):
+        with pytest.raises(MessageError):
+            read(payload[:length])
+    with pytest.raises(MessageError):
+        read(payload + b"\0")

@@ -1,0 +1,475 @@
+"""The server: carries, counts, tells the time, and says clearly when it cannot."""
+
+from __future__ import annotations
+
+import contextlib
+import pathlib
+import re
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import zenoh
+
+from vinesim.net.codec import messages
+from vinesim.net.codec.messages import Fact, Hello, Welcome
+from vinesim.net.counters import Counters
+from vinesim.net.replication.retained_sync import Telling
+from vinesim.net.server import retained_store
+from vinesim.net.server.admission import Plan
+from vinesim.net.server.retained_store import Quota
+from vinesim.net.server.server import PortTaken, Server
+from vinesim.net.transport.bus import EVERY, NameTaken, Refused
+from vinesim.net.transport.endpoints import chosen
+from vinesim.net.transport.zenoh_bus import ZenohBus, close_session, config, open_session
+from vinesim.scene.ids import Kind, thing
+
+
+def wait(condition, what: str) -> None:
+    end = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < end, f"waited in vain for: {what}"
+        time.sleep(0.002)
+
+
+def test_a_free_port_is_chosen_and_reported():
+    with Server("tcp/127.0.0.1:0") as first, Server("tcp/127.0.0.1:0") as second:
+        ports = [int(server.endpoint.rpartition(":")[2]) for server in (first, second)]
+        assert all(1024 < port < 65536 for port in ports)
+        assert ports[0] != ports[1]
+        with ZenohBus("ada", connect=first.endpoint), ZenohBus("ada", connect=second.endpoint):
+            wait(lambda: first.actors == second.actors == ["vineyard/ada"], "both rosters")
+
+
+def test_a_taken_port_is_one_clear_line():
+    with Server("tcp/127.0.0.1:0") as running:
+        with pytest.raises(PortTaken, match="already in use") as caught:
+            Server(running.endpoint)
+        assert running.endpoint in str(caught.value)
+        assert "another port" in str(caught.value)
+        assert "\n" not in str(caught.value)
+    Server(running.endpoint).close()
+
+
+@pytest.mark.parametrize("endpoint", ["", "7447", "tls/127.0.0.1:0", "tcp/127.0.0.1", "tcp/:x", "tcp/1.2.3.4:99999"])
+def test_what_is_no_endpoint_is_refused(endpoint):
+    with pytest.raises(ValueError, match=r"expected tcp/HOST:PORT"):
+        Server(endpoint)
+
+
+def test_the_roster_follows_who_comes_and_goes():
+    with Server("tcp/127.0.0.1:0") as server:
+        with ZenohBus("ada", connect=server.endpoint), ZenohBus("bob", connect=server.endpoint, world="row-2"):
+            wait(lambda: server.actors == ["row-2/bob", "vineyard/ada"], "two actors")
+        wait(lambda: server.actors == [], "nobody")
+        assert server.joined == 2
+
+
+def test_the_clock_answers_with_the_time_of_day():
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        ada.ask("clock", b"nonsense")
+        ada.ask("clock", messages.encode_time(12.5))
+        answers: list = []
+        wait(lambda: answers.extend(ada.answers()) or answers, "the time")
+        asked, told = messages.decode_time(answers[0].payload)
+        assert asked == 12.5
+        assert abs(told - time.time()) < 10.0
+        assert (server.pings, server.malformed) == (1, 1)
+
+
+def test_run_returns_when_stopped():
+    with Server("tcp/127.0.0.1:0") as server:
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        assert thread.is_alive()
+        server.stop()
+        thread.join(timeout=10.0)
+        assert not thread.is_alive()
+    server.close()
+
+
+def test_the_server_simulates_nothing():
+    heavy = {"warp", "mujoco", "vinesim.physics", "vinesim.kernels"}
+    code = f"import sys, vinesim.net.server.server; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"
+
+
+# ---------------------------------------------------------------- joining
+
+
+def hello(name, digest="D1", scene="vsp"):
+    return messages.encode_hello(Hello(name, scene=scene, digest=digest))
+
+
+def test_another_scene_is_refused_by_both_names():
+    with Server("tcp/127.0.0.1:0") as server:
+        with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+            ada.join(hello("ada"))
+            with pytest.raises(Refused, match=r"'tendone' with digest 'D2', world 'vineyard' has 'vsp' with 'D1'"):
+                bob.join(hello("bob", "D2", "tendone"))
+            bob.join(hello("bob"))
+        wait(lambda: server.actors == [], "both to leave")
+        with ZenohBus("bob", connect=server.endpoint) as bob:
+            bob.join(hello("bob", "D2"))  # nobody is there and nothing is kept: a new world
+        assert server.figures()["refused"] == 1
+
+
+def test_the_servers_scene_protocol_and_room_are_held():
+    with Server("tcp/127.0.0.1:0", plan=Plan("vsp", "D1"), most=1) as server, contextlib.ExitStack() as stack:
+        ada, bob = (stack.enter_context(ZenohBus(name, connect=server.endpoint)) for name in ("ada", "bob"))
+        with pytest.raises(Refused, match="the server was started for 'vsp' with 'D1'"):
+            ada.join(hello("ada", "D2"))
+        other = bytearray(hello("ada"))
+        other[2] = messages.PROTOCOL + 1
+        with pytest.raises(Refused, match=f"version {messages.PROTOCOL + 1}, the server version"):
+            ada.join(bytes(other))
+        ada.join(hello("ada"))
+        with pytest.raises(Refused, match="room for 1 actors"):
+            bob.join(hello("bob"))
+        with pytest.raises(Refused, match="cannot be read"):
+            bob.join(b"junk")
+
+
+def test_an_answer_of_another_protocol_is_refused_by_both_numbers():
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        newer = bytearray(messages.encode_welcome(Welcome()))
+        newer[2] = 9
+        for answer, words in ((bytes(newer), "protocol version 9"), (b"junk", "cannot be read")):
+            # what answers is another program
+            server._declared[1].undeclare()
+            server._declared[1] = server._session.declare_queryable(
+                "vs/1/*/join/*/*", lambda query, answer=answer: query.reply(str(query.key_expr), answer)
+            )
+            with pytest.raises(Refused, match=words):
+                ada.join(hello("ada"))
+
+
+def test_a_plain_router_lets_everybody_in_and_the_log_says_so(caplog):
+    (endpoint,) = chosen(["tcp/127.0.0.1:0"])
+    router = open_session(config("router", listen__endpoints=[endpoint.locator]))
+    with caplog.at_level("INFO"), ZenohBus("ada", connect=str(endpoint)) as ada:
+        ada.join(hello("ada"))
+    close_session(router)
+    assert len([line for line in caplog.messages if "no vinesim server keeps world" in line]) == 1
+
+
+def test_who_is_in_says_so_again_to_a_server_that_was_started_anew():
+    first = Server("tcp/127.0.0.1:0")
+    with first, ZenohBus("ada", connect=first.endpoint) as ada:
+        ada.join(hello("ada"))
+        endpoint = first.endpoint
+        first.close()
+        wait(lambda: ada.trouble, "ada to miss the server")
+        with Server(endpoint) as second:
+            wait(lambda: second._agreement.plan("vineyard") == Plan("vsp", "D1"), "ada to say who she is")
+            wait(lambda: not ada.trouble, "ada to be well")
+            second.close()
+        with Server(endpoint, plan=Plan("tendone", "D2")):
+            wait(lambda: "'tendone'" in ada.trouble, "ada to be told that she is in another vineyard now")
+
+
+# ---------------------------------------------------------------- facts
+
+
+def box(index=0, ownership=1, author="ada", x=0.0):
+    return Fact(thing(Kind.BOX, index), ownership, 0, author, (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+
+
+def snapshot(bus, cell, count):
+    """The facts of a cell as soon as there are so many."""
+    found, answered = {}, False
+
+    def complete():
+        nonlocal answered
+        bus.ask(f"snap/{cell[0]}/{cell[1]}")
+        time.sleep(0.02)
+        for answer in bus.answers():
+            answered = True
+            assert answer.key == f"snap/{cell[0]}/{cell[1]}"
+            found.update({fact.thing: fact for fact in messages.decode_facts(answer.payload)})
+        return answered and len(found) >= count
+
+    wait(complete, f"{count} facts of cell {cell}")
+    return [found[number] for number in sorted(found)]
+
+
+def say(bus, cell, *facts):
+    publisher = bus.publisher(f"fact/{cell[0]}/{cell[1]}/{bus.name}", reliable=True)
+    wait(lambda: publisher.matching, "the server's ear")
+    assert publisher.put(messages.encode_facts(list(facts)))
+    publisher.close()
+
+
+def test_the_winning_fact_of_every_thing_is_told_to_who_comes_later():
+    with Server("tcp/127.0.0.1:0") as server:
+        with ZenohBus("ada", connect=server.endpoint) as ada:
+            ada.join(hello("ada"))
+            say(ada, (0, -1), box(0), box(1))
+            say(ada, (4, 4), box(1, ownership=3))
+            say(ada, (5, 5), box(1, ownership=2))
+            wait(lambda: server.archive.counters.heard == 3, "three messages")
+        with ZenohBus("bob", connect=server.endpoint) as bob:
+            assert snapshot(bob, (4, 4), 1) == [box(1, 3)]
+            assert snapshot(bob, (0, -1), 1) == [box(0)]
+            assert snapshot(bob, (5, 5), 0) == []
+            with pytest.raises(Refused, match="facts kept"):
+                bob.join(hello("bob", "D2"))
+
+
+def test_a_large_snapshot_comes_in_several_answers():
+    with Server("tcp/127.0.0.1:0", quota=Quota(1e6, 1e9)) as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        ada.join(hello("ada"))
+        say(ada, (0, 0), *[box(number) for number in range(1000)])
+        say(ada, (0, 0), *[box(number) for number in range(1000, 2000)])
+        assert snapshot(ada, (0, 0), 2000) == [box(number) for number in range(2000)]
+        ada.ask("snap/0/0")
+        answers: list = []
+        wait(lambda: answers.extend(ada.answers()) or len(answers) > 1, "several answers")
+        assert max(len(answer.payload) for answer in answers) <= 64_000
+
+
+def test_one_question_for_many_cells_names_each():
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        ada.join(hello("ada"))
+        for x in range(3):
+            say(ada, (x, 0), box(x))
+        snapshot(ada, (2, 0), 1)
+        ada.ask("snap/*/0")
+        answers: list = []
+        wait(lambda: answers.extend(ada.answers()) or len(answers) >= 3, "three cells")
+        assert sorted(answer.key for answer in answers) == ["snap/0/0", "snap/1/0", "snap/2/0"]
+
+
+def test_what_cannot_be_believed_is_dropped_counted_and_said_once(caplog):
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        ada.join(hello("ada"))
+        good = messages.encode_facts([box()])
+        publisher = ada.publisher("fact/0/0/ada", reliable=True)
+        nowhere = ada.publisher("fact/0/ada", reliable=True)
+        wait(lambda: publisher.matching and nowhere.matching, "the server's ear")
+        for payload in (b"", b"junk", good[:-2], b"VS\x09\x04" + good[4:], bytes(messages.LARGEST + 1)):
+            publisher.put(payload)
+        nowhere.put(good)
+        publisher.put(messages.encode_facts([box(author="bob")]))
+        wait(lambda: server.malformed == 7, "seven to be dropped")
+        publisher.put(good)
+        assert snapshot(ada, (0, 0), 1) == [box()]
+        assert len([line for line in caplog.messages if "cannot be believed" in line]) == 1
+        for question in ("snap/x/0", "snap/1/1.5"):
+            ada.ask(question)
+        wait(lambda: server.malformed == 9, "two questions that name no cell")
+
+
+def test_who_says_too_much_is_cut_off_and_nobody_else(caplog):
+    with (
+        Server("tcp/127.0.0.1:0", quota=Quota(1.0, 1e6)) as server,
+        ZenohBus("ada", connect=server.endpoint) as ada,
+        ZenohBus("bob", connect=server.endpoint) as bob,
+    ):
+        ada.join(hello("ada"))
+        flood = ada.publisher("fact/0/0/ada", reliable=True)
+        wait(lambda: flood.matching, "the server's ear")
+        for number in range(50):
+            flood.put(messages.encode_facts([box(number)]))
+        say(bob, (1, 1), box(99, author="bob"))
+        assert snapshot(bob, (1, 1), 1) == [box(99, author="bob")]
+        wait(lambda: server.archive.counters.heard == 51, "all to arrive")
+        wait(lambda: server.archive.count() + server.archive.counters.over_quota == 51, "all to be judged")
+        assert 5 <= server.archive.count() <= 10
+        assert len([line for line in caplog.messages if "quota" in line]) == 1
+
+
+def test_facts_wait_until_somebody_is_let_into_their_world(monkeypatch):
+    monkeypatch.setattr(retained_store, "EARLY", 2)
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        for number in range(3):
+            say(ada, (0, 0), box(number))
+        wait(lambda: server.archive.counters.strange == 1, "the oldest to be given up")
+        assert server.archive.count() == 0
+        ada.join(hello("ada"))
+        assert snapshot(ada, (0, 0), 2) == [box(1), box(2)]
+
+
+SERVE = """
+import pathlib, sys
+from vinesim.net.server.server import Server
+with Server(sys.argv[1], keep=pathlib.Path(sys.argv[2])) as server:
+    print(server.endpoint, flush=True)
+    server.run()
+"""
+
+
+@contextlib.contextmanager
+def serving(endpoint, folder):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SERVE, endpoint, str(folder)], stdout=subprocess.PIPE, text=True
+    )  # fmt: skip
+    try:
+        yield process, process.stdout.readline().strip()
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_a_server_killed_in_full_flight_has_lost_nothing_it_told(tmp_path):
+    with serving("tcp/127.0.0.1:0", tmp_path) as (process, endpoint), ZenohBus("ada", connect=endpoint) as ada:
+        ada.join(hello("ada"))
+        say(ada, (0, 0), *[box(number) for number in range(50)])
+        told = snapshot(ada, (0, 0), 50)
+        flood = ada.publisher("fact/0/0/ada", reliable=True)
+        wait(lambda: flood.matching, "the server's ear")
+        for number in range(50, 150):
+            flood.put(messages.encode_facts([box(number)]))
+        process.kill()
+        process.wait()
+        with serving(endpoint, tmp_path):
+            wait(lambda: not ada.trouble, "ada to be back")
+            again = snapshot(ada, (0, 0), 50)
+            assert again[:50] == told
+            assert again == [box(number) for number in range(len(again))]  # and of the rest the first that came
+
+
+def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
+    """Those who are there are its memory."""
+    with (
+        serving("tcp/127.0.0.1:0", tmp_path / "one") as (first, endpoint),
+        ZenohBus("ada", connect=endpoint) as ada,
+        ZenohBus("late", connect=endpoint) as late,
+    ):
+        ada.join(hello("ada"))
+        telling = Telling(ada, Counters())
+        told: list = []
+
+        def ticking(condition):
+            def check():
+                telling.follow([(0, 0)], time.monotonic())
+                telling.speak()
+                time.sleep(0.005)
+                return condition()
+
+            return check
+
+        def known():
+            late.ask("snap/0/0")
+            told[:] = [fact for answer in late.answers() for fact in messages.decode_facts(answer.payload)] or told
+            return told == [box(number) for number in range(30)]
+
+        for number in range(30):
+            telling.say((0, 0), box(number))
+        wait(ticking(known), "thirty facts")
+        first.kill()
+        first.wait()
+        wait(ticking(lambda: ada.trouble), "ada to miss the server")
+        with serving(endpoint, tmp_path / "another"):  # a folder with nothing in it
+            told.clear()
+            wait(ticking(known), "the same facts again")
+
+
+def test_the_scene_is_kept_with_the_facts(tmp_path):
+    with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        ada.join(hello("ada"))
+        say(ada, (0, 0), box())
+        snapshot(ada, (0, 0), 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["vineyard.facts"]
+    with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("bob", connect=server.endpoint) as bob:
+        with pytest.raises(Refused, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--keep"):
+            bob.join(hello("bob", "D2"))
+        assert snapshot(bob, (0, 0), 1) == [box()]
+
+
+# ---------------------------------------------------------------- several servers
+
+
+def meet(one, other):
+    """Poses and events of each reach the other, over however many routers, and what may be lost stays what it is."""
+    for sender, receiver in ((one, other), (other, one)):
+        receiver.subscribe(f"a/{sender.name}")
+        receiver.subscribe(f"own/0/0/{sender.name}", EVERY)
+        pose = sender.publisher(f"a/{sender.name}")
+        event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
+        wait(lambda pose=pose, event=event: pose.matching and event.matching, "the other's subscriptions")
+        assert event.put(b"event")
+        heard: set = set()
+
+        def arrived(pose=pose, receiver=receiver, heard=heard):
+            pose.put(b"pose")
+            time.sleep(0.002)
+            heard.update(receiver.drain())
+            return len(heard) == 2
+
+        wait(arrived, "a pose and an event")
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "udp"])
+def test_of_two_linked_servers_one_decides_and_keeps_for_both(protocol):
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as hub:
+        address = hub.endpoint.partition("/")[2]
+        with (
+            Server("tcp/127.0.0.1:0", connect=[f"{protocol}/{address}"]) as relay,
+            ZenohBus("ada", connect=hub.endpoint) as ada,
+            ZenohBus("bob", connect=relay.endpoint) as bob,
+        ):
+            wait(lambda: hub.actors == relay.actors == ["vineyard/ada", "vineyard/bob"], "both rosters")
+            wait(lambda: ada.alive() == bob.alive() == {"ada", "bob"}, "both to see each other")
+            bob.join(hello("bob"))
+            with pytest.raises(Refused, match="'D2', world 'vineyard' has 'vsp' with 'D1'"):
+                ada.join(hello("ada", "D2"))
+            ada.join(hello("ada"))
+            meet(ada, bob)
+            say(bob, (0, 0), box(0, author="bob"))
+            say(ada, (0, 0), box(1))
+            assert snapshot(ada, (0, 0), 2) == snapshot(bob, (0, 0), 2) == [box(0, author="bob"), box(1)]
+            with pytest.raises(NameTaken):
+                ZenohBus("ada", connect=relay.endpoint)
+            answers: list = []
+            bob.ask("clock", messages.encode_time(1.0))
+            wait(lambda: answers.extend(bob.answers()) or answers, "the time")
+            assert (hub.pings, relay.pings) == (1, 0)
+
+
+def test_linked_servers_have_a_way_for_what_may_be_lost():
+    with Server("udp/127.0.0.1:0") as hub, Server("tcp/127.0.0.1:0", connect=[hub.endpoint]) as relay:
+        wait(lambda: len(relay._session.info.links()) == 2, "both links")
+        kinds = [link.reliability for link in relay._session.info.links()]
+        assert zenoh.Reliability.BEST_EFFORT in kinds
+        assert zenoh.Reliability.RELIABLE in kinds
+
+
+def test_a_server_that_carries_waits_for_the_one_that_keeps():
+    (endpoint,) = chosen(["tcp/127.0.0.1:0"])
+    with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as relay, ZenohBus("ada", connect=relay.endpoint) as ada:
+        ada.join(hello("ada"))  # nobody decides yet
+        assert not ada.trouble
+        with Server(str(endpoint)) as hub:
+            wait(lambda: hub._agreement.plan("vineyard") == Plan("vsp", "D1"), "ada to say who she is")
+        wait(lambda: "the server that keeps world 'vineyard' is gone" in ada.trouble, "ada to miss the one that keeps")
+        with Server(str(endpoint)) as hub:
+            wait(lambda: not ada.trouble and hub.actors == ["vineyard/ada"], "ada to be well")
+
+
+def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):
+    with pytest.raises(ValueError, match=r"only carries: give --keep, --scene and --max-clients to the one server"):
+        Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], keep=tmp_path)
+
+
+def test_the_configuration_for_stock_routers_is_true():
+    text = (pathlib.Path(__file__).parents[2] / "docs/network-routers.md").read_text()
+    snippet = re.search(r"```json5\n(.*?)```", text, re.S).group(1)
+    stream, datagrams = chosen(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as hub:
+        snippet = snippet.replace("0.0.0.0:7447", f"127.0.0.1:{stream.port}")
+        snippet = snippet.replace("10.0.0.1:7447", hub.endpoint.partition("/")[2])
+        router = open_session(zenoh.Config.from_json5(snippet))
+        with ZenohBus("ada", connect=hub.endpoint) as ada, ZenohBus("bob", connect=str(datagrams)) as bob:
+            assert len(bob.links) == 3
+            wait(lambda: ada.alive() == bob.alive() == {"ada", "bob"}, "both to see each other")
+            ada.join(hello("ada"))
+            with pytest.raises(Refused, match="'D2'"):
+                bob.join(hello("bob", "D2"))
+            bob.join(hello("bob"))
+            meet(ada, bob)
+        close_session(router)

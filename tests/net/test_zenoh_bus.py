@@ -1,0 +1,522 @@
+"""The bus over real Zenoh on loopback: tcp, free ports, no multicast; waits for conditions, never for time alone."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.net.codec import messages
+from vinesim.net.codec.messages import Hello
+from vinesim.net.replication.exchange import Exchange
+from vinesim.net.server.server import Server
+from vinesim.net.transport import zenoh_bus
+from vinesim.net.transport.bus import EVERY, NameTaken
+from vinesim.net.transport.certificates import new
+from vinesim.net.transport.endpoints import chosen
+from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.state import State
+from vinesim.scene.values import RobotUpdate
+
+PATIENCE = 10.0
+
+
+def wait(condition: Callable[[], object], what: str) -> None:
+    """Until it holds; fails in words after ten seconds."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"waited {PATIENCE} s in vain for: {what}"
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    with Server("tcp/127.0.0.1:0") as running:
+        yield running
+
+
+class Wire:
+    """A relay between a client and the router that counts every byte each way, framing and all."""
+
+    def __init__(self, endpoint: str) -> None:
+        host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+        self._target = (host, int(port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self.up = self.down = 0
+        self._sockets = [self._listener]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                router = socket.create_connection(self._target)
+                self._sockets += [client, router]
+                for source, target, way in ((client, router, "up"), (router, client, "down")):
+                    threading.Thread(target=self._carry, args=(source, target, way), daemon=True).start()
+
+    def _carry(self, source: socket.socket, target: socket.socket, way: str) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                setattr(self, way, getattr(self, way) + len(data))
+                target.sendall(data)
+        with contextlib.suppress(OSError):
+            target.shutdown(socket.SHUT_RDWR)
+
+    def __enter__(self) -> Wire:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for each in self._sockets:
+            each.close()
+
+
+def test_samples_cross_and_depths_hold(server):
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+        bob.subscribe("c/0/0/*")
+        bob.subscribe("own/0/0/*", EVERY)
+        pose, event = ada.publisher("c/0/0/ada"), ada.publisher("own/0/0/ada", reliable=True)
+        wait(lambda: pose.matching and event.matching, "bob's subscriptions")
+        for number in range(100):
+            assert pose.put(bytes([number]))
+            assert event.put(bytes([number]))
+        wait(lambda: bob.bytes_in == 200, "all samples")
+        heard = bob.drain()
+        assert [payload[0] for key, payload in heard if key == "own/0/0/ada"] == list(range(100))
+        assert [payload[0] for key, payload in heard if key == "c/0/0/ada"] == [99]
+        assert (ada.bytes_out, bob.bytes_in) == (200, 200)
+
+
+def test_without_a_listener_not_one_byte_is_on_the_wire(server):
+    with (
+        Wire(server.endpoint) as wire,
+        ZenohBus("ada", connect=wire.endpoint) as ada,
+        ZenohBus("bob", connect=server.endpoint) as bob,
+    ):
+        # both hear the neighbouring cell, ada also her own: neither may make her send
+        bob.subscribe("c/1/0/*")
+        ada.subscribe("c/0/0/*")
+        here, there = ada.publisher("c/0/0/ada"), ada.publisher("c/1/0/ada")
+        wait(lambda: there.matching, "bob's subscription")
+        assert not here.matching
+        payload = bytes(200)
+
+        def cost(publisher, count: int) -> int:
+            before, heard = wire.up, bob.bytes_in
+            for _ in range(count):
+                # past the bus's own look at matching: it is Zenoh that must not send
+                publisher._publisher.put(payload)
+            ended = heard + 3 + (200 * count if publisher is there else 0)
+            assert there.put(b"end")
+            wait(lambda: bob.bytes_in == ended, "the sample that ends the count")
+            return wire.up - before
+
+        assert cost(there, 50) > 50 * 200
+        # the end mark, and perhaps a keepalive of a few bytes
+        assert cost(here, 20_000) < 200
+        assert not here.put(payload)
+        assert ada.bytes_out == 6  # the two end marks, put through the bus
+
+
+def test_payload_bytes_are_what_crosses_the_wire(server):
+    with (
+        Wire(server.endpoint) as wire,
+        ZenohBus("ada", connect=wire.endpoint) as ada,
+        ZenohBus("bob", connect=server.endpoint) as bob,
+    ):
+        bob.subscribe("c/0/0/*", EVERY)
+        publisher = ada.publisher("c/0/0/ada")
+        wait(lambda: publisher.matching, "bob's subscription")
+        before = wire.up
+        for _ in range(50):
+            publisher.put(bytes(1000))
+            time.sleep(0.001)
+        wait(lambda: bob.bytes_in == 50_000, "all samples")
+        assert ada.bytes_out == 50_000
+        assert 50_000 <= wire.up - before < 50_000 + 50 * 80
+
+
+def test_a_name_is_live_once_and_free_again_after_leaving(server):
+    with ZenohBus("ada", connect=server.endpoint):
+        with pytest.raises(NameTaken, match="'ada' is already live in world 'vineyard'"):
+            ZenohBus("ada", connect=server.endpoint)
+        with ZenohBus("ada", connect=server.endpoint, world="other") as elsewhere:
+            assert elsewhere.alive() == {"ada"}
+    with ZenohBus("ada", connect=server.endpoint) as again:
+        assert again.alive() == {"ada"}
+
+
+def test_of_two_who_come_at_once_not_both_stay(server):
+    found: list[object] = []
+
+    def join() -> None:
+        try:
+            found.append(ZenohBus("ada", connect=server.endpoint))
+        except NameTaken as error:
+            found.append(error)
+
+    threads = [threading.Thread(target=join) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    buses = [each for each in found if isinstance(each, ZenohBus)]
+    for bus in buses:
+        bus.close()
+    assert len(found) == 4
+    assert len(buses) <= 1
+
+
+def test_who_is_there_is_known_at_once_and_who_leaves_is_missed(server):
+    with ZenohBus("ada", connect=server.endpoint) as ada:
+        with ZenohBus("bob", connect=server.endpoint) as bob:
+            assert bob.alive() == {"ada", "bob"}
+            wait(lambda: ada.alive() == {"ada", "bob"}, "bob to be seen")
+        wait(lambda: ada.alive() == {"ada"}, "bob to be missed")
+
+
+def test_without_a_server_there_is_one_clear_line():
+    with socket.create_server(("127.0.0.1", 0)) as reserved:
+        endpoint = f"tcp/127.0.0.1:{reserved.getsockname()[1]}"
+    with pytest.raises(ServerUnreachable, match="vinesim server") as caught:
+        ZenohBus("ada", connect=endpoint)
+    assert endpoint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "vs 1"])
+def test_a_name_that_is_no_key_is_refused(name):
+    with pytest.raises(ValueError, match="letters, digits"):
+        ZenohBus(name)
+
+
+def test_questions_find_their_answers(server):
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+        bob.serve("hello/bob", lambda question: question + b"!")
+        answers: list = []
+
+        def asked() -> bool:
+            ada.ask("hello/bob", b"hi")
+            time.sleep(0.02)
+            answers.extend(ada.answers())
+            return bool(answers)
+
+        wait(asked, "bob's answer")
+        assert answers[0][:2] == ("hello/bob", b"hi!")
+        assert 0.0 <= answers[0].age < PATIENCE
+
+
+def test_a_huge_sample_is_not_kept(server):
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+        bob.subscribe("own/0/0/*", EVERY)
+        event = ada.publisher("own/0/0/ada", reliable=True)
+        wait(lambda: event.matching, "bob's subscription")
+        event.put(bytes(messages.LARGEST + 1))
+        event.put(bytes(5 * messages.LARGEST))  # the router does not even put this together
+        event.put(b"small")
+        wait(lambda: bob.bytes_in == messages.LARGEST + 6, "both samples")
+        assert bob.drain() == [("own/0/0/ada", b"small")]
+        assert bob.lost == 1
+
+
+def test_a_session_left_open_does_not_hang_at_exit(server):
+    code = f"from vinesim.net.transport.zenoh_bus import ZenohBus\nbus = ZenohBus('ada', connect={server.endpoint!r})\nprint('in')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout) == (0, "in\n"), done.stderr
+
+
+# ---------------------------------------------------------------- exchanges over Zenoh
+
+
+class Client:
+    """A robot at ``x`` in a vineyard of three trees, ticking by the wall clock."""
+
+    def __init__(self, bus: ZenohBus, x: float) -> None:
+        trees = []
+        for number in range(3):
+            tree = Tree(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
+            tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)
+            trees.append(tree)
+        self.model = assemble(trees)
+        self.state = State.at_rest(self.model)
+        self.exchange = Exchange(bus, Hello(bus.name, digest=self.model.digest(), joints=1), self.model)
+        self.robot = RobotUpdate(bus.name, 0.0, frames.pose(np.array([x, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
+        self.touched: set[int] = set()
+        self.robots: dict[str, RobotUpdate] = {}
+        self.heard: list = []
+
+    def tick(self) -> None:
+        now = time.monotonic()
+        inbox = self.exchange.receive(now)
+        self.robots = inbox.robots
+        self.heard += inbox.trees
+        self.exchange.send(now, self.robot, touched=self.touched, read=self.read)
+
+    def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
+        bodies = self.model.bodies_of(tree)
+        return self.state.joint_q[bodies], self.state.joint_qd[bodies]
+
+
+def together(*clients: Client) -> Callable[[Callable[[], object]], Callable[[], object]]:
+    def ticking(condition: Callable[[], object]) -> Callable[[], object]:
+        def check() -> object:
+            for client in clients:
+                client.tick()
+            return condition()
+
+        return check
+
+    return ticking
+
+
+def test_two_clients_exchange_what_is_touched_near_and_nothing_far(server):
+    with (
+        Wire(server.endpoint) as wire,
+        ZenohBus("ada", connect=wire.endpoint) as a,
+        ZenohBus("bob", connect=server.endpoint) as b,
+    ):
+        ada, bob = Client(a, 1.0), Client(b, 60.0)
+        ticking = together(ada, bob)
+        wait(ticking(lambda: "bob" in ada.robots and "ada" in bob.robots), "both to see each other")
+        wait(ticking(lambda: abs(ada.exchange.offset + time.monotonic() - time.time()) < 0.1), "the server's clock")
+        ada.touched = {0}
+        turn = frames.exp(np.array([0.0, 0.3, 0.0]))
+        ada.state.joint_q[:] = frames.multiply(turn, ada.model.joint_settled)
+        counters = ada.exchange.counters
+        poses = counters.actor.messages_out
+        wait(ticking(lambda: counters.actor.messages_out > poses + 5), "a second of far poses")
+        assert (counters.environment.messages_out, counters.event.messages_out) == (0, 0)
+        # all that left is poses and upkeep: were trees among it, thousands of bytes would be
+        assert a.bytes_out == counters.actor.bytes_out
+        assert ada.exchange.owner(0) == "ada"
+        assert bob.exchange.owner(0) is None
+        bob.robot = RobotUpdate("bob", 0.0, frames.pose(np.array([2.0, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
+        wait(ticking(lambda: bob.heard), "the touched tree")
+        update = bob.heard[0]
+        assert (update.tree, update.owner) == (0, "ada")
+        np.testing.assert_allclose(update.joint_q, ada.read(0)[0], atol=1e-4)
+        ada.touched = set()
+        wait(ticking(lambda: bob.exchange.owner(0) is None), "the rest record")
+        assert wire.up > 0
+
+
+def test_a_router_that_is_killed_and_restarted_resumes():
+    code = (
+        "import sys\nfrom vinesim.net.server.server import Server\n"
+        "with Server(sys.argv[1]) as server:\n    print('up', flush=True)\n    server.run()"
+    )
+    with socket.create_server(("127.0.0.1", 0)) as reserved:
+        endpoint = f"tcp/127.0.0.1:{reserved.getsockname()[1]}"
+
+    def start() -> subprocess.Popen:
+        process = subprocess.Popen([sys.executable, "-c", code, endpoint], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        return process
+
+    router = start()
+    try:
+        with ZenohBus("ada", connect=endpoint) as a, ZenohBus("bob", connect=endpoint) as b:
+            ada, bob = Client(a, 1.0), Client(b, 2.0)
+            ticking = together(ada, bob)
+            ada.touched = {1}
+            wait(ticking(lambda: bob.exchange.owner(1) == "ada"), "the first touch")
+            router.kill()
+            router.wait()
+            wait(ticking(lambda: a.trouble and b.trouble), "both to notice that the server is gone")
+            assert endpoint in a.trouble
+            wait(ticking(lambda: a.alive() == {"ada"} and not bob.robots), "each to be alone")
+            assert ada.exchange.owner(1) == "ada"
+            router = start()
+            wait(ticking(lambda: bob.exchange.owner(1) == "ada" and "ada" in bob.robots), "the stream again")
+            assert a.trouble == b.trouble == ""
+    finally:
+        router.kill()
+        router.wait()
+
+
+# ---------------------------------------------------------------- links
+
+
+class Pump:
+    """Sends a pose and an event each time it is asked whether both have arrived by now."""
+
+    def __init__(self, sender: ZenohBus, receiver: ZenohBus) -> None:
+        receiver.subscribe(f"a/{sender.name}")
+        receiver.subscribe(f"own/0/0/{sender.name}", EVERY)
+        self._pose = sender.publisher(f"a/{sender.name}")
+        self._event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
+        self._receiver = receiver
+        self._heard: set[str] = set()
+
+    def again(self) -> None:
+        self._receiver.drain()
+        self._heard.clear()
+
+    def __call__(self) -> bool:
+        self._pose.put(bytes(1000))
+        self._event.put(b"event")
+        time.sleep(0.002)
+        self._heard.update(key for key, _ in self._receiver.drain())
+        return len(self._heard) == 2
+
+
+def test_poses_are_datagrams_beside_the_stream_of_events(server):
+    with Wire(server.endpoint) as wire:
+        port = wire.endpoint.rpartition(":")[2]
+        # datagrams at the relay's port number, past the relay
+        with (
+            Server(f"udp/127.0.0.1:{port}", connect=[server.endpoint]),
+            ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada,
+            ZenohBus("bob", connect=server.endpoint) as bob,
+        ):
+            assert [link.partition(" ")[2] for link in ada.links] == ["reliable", "best effort", "reliable"]
+            assert len(bob.links) == 1
+            bob.subscribe("a/ada", EVERY)
+            bob.subscribe("own/0/0/ada", EVERY)
+            pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
+            wait(lambda: pose.matching and event.matching, "bob's subscriptions")
+            before = wire.up
+            wait(lambda: (pose.put(bytes(1000)) and time.sleep(0.001)) or bob.bytes_in >= 50_000, "fifty poses")
+            assert wire.up - before < 5_000
+            for _ in range(20):
+                event.put(bytes(1000))
+            heard: list = []
+            wait(lambda: heard.extend(bob.drain()) or sum(k[0] == "o" for k, _ in heard) == 20, "all events")
+            assert wire.up - before > 20_000
+
+
+def test_where_no_datagrams_pass_poses_take_the_stream_and_the_log_says_so(server, caplog):
+    port = server.endpoint.rpartition(":")[2]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:  # takes every handshake and answers none
+        silent.bind(("127.0.0.1", int(port)))
+        with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+            assert len([line for line in caplog.messages if "no datagrams pass" in line]) == 1
+            assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
+            wait(Pump(ada, bob), "a pose and an event")
+
+
+class DatagramWire:
+    """A relay of datagrams between one client and the router, until it is closed."""
+
+    def __init__(self, port: int, target: int) -> None:
+        self._outer, self._inner = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        self._outer.bind(("127.0.0.1", port))
+        self._inner.connect(("127.0.0.1", target))
+        self._client: tuple[str, int] | None = None
+        for carry in (self._there, self._back):
+            threading.Thread(target=carry, daemon=True).start()
+
+    def _there(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                data, self._client = self._outer.recvfrom(65536)
+                self._inner.send(data)
+
+    def _back(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                data = self._inner.recv(65536)
+                assert self._client is not None
+                self._outer.sendto(data, self._client)
+
+    def close(self) -> None:
+        for each in (self._outer, self._inner):
+            each.close()
+
+
+def test_when_datagrams_pass_no_more_poses_take_the_stream(caplog, monkeypatch):
+    monkeypatch.setattr(zenoh_bus, "SILENT", 1.0)
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, Wire(server.endpoint) as wire:
+        port = int(wire.endpoint.rpartition(":")[2])
+        datagrams = DatagramWire(port, server.endpoints[1].port)
+        with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+            assert len(ada.links) == 3
+            there, back = Pump(ada, bob), Pump(bob, ada)
+            wait(lambda: there() and back(), "poses each way")
+            datagrams.close()
+            wait(lambda: "udp/" in ada.trouble, "ada to miss the datagrams")
+            there.again()
+            back.again()
+            wait(lambda: there() and back(), "poses over the stream")
+            assert ada.trouble == ""
+            assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
+            assert len([line for line in caplog.messages if "no datagrams pass" in line and "any more" in line]) == 1
+
+
+JOIN = """
+import pathlib, sys
+from vinesim.net.transport.zenoh_bus import ZenohBus
+with ZenohBus("ada", connect=sys.argv[1]):
+    print("in", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("way", [0, 1], ids=["tcp", "udp"])
+def test_a_frozen_client_is_missed(way):
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, ZenohBus("bob", connect=server.endpoint) as bob:
+        process = subprocess.Popen(
+            [sys.executable, "-c", JOIN, str(server.endpoints[way])], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"in\n"
+            wait(lambda: "ada" in bob.alive() and "vineyard/ada" in server.actors, "ada")
+            process.send_signal(signal.SIGSTOP)
+            wait(lambda: "ada" not in bob.alive() and "vineyard/ada" not in server.actors, "ada to be missed")
+        finally:
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.parametrize("protocols", ["tcp udp", "tls quic"])
+def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
+    stream, datagrams = protocols.split()
+    secure = stream == "tls"
+    for name in ("ada", "bob") if secure else ():
+        new(tmp_path, name)
+    wanted = chosen([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
+    code = (
+        "import pathlib, sys\nfrom vinesim.net.server.server import Server\n"
+        f"with Server(sys.argv[1:], certificates={f'pathlib.Path({str(tmp_path)!r})' if secure else None}) as server:\n"
+        "    print('up', flush=True)\n    server.run()"
+    )
+
+    def start() -> subprocess.Popen:
+        process = subprocess.Popen([sys.executable, "-c", code, *map(str, wanted)], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        return process
+
+    router = start()
+    certificates = tmp_path if secure else None
+    try:
+        with (
+            ZenohBus("ada", connect=str(wanted[1]), certificates=certificates) as ada,
+            ZenohBus("bob", connect=str(wanted[1]), certificates=certificates) as bob,
+        ):
+            assert len(ada.links) == len(bob.links) == 3
+            both = Pump(ada, bob)
+            wait(both, "a pose and an event")
+            router.kill()
+            router.wait()
+            wait(lambda: ada.trouble and bob.trouble, "both to notice")
+            router = start()
+            both.again()
+            wait(both, "both streams again")
+            wait(lambda: not ada.trouble and not bob.trouble and len(ada.links) == 3, "both to be well")
+    finally:
+        router.kill()
+        router.wait()

@@ -1,0 +1,662 @@
+"""Touching: closest points, waking, the same tick, books that balance, room that runs out in words."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
+from vinesim import frames
+from vinesim.kernels.contact import solver
+from vinesim.physics.contact.contact_solver import Touching, shapes_of
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.step import Physics
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+
+KINDS = {
+    "sphere": (2, (0.05, 0.0, 0.0)),
+    "capsule": (3, (0.04, 0.1, 0.0)),
+    "ellipsoid": (4, (0.05, 0.08, 0.1)),
+    "cylinder": (5, (0.06, 0.09, 0.0)),
+    "box": (6, (0.05, 0.07, 0.1)),
+}
+
+
+@wp.kernel
+def _closest(
+    # in
+    kind: int,
+    size: wp.vec3d,
+    start: wp.array(dtype=wp.vec3d),
+    end: wp.array(dtype=wp.vec3d),
+    # out
+    found_out: wp.array(dtype=wp.vec4d),
+):
+    """Normal and distance where one segment is closest to a primitive."""
+    i = wp.tid()
+    t = solver.closest(kind, size, start[i], end[i])
+    found_out[i] = solver.distance(kind, size, start[i] + t * (end[i] - start[i]))
+
+
+def closest(kind: str, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    number, size = KINDS[kind]
+    found = wp.zeros(len(start), dtype=wp.vec4d, device="cpu")
+    ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]
+    wp.launch(_closest, len(start), inputs=[number, wp.vec3d(*size), *ends], outputs=[found], device="cpu")
+    return found.numpy()
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder"])
+@pytest.mark.parametrize("length", [0.0, 0.3])
+def test_distance_of_segments_is_mujocos(kind, length):
+    rng = np.random.default_rng(5)
+    number, size = KINDS[kind]
+    spec = mujoco.MjSpec()
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
+    spec.worldbody.add_geom(type=mujoco.mjtGeom(number), size=size)
+    body = spec.worldbody.add_body(mocap=True)
+    thin = 0.001
+    kind_of = mujoco.mjtGeom.mjGEOM_CAPSULE if length else mujoco.mjtGeom.mjGEOM_SPHERE
+    body.add_geom(type=kind_of, size=[thin, length / 2, 0])
+    world = spec.compile()
+    data = mujoco.MjData(world)
+    middle = rng.normal(size=(200, 3)) * 0.15
+    turn = frames.normalize(rng.normal(size=(200, 4)))
+    turn[:20] = frames.IDENTITY  # parallel to axes and faces
+    axis = frames.rotate(turn, np.array([0.0, 0.0, length / 2]))
+    mine = closest(kind, middle - axis, middle + axis)
+    compared = 0
+    for i in range(len(middle)):
+        data.mocap_pos[0], data.mocap_quat[0] = middle[i], frames.to_wxyz(turn[i])
+        mujoco.mj_forward(world, data)
+        gap = mujoco.mj_geomDistance(world, data, 0, 1, 10.0, None)
+        if gap > 0.0:
+            assert mine[i, 3] - thin == pytest.approx(gap, abs=2e-6)
+            compared += 1
+    assert compared > 80
+    np.testing.assert_allclose(np.linalg.norm(mine[:, :3], axis=1), 1.0, atol=1e-12)
+
+
+def test_distance_of_segments_and_a_box_is_that_of_the_closest_of_many_points():
+    """Not MuJoCo here: its distance from a box to a capsule that pierces it comes out positive."""
+    rng = np.random.default_rng(5)
+    size = np.array(KINDS["box"][1])
+    middle, turn = rng.normal(size=(200, 3)) * 0.15, frames.normalize(rng.normal(size=(200, 4)))
+    axis = frames.rotate(turn, np.array([0.0, 0.0, 0.15]))
+    points = middle[:, None] + np.linspace(-1.0, 1.0, 2001)[:, None] * axis[:, None]
+    beyond = np.abs(points) - size
+    outside, inside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1), beyond.max(-1)
+    truth = np.where(inside < 0.0, inside, outside).min(1)
+    mine = closest("box", middle - axis, middle + axis)[:, 3]
+    assert (truth < 0.0).sum() > 20
+    assert (mine <= truth + 1e-9).all()
+    np.testing.assert_allclose(mine, truth, atol=1.5e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_distance_grows_along_its_normal_and_is_negative_inside(kind):
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(400, 3)) * 0.1
+    found = closest(kind, points, points)
+    step = 1e-5
+    moved = closest(kind, points + step * found[:, :3], points + step * found[:, :3])
+    smooth = (np.abs(found[:, 3]) < 0.01) if kind == "ellipsoid" else np.full(len(points), True)
+    np.testing.assert_allclose(
+        (moved[:, 3] - found[:, 3])[smooth] / step, 1.0, atol=0.1 if kind == "ellipsoid" else 1e-4
+    )
+    size = np.array(KINDS[kind][1])
+    if kind in ("box", "ellipsoid"):
+        inside = (np.abs(points) < size).all(1) if kind == "box" else ((points / size) ** 2).sum(1) < 1.0
+        assert ((found[:, 3] < 0.0) == inside).all()
+
+
+numbers = st.integers(-200, 200).map(lambda k: k / 1000.0)
+points = st.tuples(numbers, numbers, numbers)
+
+
+def true_distance(kind: str, p: np.ndarray) -> np.ndarray:
+    """Signed distance of points [n, 3], straight from the definition; the ellipsoid's only on and outside of it."""
+    size = np.array(KINDS[kind][1])
+    if kind == "sphere":
+        return np.linalg.norm(p, axis=1) - size[0]
+    if kind == "capsule":
+        return np.linalg.norm(p - np.clip(p[:, 2:], -size[1], size[1]) * [0, 0, 1], axis=1) - size[0]
+    if kind == "box":
+        beyond = np.abs(p) - size
+        return np.where((beyond < 0).all(1), beyond.max(1), np.linalg.norm(np.maximum(beyond, 0), axis=1))
+    across, along = np.hypot(p[:, 0], p[:, 1]) - size[0], np.abs(p[:, 2]) - size[1]
+    inside = (across < 0) & (along < 0)
+    return np.where(inside, np.maximum(across, along), np.hypot(np.maximum(across, 0), np.maximum(along, 0)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(kind=st.sampled_from(["sphere", "capsule", "cylinder", "box"]), start=points, end=points)
+def test_distance_of_a_segment_is_the_least_of_its_points(kind, start, end):
+    a, b = np.array(start, float), np.array(end, float)
+    along = np.linspace(0.0, 1.0, 2001)[:, None]
+    truth = true_distance(kind, a + along * (b - a)).min()
+    step = np.linalg.norm(b - a) / 2000
+    mine = closest(kind, a[None], b[None])[0]
+    assert truth - step - 1e-9 <= mine[3] <= truth + 1e-9 or mine[3] == pytest.approx(truth, abs=step + 1e-9)
+    assert np.linalg.norm(mine[:3]) == pytest.approx(1.0, abs=1e-9)
+
+
+@settings(max_examples=100, deadline=None)
+@given(start=points, end=points)
+def test_distance_of_a_segment_and_an_ellipsoid_has_its_sign_and_is_close_near_it(start, end):
+    size = np.array(KINDS["ellipsoid"][1])
+    a, b = np.array(start, float), np.array(end, float)
+    p = a + np.linspace(0.0, 1.0, 2001)[:, None] * (b - a)
+    mine = closest("ellipsoid", a[None], b[None])[0]
+    depth = (np.linalg.norm(p / size, axis=1) - 1.0).min()
+    if abs(depth) > 2e-3:
+        assert np.sign(mine[3]) == np.sign(depth)
+    if 0.0 < mine[3] < 0.01:  # the way to the surface along its normal
+        polar, around = np.meshgrid(np.linspace(0, np.pi, 181), np.linspace(0, 2 * np.pi, 361))
+        sphere = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
+        surface = (size * sphere).reshape(-1, 3)
+        nearest = min(np.linalg.norm(surface - x, axis=1).min() for x in p[::20])
+        assert mine[3] == pytest.approx(nearest, abs=0.003)
+
+
+@wp.kernel
+def _crossing(
+    # in
+    a: wp.array(dtype=wp.vec3d),
+    b: wp.array(dtype=wp.vec3d),
+    c: wp.array(dtype=wp.vec3d),
+    d: wp.array(dtype=wp.vec3d),
+    # out
+    found_out: wp.array(dtype=solver.vec6d),
+):
+    """Normal, distance and places where two segments are closest."""
+    i = wp.tid()
+    found_out[i] = solver.crossing(a[i], b[i], c[i], d[i])
+
+
+@settings(max_examples=150, deadline=None)
+@given(a=points, b=points, c=points, d=points)
+def test_distance_of_two_segments_is_the_least_of_their_points(a, b, c, d):
+    ends = [np.array([x], float) for x in (a, b, c, d)]
+    found = wp.zeros(1, dtype=solver.vec6d, device="cpu")
+    wp.launch(
+        _crossing, 1, inputs=[wp.array(x, dtype=wp.vec3d, device="cpu") for x in ends], outputs=[found], device="cpu"
+    )
+    mine = found.numpy()[0]
+    t = np.linspace(0.0, 1.0, 301)[:, None]
+    one, other = (x + t * (y - x) for x, y in (ends[:2], ends[2:]))
+    truth = np.linalg.norm(one[:, None] - other[None], axis=-1).min()
+    step = (np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(ends[3] - ends[2])) / 600
+    assert truth - step - 1e-7 <= mine[3] <= truth + 1e-7
+    assert np.linalg.norm(mine[:3]) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_segment_along_a_face_touches_in_its_middle():
+    start, end = np.array([[0.06, 0.0, -0.04]]), np.array([[0.06, 0.0, 0.04]])
+
+    assert closest("box", start, end)[0] == pytest.approx([1.0, 0.0, 0.0, 0.01])
+
+
+def test_spheres_of_a_bunch_fill_its_spheroid_and_no_more():
+    model, body, _ = bunch_scene()
+    shapes = shapes_of(model)
+    of = (shapes.bunch == 0) & (model.body_organ[shapes.body] == Organ.BUNCH)
+    assert (shapes.body[of] == body).all()
+    assert (np.diff(shapes.body) >= 0).all()
+    x, r = shapes.start[of, 0], shapes.radius[of]
+    assert (x - r).min() == pytest.approx(0.0, abs=1e-6)
+    assert (x + r).max() == pytest.approx(0.17, abs=1e-6)
+    assert r.max() == pytest.approx(0.045)
+    angle = np.linspace(0, np.pi, 181)
+    for center, radius in zip(x, r, strict=True):
+        along, across = (center - 0.085 + radius * np.cos(angle)) / 0.085, radius * np.sin(angle) / 0.045
+        assert (along**2 + across**2).max() < 1.0 + 1e-5
+
+
+def rows_of_canes(count: int = 40):
+    return assemble([cane((2.0 * (i % 8), 1.0 * (i // 8), 1.0), radius=0.005) for i in range(count)])
+
+
+def test_only_what_is_reached_wakes_and_it_moves_in_the_same_tick():
+    model = rows_of_canes()
+    physics = Physics(model)
+    physics.step()
+    assert len(physics.plants.awake) == 0
+    physics.add_robot(bar((0.7, -0.06, 0.95)))
+    drive = physics.rigid._robots["bar"].v
+    physics.rigid.data.qvel[drive] = 3.0
+    before = physics.state.joint_q.copy()
+    reached = None
+    for _ in range(3):
+        physics.step()
+        if physics.contacts:
+            reached = physics.tick
+            break
+    assert reached is not None
+    assert physics.plants.awake.tolist() == [0]
+    assert physics.touched == ((0, "bar"),)
+    moved = np.abs(physics.state.joint_q - before).max(1) > 0
+    assert moved[: model.tree_size[0]].any()
+    assert not moved[model.tree_size[0] :].any()
+    deepest = min(c.distance for c in physics.contacts)
+    assert deepest > 0.0  # seen before it was there: nothing was late
+    _, _, _, contact_effort = physics.rigid.read("bar")
+    assert contact_effort[0] == pytest.approx(sum(c.force[1] for c in physics.contacts), rel=1e-6)
+
+
+def test_fast_bar_wakes_every_cane_before_it_overlaps_one():
+    physics = Physics(assemble([cane((0.0, 0.3 * i, 1.0), radius=0.005) for i in range(6)]))
+    physics.add_robot(bar((0.7, -0.2, 0.95), damping=2000.0))
+    physics.rigid.data.qvel[physics.rigid._robots["bar"].v] = 5.0
+    physics.rigid.command("bar", np.zeros(1), np.array([5.0]))
+    first = {}
+    for _ in range(40):
+        asleep = set(range(6)) - set(physics.plants.awake.tolist())
+        physics.step()
+        for c in physics.contacts:
+            tree = int(physics.model.body_tree[c.body])
+            if tree not in first:
+                first[tree] = (c.distance, tree in asleep)
+    assert set(first) == set(range(6))
+    assert min(gap for gap, asleep in first.values() if asleep) > 0.0
+    assert min(gap for gap, _ in first.values()) > -2e-3  # 5 cm come between two ticks
+
+
+def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
+    tree = cane((0.0, 0.0, 0.12), radius=0.005)
+    box = {"box_pose": [[0.5, -0.22, 0.001, 0, 0, 0, 1]], "box_size": [[0.6, 0.4, 0.3]], "box_mass": [[2.0]]}
+    physics = Physics(assemble([tree], **box))
+    for _ in range(50):
+        physics.step()
+    physics.plants.rest(physics.plants.awake)
+    for _ in range(20):
+        physics.step()
+    assert len(physics.plants.awake) == 0
+    physics.rigid.data.joint("box/0").qvel[1] = 1.0
+    touched = set()
+    for _ in range(30):
+        physics.step()
+        touched.update(physics.touched)
+    assert touched == {(0, "box/0")}
+
+
+def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
+    model, _, middle = bunch_scene()
+    physics = Physics(model)
+    physics.touching = Touching(model, physics.plants, physics.rigid, capacity=2)
+    physics.add_robot(gripper(middle))
+    stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+    for tick in range(250):
+        physics.rigid.command("grip", grasp(0.01 * tick)[0])
+        for stage in stages:
+            stage()
+        physics._commit()
+        physics._finish()
+        assert physics.touching.count <= 2
+    assert physics.touching.dropped > 0
+    assert "left out" in physics.touching.complaint
+    assert "capacity" in physics.touching.complaint
+    assert len(physics.contacts) == 2
+
+
+def test_nothing_touches_a_bunch_that_was_picked():
+    model, _, middle = bunch_scene()
+    physics = Physics(model)
+    physics.add_robot(gripper(middle))
+    physics.state.bunch_attached[0] = False
+    for tick in range(120):
+        physics.rigid.command("grip", grasp(0.01 * tick)[0])
+        physics.step()
+    assert physics.touching.count == 0
+
+
+def test_a_robot_that_joins_does_not_shake_a_grasp():
+    model, body, middle = bunch_scene()
+    runs = []
+    for join in (False, True):
+        physics = Physics(model)
+        physics.add_robot(gripper(middle))
+        for tick in range(300):
+            physics.rigid.command("grip", grasp(0.01 * tick)[0])
+            if join and tick == 200:
+                physics.add_robot(bar((0.0, 5.0, 0.5)))
+            if join and tick == 250:
+                physics.remove_robot("bar")
+            physics.step()
+        runs.append(physics.view().body_q[body])
+    np.testing.assert_allclose(runs[0], runs[1], atol=1e-6)
+
+
+def test_islands_do_not_feel_each_other():
+    """Two canes, each pushed by a bar of its own: pushed in one scene or in two, they end in the same place."""
+    both = [cane((0.0, 3.0 * i, 1.0), radius=0.005) for i in range(2)]
+    ends = []
+    for which in ((0, 1), (0,), (1,)):
+        physics = Physics(assemble([both[i] for i in which]))
+        for i in which:
+            physics.add_robot(bar((0.7, 3.0 * i - 0.06, 0.95), f"bar{i}", damping=300.0))
+        islands = 0
+        for _ in range(60):
+            for i in which:
+                physics.rigid.command(f"bar{i}", np.zeros(1), np.array([0.5]))
+            physics.step()
+            islands = max(islands, physics.touching.islands)
+        assert islands == len(which)
+        ends.append(physics.state.joint_q.copy())
+    np.testing.assert_allclose(ends[0], np.concatenate(ends[1:]), atol=1e-5)
+
+
+def test_contacts_come_sorted_and_name_who_touches_what():
+    model, body, middle = bunch_scene()
+    physics = Physics(model)
+    physics.add_robot(gripper(middle, "grip"))
+    for tick in range(250):
+        physics.rigid.command("grip", grasp(0.01 * tick)[0])
+        physics.step()
+    contacts = physics.contacts
+    assert {c.link for c in contacts} == {"left", "right"}
+    assert all(c.actor == "grip" and c.body == body for c in contacts)
+    assert [c.body for c in contacts] == sorted(c.body for c in contacts)
+    left = next(c for c in contacts if c.link == "left")
+    assert left.force[1] > 10.0  # the bunch pushes the left finger out
+    assert left.distance < 0.0
+    assert left.position[1] > middle[1]
+
+
+def test_views_own_what_they_show_and_share_it_while_all_sleep():
+    model, _, middle = bunch_scene()
+    physics = Physics(model)
+    physics.step()
+    first = physics.view()
+    physics.step()
+    assert physics.view().body_q is first.body_q
+    physics.plants.wake(0)
+    physics.state.joint_qd[5, 1] = 1.0
+    physics.step()
+    second = physics.view()
+    kept = second.body_q.copy()
+    assert second.moved.tolist() == [0]
+    assert (second.body_q != first.body_q).any()
+    np.testing.assert_allclose(second.body_q, model.forward(physics.state.joint_q), atol=1e-5)
+    physics.step()
+    physics.view()
+    assert (second.body_q == kept).all()
+    physics.add_robot(gripper(middle))
+    assert len(physics.view().links) == len(physics.view().link_q) == 2
+    assert physics.view().links is physics.view().links
+
+
+def test_rigid_groups_join_what_a_constraint_couples():
+    rigid = Rigid(rows_of_canes(1))
+    rigid.add_robot(bar((0.0, 0.0, 0.5), "a"))
+    rigid.add_robot(bar((0.0, 0.055, 0.5), "b"))
+    rigid.prep()
+    world = rigid.world
+    a, b = (int(rigid.group[world.body_treeid[world.geom_bodyid[g]]]) for g in rigid.geoms.id)
+    assert rigid.data.ncon > 0
+    assert a == b
+
+
+def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
+    physics = Physics(rows_of_canes(3))
+    assert [name.split(":")[0] for name, _ in physics.stages] == [
+        "wind", "holding", "rigid", "touching", "detail", "plants", "touching", "plants", "rigid", "guard", "parting",
+        "holding", "sleep",
+    ]  # fmt: skip
+    physics.plants.wake(1)
+    physics.state.joint_qd[physics.model.bodies_of(1).start, 1] = 0.5
+    for _ in range(3000):
+        physics.step()
+        if len(physics.plants.awake) == 0:
+            break
+    assert len(physics.plants.awake) == 0
+    assert physics.time == pytest.approx(0.01 * physics.tick)
+
+
+def test_a_tree_that_a_robot_reaches_into_stays_awake():
+    physics = Physics(rows_of_canes(3))
+    physics.add_robot(bar((0.7, -0.034, 0.95), stiffness=1000.0, damping=100.0))
+    for _ in range(400):
+        physics.step()
+    assert physics.touching.near.tolist() == [0]
+    assert physics.plants.awake.tolist() == [0]
+
+
+def test_a_copy_touches_only_trees_of_which_its_owner_tells():
+    physics = Physics(rows_of_canes())
+    reached = int(physics.model.tree_first[20])
+    at = physics.state.body_q[reached + 5, :3].copy()
+    physics.add_robot(bar(at, "ghost"))
+    physics.touching.copies.add("ghost")
+    asleep = physics.state.joint_q.copy()
+    for _ in range(5):
+        physics.step()
+    assert physics.contacts == ()
+    assert len(physics.plants.awake) == 0
+    assert np.array_equal(physics.state.joint_q, asleep)
+
+    physics.touching.told[20] = True
+    physics.step()
+    assert {tree for tree, _ in physics.touched} == {20}
+
+
+# ---------------------------------------------------------------------- what stands, branches, clusters
+
+
+POLE = {"fixed_radius": [[0.03, 0.03]], "fixed_organ": [int(Organ.POLE)], "fixed_index": [0]}
+
+
+def test_what_stands_neither_wakes_a_tree_nor_keeps_it_awake():
+    model = assemble([cane((0.0, 0.0, 0.01))], fixed_start=[[0.5, 0.04, 0.0]], fixed_end=[[0.5, 0.04, 2.0]], **POLE)
+    physics = Physics(model)
+    for _ in range(20):
+        physics.step()
+    assert len(physics.plants.awake) == 0
+    physics.plants.wake(0)
+    for _ in range(60):
+        physics.step()
+    assert len(physics.plants.awake) == 0
+    assert physics.touching.near.tolist() == []
+
+
+def test_a_swinging_cane_stops_at_a_pole():
+    model = assemble([cane((0.0, 0.0, 1.0))], fixed_start=[[0.8, 0.1, 0.0]], fixed_end=[[0.8, 0.1, 2.0]], **POLE)
+    furthest = {}
+    for standing in (True, False):
+        physics = Physics(model if standing else assemble([cane((0.0, 0.0, 1.0))]))
+        physics.plants.wake(0)
+        physics.state.joint_qd[:4, 2] = 3.0
+        furthest[standing] = 0.0
+        met = set()
+        for _ in range(40):
+            physics.step()
+            met |= {(c.actor, c.link) for c in physics.contacts}
+            furthest[standing] = max(furthest[standing], float(physics.view().body_q[12, 1]))
+        assert met == ({("world", "fixed/0")} if standing else set())
+    assert furthest[False] > 0.12
+    assert furthest[True] < 0.08
+
+
+def clustered() -> Model:
+    """A cane with a bunch of two clusters at its tip."""
+    tree = Tree(frames.pose(np.array([0.0, 0.0, 1.0])))
+    last = tree.rod(-1, 0.4, (0.006, 0.006), Wood(5e9, 800.0, 0.02), 4)[-1]
+    down = frames.aligned(np.array([0.0, 0.0, -1.0]))
+    bunch = tree.add(
+        last, offset=(0.1, 0, 0), rest=down, organ=int(Organ.BUNCH), mass=0.3, com=(0.08, 0, 0), length=0.16,
+        radius=(0.04, 0.04), inertia=(3e-4, 8e-4, 8e-4), stiffness=np.full(3, 0.3), damping=np.full(3, 0.02),
+    )  # fmt: skip
+    parts = [
+        tree.add(
+            bunch, offset=(0.02 + 0.07 * i, 0, 0), organ=int(Organ.BUNCH), mass=0.14, com=(0.035, 0, 0), length=0.07,
+            radius=(0.03, 0.03), inertia=(1e-4, 1e-4, 1e-4), stiffness=np.full(3, 0.1), damping=np.full(3, 0.01),
+        )
+        for i in range(2)
+    ]  # fmt: skip
+    tree.bunches.append({"body": bunch, "length": 0.16, "radius": 0.04, "berries": 60})
+    model = assemble([tree])
+    model.tree_core[0] -= len(parts)
+    model.bunch_cluster[0], model.bunch_clusters[0] = parts[0], len(parts)
+    model.bunch_head_mass[0], model.bunch_head_com[0], model.bunch_head_inertia[0] = 0.02, (0.01, 0, 0), (1e-5,) * 3
+    whole = 0.02 * 0.01 + 0.14 * (0.055 + 0.125)
+    model.bunch_head_com[0] = (0.01, 0.0, 0.0)
+    model.body_com[bunch] = (whole / 0.3, 0.0, 0.0)
+    return model
+
+
+def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fine():
+    model = clustered()
+    shapes, bunch = shapes_of(model), int(model.bunch_body[0])
+    assert (shapes.bunch == 0).sum() == (shapes.when > 0).sum()
+    assert set(shapes.body[shapes.when == 1]) == {bunch}
+    assert set(shapes.body[shapes.when == 2]) == {bunch + 1, bunch + 2}
+    assert (np.diff(shapes.body) >= 0).all()
+    met = {}
+    for fine in (False, True):
+        physics = Physics(model)
+        if fine:
+            physics.plants.refine(0)
+        at = physics.state.body_q[bunch, :3] + np.array([0.0, -0.075, -0.06])
+        physics.add_robot(bar(at, damping=200.0))
+        physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
+        seen = set()
+        stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+        for _ in range(40):
+            for stage in stages:
+                stage()
+            seen |= {c.body for c in physics.contacts}
+            physics._commit()
+            physics._finish()
+        met[fine] = seen
+    assert bunch in met[False]
+    assert met[False].isdisjoint({bunch + 1, bunch + 2})
+    assert met[True] & {bunch + 1, bunch + 2}
+    assert bunch not in met[True]
+
+
+# ---------------------------------------------------------------------- laws of every contact, in scenes by chance
+
+
+def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
+    """A few canes about the origin and two bodies that fly among them."""
+    rng = np.random.default_rng(seed)
+    trees = [
+        cane(
+            (rng.uniform(-0.2, 0.2), 0.15 * i, rng.uniform(0.8, 1.2)), radius=float(rng.uniform(0.003, 0.008)),
+            beta=float(rng.uniform(0.0, 0.03)), heading=float(rng.uniform(-0.5, 0.5)),
+            bunch=float(rng.choice([0.0, 0.4])),
+        )
+        for i in range(4)
+    ]  # fmt: skip
+    physics = Physics(assemble(trees), picking=False)
+    if options:
+        Touching.__init__(physics.touching, physics.model, physics.plants, physics.rigid, **options)
+    physics.add_robot(bar((rng.uniform(0.3, 0.9), -0.2, 1.0), damping=float(rng.choice([0.0, 300.0]))))
+    physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
+    speed = rng.uniform(0.3, 3.0)
+    physics.rigid.command("bar", np.zeros(1), np.array([speed]))
+    physics.rigid.data.qvel[physics.rigid._robots["bar"].v] = speed
+    physics.rigid.push("probe", "rod", np.array([0.0, 0.0, -rng.uniform(2.0, 30.0)]))
+    return physics, ["bar", "probe"]
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**31))
+def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed):
+    physics, robots = scene_by_chance(seed)
+    touching, rigid = physics.touching, physics.rigid
+    pressed = 0
+    for _ in range(60):
+        physics.step()
+        n = touching.count
+        if n == 0:
+            continue
+        pressed += 1
+        impulse = touching._impulse[: 3 * n].reshape(n, 3)
+        assert (impulse[:, 0] >= 0.0).all()
+        rub = np.linalg.norm(impulse[:, 1:], axis=1)
+        assert (rub <= touching._friction[:n] * impulse[:, 0] * (1.0 + 1e-9) + 1e-15).all()
+        # what plants feel, summed over bodies; what others feel, contact by contact
+        outside = [c for c in physics.contacts if c.actor != "plants"]
+        np.testing.assert_allclose(
+            touching.wrenches[:, :3].sum(0), -sum((c.force for c in outside), np.zeros(3)), atol=1e-9
+        )
+        for name in robots:
+            base = rigid._robots[name].base_v[:2]
+            on_robot = sum((c.force for c in outside if c.actor == name), np.zeros(3))
+            np.testing.assert_allclose(touching.force[base], on_robot[:2], atol=1e-9)
+    assume(pressed > 0)
+    assert np.isfinite(physics.state.joint_qd).all()
+
+
+def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axis: np.ndarray) -> np.ndarray:
+    """Least distance [tree] of the shapes of each tree and a capsule on a robot's link, from many points of both."""
+    touching, model = physics.touching, physics.model
+    body_q = model.forward(physics.state.joint_q)[touching.shapes.body]
+    t = np.linspace(0.0, 1.0, 9)[:, None, None]
+    along = touching.shapes.start + t * (touching.shapes.end - touching.shapes.start)
+    points = body_q[:, :3] + frames.rotate(body_q[:, 3:], along.astype(float))
+    pose = physics.rigid.link_pose(name, link)
+    turn = frames.rotate(pose[3:], axis)
+    apart = points - pose[:3]
+    apart -= np.clip(apart @ turn, -half, half)[..., None] * turn
+    gap = (np.linalg.norm(apart, axis=-1) - touching.shapes.radius - radius).min(0)
+    least = np.full(len(model.tree_first), np.inf)
+    np.minimum.at(least, model.body_tree[touching.shapes.body], gap)
+    return least
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**31))
+def test_waking_is_never_late(seed):
+    """However a bar flies through a vineyard, at the end of every tick it touches no tree that sleeps."""
+    rng = np.random.default_rng(seed)
+    model = assemble([cane((1.2 * (i % 3), 0.25 * (i // 3), 1.0), radius=0.005) for i in range(24)])
+    physics = Physics(model)
+    physics.add_robot(bar((rng.uniform(0.0, 3.0), rng.uniform(-1.0, 1.0), rng.uniform(0.8, 1.2)), damping=2000.0))
+    speed, woken, touched = 0.0, set(), set()
+    for tick in range(120):
+        if tick % 20 == 0:
+            speed = float(rng.uniform(-5.0, 5.0))
+            physics.rigid.drive_base("bar", (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), rng.uniform(-2.0, 2.0)))
+        physics.rigid.command("bar", np.zeros(1), np.array([speed]))
+        asleep = ~physics.state.tree_awake.copy()
+        physics.step()
+        still = asleep & ~physics.state.tree_awake
+        gap = gaps(physics, "bar", "bar", 0.03, 0.3, np.array([0.0, 0.0, 1.0]))
+        assert gap[still].min(initial=np.inf) > 0.0
+        touched |= set(np.flatnonzero(gap < 0.0).tolist())
+        woken |= set(physics.plants.awake.tolist())
+    assume(touched)
+    assert touched <= woken
+
+
+def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
+    """Many canes in one place about one bar: what is left out is said in words, twice the same."""
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, heading=4e-5 * i) for i in range(460)])
+
+    def run() -> tuple:
+        physics = Physics(model)
+        Touching.__init__(physics.touching, model, physics.plants, physics.rigid, capacity=100, branches=False)
+        for i in range(15):
+            physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
+        physics.plants.wake(np.arange(460))
+        for stage in (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve):
+            stage()
+        t = physics.touching
+        return t.count, t.dropped, t.complaint, t._gap[:100].copy(), t.bodies.tobytes() + t.wrenches.tobytes(), t
+
+    count, dropped, complaint, gap, result, touching = run()
+    assert count == 100
+    assert count + dropped > 10_000
+    assert f"{dropped} of {count + dropped} contacts" in complaint
+    seen = np.flatnonzero(touching._slot < touching._found[:460, None])
+    everything = np.sort(touching._hit_gap[:460].ravel()[seen])
+    np.testing.assert_array_equal(np.sort(gap), everything[:100])
+    assert run()[4] == result

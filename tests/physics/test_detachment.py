@@ -1,0 +1,341 @@
+"""From vine to hand: momentum, the grasp, the fall, and a peduncle that parts when pulled too hard."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import DOWN, bar, bunch_scene, cane, grasp, gripper
+from vinesim import frames
+from vinesim.physics.step import Physics
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.values import Parting
+
+
+def momentum(physics: Physics, name: str) -> np.ndarray:
+    """Linear momentum [3] of one free body of the rigid world, kg m/s."""
+    world, data = physics.rigid.world, physics.rigid.data
+    mujoco.mj_fwdPosition(world, data)
+    mujoco.mj_comVel(world, data)
+    velocity, body = np.zeros(6), data.body(name).id
+    mujoco.mj_objectVelocity(world, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+    lever = data.xipos[body] - data.xpos[body]
+    return world.body_mass[body] * (velocity[3:] + np.cross(velocity[:3], lever))
+
+
+def test_a_cut_bunch_keeps_its_momentum_and_falls():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    physics.plants.wake(0)
+    physics.state.joint_qd[body] = 0.3, -1.0, 2.0
+    physics.state.joint_qd[4] = 0.0, 0.5, 0.3
+    for _ in range(7):
+        physics.step()
+    physics.plants.kinematics()
+    pose, velocity = physics.state.body_q[body].astype(float), physics.state.body_qd[body].astype(float)
+    com = frames.rotate(pose[3:], model.body_com[body].astype(float))
+    before = 0.5 * (velocity[:3] + np.cross(velocity[3:], com))
+    physics.pick(0)
+    np.testing.assert_allclose(momentum(physics, "loose/0"), before, atol=1e-6)
+    assert np.linalg.norm(before) > 0.01
+    view = physics.view()
+    assert not view.bunch_attached[0]
+    assert [(link.name, link.organ, link.index) for link in view.links] == [("bunch/0", Organ.BUNCH, 0)]
+    np.testing.assert_allclose(view.link_q[0], view.body_q[body], atol=1e-5)
+    height = view.link_q[0, 2]
+    for _ in range(300):
+        physics.step()
+    assert physics.view().link_q[0, 2] < height - 1.0
+    assert physics.view().link_q[0, 2] > 0.0
+    with pytest.raises(ValueError, match="picked already"):
+        physics.pick(0)
+
+
+def test_the_vine_springs_up_without_its_bunch():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    tip = body - 3
+    low = physics.view().body_q[tip, 2]
+    physics.pick(0)
+    for _ in range(1500):
+        physics.step()
+    assert physics.view().body_q[tip, 2] > low + 0.05
+    assert np.isfinite(physics.view().body_q).all()
+
+
+def detached_in_the_grasp() -> tuple[Physics, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Grasp, lift, let the shears take it: bunch in the hand, finger forces of each later tick, what was before."""
+    model, _, middle = bunch_scene()
+    physics = Physics(model)
+    physics.add_robot(gripper(middle))
+    for tick in range(290):
+        physics.rigid.command("grip", grasp(0.01 * tick)[0])
+        physics.step()
+    squeeze = physics.rigid.read("grip")[3][2:].copy()
+    start = physics.rigid.link_pose("grip", "hand")[2]
+    physics.pick(0)
+    seen = []
+    for _ in range(200):
+        physics.step()
+        hand = physics.rigid.link_pose("grip", "hand")[:3]
+        seen.append([*(physics.rigid.bunch_pose(0)[:3] - hand), *physics.rigid.read("grip")[3][2:]])
+    return physics, np.array(seen)[:, :3], np.array(seen)[:, 3:], squeeze, start
+
+
+def test_a_bunch_cut_in_the_grasp_stays_in_it():
+    physics, place, fingers, squeeze, start = detached_in_the_grasp()
+    assert np.abs(fingers / squeeze - 1.0).max() < 0.015  # in every tick of 2 s
+    assert np.abs(place - place[0]).max() < 5e-5
+    # the lift now carries the bunch's weight, which its peduncle no longer does
+    assert physics.rigid.read("grip")[3][1] == pytest.approx(-0.5 * 9.81, rel=0.02)
+    assert start == pytest.approx(physics.rigid.link_pose("grip", "hand")[2], abs=3e-3)
+    assert not physics.plants.state.bunch_attached[0]
+
+
+def test_twice_the_same_bits():
+    data = [detached_in_the_grasp()[0].rigid.data for _ in range(2)]
+    assert data[0].qpos.tobytes() + data[0].qvel.tobytes() == data[1].qpos.tobytes() + data[1].qvel.tobytes()
+
+
+def pulled(pull: float, bend: float, ticks: int = 400) -> tuple[Physics, tuple[Parting, ...], np.ndarray]:
+    """A gripper closes on a bunch and goes down and down: the partings, and the peduncle's wrench tick by tick."""
+    model, _, middle = bunch_scene()
+    model.bunch_pull[0], model.bunch_bend[0] = pull, bend
+    physics = Physics(model)
+    physics.add_robot(gripper(middle, effort=80.0))
+    wrenches: list[np.ndarray] = []
+    for tick in range(ticks):
+        target, _ = grasp(0.01 * min(tick, 130))
+        target[1] = -0.002 * max(tick - 150, 0)
+        if pull > 1e3:  # turn it aside rather than pull
+            target[:2] = 0.002 * max(tick - 150, 0), 0.0
+        physics.rigid.command("grip", target)
+        physics.step()
+        wrenches.append(physics.plants.joint_wrench(model.bunch_body)[0])
+        if physics.partings:
+            break
+    return physics, physics.partings, np.array(wrenches)
+
+
+def test_a_peduncle_parts_when_it_is_pulled_harder_than_it_holds():
+    physics, partings, wrenches = pulled(12.0, 1e3)
+    (parting,) = partings
+    force = np.linalg.norm(wrenches[:, :3], axis=1)
+    assert len(force) > 155
+    assert force[-3:-1].min() > 12.0  # the third tick too strong, after which it hangs no more
+    assert force[:150].max() < 12.0
+    assert (parting.bunch, parting.cause, parting.actor) == (0, "pull", "grip")
+    assert (parting.tick, parting.body) == (physics.tick, physics.model.bunch_body[0])
+    assert np.linalg.norm(parting.force) > 12.0
+    assert parting.force[2] > 10.0  # what the vine held on with, upwards
+    assert physics.rigid.loose == (0,)
+
+
+def test_a_peduncle_breaks_when_it_is_bent_further_than_it_gives():
+    _, (parting,), wrenches = pulled(1e4, 0.05)
+    moment = np.linalg.norm(wrenches[:, 3:], axis=1)
+    assert (parting.bunch, parting.cause, parting.actor) == (0, "bend", "grip")
+    assert np.linalg.norm(parting.moment) > 0.05
+    assert moment[-3:-1].min() > 0.05
+
+
+def test_nothing_parts_without_strain():
+    physics, partings, _ = pulled(1e5, 1e5, 200)
+    assert partings == ()
+    assert physics.rigid.loose == ()
+
+
+def test_a_command_is_told_with_the_weight_the_stalk_carried():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    physics.pick(0)
+    assert physics.partings == ()
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.tree, parting.body, parting.bunch, parting.cause, parting.actor) == (0, body, 0, "command", "")
+    np.testing.assert_allclose(parting.force, [0.0, 0.0, 0.5 * 9.81], atol=1e-4)
+    physics.step()
+    assert physics.partings == ()
+    with pytest.raises(ValueError, match="no bunch 7"):
+        physics.pick(7)
+
+
+def test_a_blade_that_closes_on_the_stalk_takes_the_bunch():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    stalk = physics.view().body_q[body - 1, :3]
+    physics.add_robot(bar(stalk + np.array([0.0, -0.5, -0.2])))
+    mouth = physics.blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.18])), np.array([0.03, 0.03, 0.002]))
+    physics.step()
+    assert physics.partings == ()
+    mouth.close()
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.bunch, parting.body, parting.cause, parting.actor) == (0, body, "blade", "bar")
+    assert parting.force[2] == pytest.approx(0.5 * 9.81, rel=0.05)
+    mouth.close()  # on the stub of the stalk: nothing is left to cut
+    physics.step()
+    assert physics.partings == ()
+    with pytest.raises(ValueError, match="no link 'hand'"):
+        physics.blade("bar", "hand", mouth.pose, mouth.half)
+    physics.remove_robot("bar")
+    assert physics.parting.blades == []
+
+
+def test_a_blade_beside_the_stalk_cuts_nothing():
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    stalk = physics.view().body_q[body - 1, :3]
+    physics.add_robot(bar(stalk + np.array([0.0, -0.5, -0.2])))
+    for offset in ([0.05, 0.5, 0.18], [0.0, 0.54, 0.18], [0.0, 0.5, 0.12]):
+        mouth = physics.blade("bar", "bar", frames.pose(np.array(offset)), np.array([0.03, 0.03, 0.002]))
+        mouth.close()
+        physics.step()
+        assert physics.partings == (), offset
+
+
+def test_a_bunch_dropped_over_a_crate_ends_in_it():
+    tree = cane((0.0, 0.0, 0.9), bunch=0.5)
+    box = {"box_pose": [[1.0, 0.0, 0.001, 0, 0, 0, 1]], "box_size": [[0.6, 0.4, 0.3]], "box_mass": [[2.0]]}
+    model = assemble([tree], **box)
+    physics = Physics(model)
+    for _ in range(20):
+        physics.step()
+    physics.pick(0)
+    for _ in range(400):
+        physics.step()
+    links = {link.name: pose for link, pose in zip(physics.rigid.links(), physics.rigid.link_q(), strict=True)}
+    bunch, crate = links["bunch/0"], links["box/0"]
+    assert 0.0 < bunch[2] - crate[2] < 0.25
+    assert np.abs(bunch[:2] - crate[:2]).max() < 0.3
+    assert np.abs(physics.rigid.data.qvel).max() < 0.1
+
+
+def laden(clusters: bool = True, side: bool = True) -> Tree:
+    """A cane of 1 m with a bunch half way along, and a side shoot behind it that carries another."""
+    tree = Tree(frames.pose(np.array([0.0, 0.0, 1.6])))
+    wood, green = Wood(5e9, 900.0, 0.01), Wood(3e8, 1000.0, 0.05)
+    main = tree.rod(-1, 1.0, (0.006, 0.004), wood, 10)
+    for at in (main[4], main[8]) if side else (main[4],):
+        stalk = tree.rod(at, 0.06, (0.0022, 0.0022), green, 2, organ=Organ.PEDUNCLE, rest=DOWN)
+        tree.bunch(stalk[-1], 0.5, count=80, seed=3, clusters=clusters)
+    tree.settle()
+    return tree
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_a_cut_cane_falls_and_takes_its_bunch_along(fine):
+    model = assemble([laden()])
+    physics = Physics(model)
+    if fine:
+        physics.plants.wake(0)
+        physics.watch(model.forward(model.joint_settled)[model.bunch_body, :3], 0.1)
+    for _ in range(5):
+        physics.step()
+    assert physics.state.tree_fine[0] == fine
+    below = [6, 7, 8, 9, *range(13, 16), *range(int(model.bunch_cluster[1]), len(model.body_mass))]
+    moving = below if fine else below[:7]
+    before = physics.view().body_q.copy()
+    weight = 9.81 * physics.plants.body_mass[moving].sum()
+    physics.cut(6)
+    for _ in range(20):
+        physics.step()
+        if physics.partings:
+            (parting,) = physics.partings
+    assert (parting.body, parting.bunch, parting.cause) == (6, -1, "command")
+    assert parting.force[2] == pytest.approx(weight, rel=0.01)
+    fallen = (before - physics.view().body_q)[:, 2]
+    assert fallen[moving].mean() == pytest.approx(0.5 * 9.81 * 0.2**2, rel=0.1)
+    assert fallen[:5].max() < 1e-4  # and the rest springs up
+    assert physics.state.bunch_attached.all()
+    with pytest.raises(ValueError, match="cut already"):
+        physics.cut(6)
+    with pytest.raises(ValueError, match="no piece of wood"):
+        physics.cut(int(model.bunch_body[0]))
+
+
+def test_a_blade_cuts_the_piece_next_to_the_root_and_only_that():
+    """The mouth spans a joint of two pieces: one cut, which takes the further one along."""
+    model = assemble([laden()])
+    physics = Physics(model)
+    joint = physics.view().body_q[7, :3]
+    physics.add_robot(bar(joint + np.array([0.0, -0.5, -0.2])))
+    mouth = physics.blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.2])), np.array([0.03, 0.03, 0.03]))
+    mouth.close()
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.body, parting.bunch, parting.cause, parting.actor) == (6, -1, "blade", "bar")
+    assert physics.state.body_cut.tolist() == [body == 6 for body in range(len(model.body_mass))]
+
+
+def test_a_stalk_that_is_cut_by_command_lets_its_bunch_go():
+    model = assemble([laden()])
+    physics = Physics(model)
+    physics.cut(10)
+    physics.step()
+    (parting,) = physics.partings
+    assert (parting.body, parting.bunch) == (12, 0)
+    assert physics.rigid.loose == (0,)
+
+
+def test_a_fine_bunch_is_picked_as_the_compound_that_it_is():
+    """Its clusters swing; loose, it has their weight, middle and moments where they are, and their momentum."""
+    model = assemble([laden(side=False)])
+    physics = Physics(model)
+    parts = np.arange(model.bunch_cluster[0], model.bunch_cluster[0] + model.bunch_clusters[0])
+    everything = np.append(parts, model.bunch_body[0])
+    physics.watch(model.forward(model.joint_settled)[model.bunch_body, :3], 0.2)
+    physics.plants.wake(0)
+    physics.step()
+    physics.state.joint_qd[parts[0], 1] = 2.0
+    for _ in range(10):
+        physics.step()
+    assert physics.state.tree_fine[0]
+    q, qd = physics.view().body_q[everything].astype(float), physics.state.body_qd[everything].astype(float)
+    com = frames.rotate(q[:, 3:], physics.plants.body_com[everything].astype(float))
+    mass = physics.plants.body_mass[everything].astype(float)
+    middle = mass @ (q[:, :3] + com) / mass.sum()
+    before = mass @ (qd[:, :3] + np.cross(qd[:, 3:], com))
+    physics.pick(0)
+    world, data = physics.rigid.world, physics.rigid.data
+    after = momentum(physics, "loose/0")
+    body = world.body("loose/0").id
+    assert world.body_mass[body] == pytest.approx(0.5, rel=1e-6)
+    np.testing.assert_allclose(data.xipos[body], middle, atol=1e-6)
+    assert np.linalg.norm(before) > 0.02
+    # the clusters stop against their head within no time, and the stalk, which is still there then, feels it
+    np.testing.assert_allclose(after, before, atol=0.05 * np.linalg.norm(before))
+    shapes = physics.rigid.links()[0].shapes
+    assert len(shapes) == model.bunch_clusters[0]
+    for shape, part in zip(shapes, parts, strict=True):
+        at = frames.compose(physics.rigid.link_q()[0], shape.pose)[:3]
+        pose = physics.state.body_q[part].astype(float)
+        half = np.array([0.5 * model.body_length[part], 0.0, 0.0])
+        np.testing.assert_allclose(at, pose[:3] + frames.rotate(pose[3:], half), atol=1e-5)
+
+
+def test_a_fine_bunch_cut_in_the_grasp_stays_in_it():
+    """As the coarse one: its shapes go along as they are held."""
+    tree = laden(side=False)
+    model = assemble([tree])
+    pose = model.forward(model.joint_settled)[model.bunch_body[0]]
+    middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[0], 0.0, 0.0]))
+    physics = Physics(model)
+    physics.add_robot(gripper(middle))
+    for tick in range(290):
+        physics.rigid.command("grip", grasp(0.01 * tick)[0])
+        physics.step()
+    assert physics.state.tree_fine[0]
+    squeeze = physics.rigid.read("grip")[3][2:].copy()
+    physics.pick(0)
+    fingers, place = [], []
+    for _ in range(200):
+        physics.step()
+        fingers.append(physics.rigid.read("grip")[3][2:].copy())
+        place.append(physics.rigid.bunch_pose(0)[:3] - physics.rigid.link_pose("grip", "hand")[:3])
+
+    assert np.abs(np.array(fingers) / squeeze - 1.0).max() < 0.015
+    # two fingers of equal force let it wander between them, but it does not sink
+    assert np.abs(np.array(place)[:, 2] - place[0][2]).max() < 5e-5

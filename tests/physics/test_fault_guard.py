@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import functools
+import logging
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vinesim import frames
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.fault_guard import Guard
+from vinesim.physics.plants.sleep import Sleep
+from vinesim.scene import spec
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.state import State
+
+
+def row(count: int) -> Plants:
+    trees = []
+    for i in range(count):
+        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
+        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 6)
+        tree.settle()
+        trees.append(tree)
+    model = assemble(trees)
+    return Plants(model, State.at_rest(model))
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e9])
+def test_a_poisoned_tree_is_rolled_back_and_the_others_go_on(poison: float, caplog: pytest.LogCaptureFixture) -> None:
+    plants, clean = row(3), row(3)
+    guard = Guard(plants)
+    for each in (plants, clean):
+        each.wake(np.arange(3))
+        each.state.joint_qd[:, 1] = 0.3
+    for tick in range(30):
+        plants.free()
+        clean.free()
+        clean.commit()
+        if tick != 10:
+            plants.commit()
+            assert guard.check().size == 0
+            continue
+        before = plants.state.joint_q.copy()
+        plants.commit(np.array([8]), np.array([[poison, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+        assert guard.check().tolist() == [1]
+        assert not caplog.records
+    bad, good = plants.model.bodies_of(1), np.delete(np.arange(18), plants.model.bodies_of(1))
+    np.testing.assert_array_equal(plants.state.joint_q[bad], before[bad])
+    assert not plants.state.joint_qd[bad].any()
+    assert plants.awake.tolist() == [0, 2]
+    np.testing.assert_array_equal(plants.state.joint_q[good], clean.state.joint_q[good])
+    assert guard.count.tolist() == [0, 1, 0]
+    with caplog.at_level(logging.WARNING):
+        faults = guard.report()
+    assert [(fault.tick, fault.tree) for fault in faults] == [(11, 1)]
+    assert "tree 1 stopped in tick 11" in caplog.text
+    assert guard.report() == []
+
+
+def test_a_stopped_tree_wakes_sound() -> None:
+    plants = row(1)
+    guard = Guard(plants)
+    plants.wake(0)
+    plants.state.joint_q[3] = np.nan
+    plants.body_load[2, 1] = np.inf
+    plants.free()
+    plants.commit()
+    assert guard.check().tolist() == [0]
+    plants.wake(0)
+    for _ in range(20):
+        plants.free()
+        plants.commit()
+        assert guard.check().size == 0
+    assert np.isfinite(plants.state.body_q).all()
+    assert plants.tree_rate[0] < 0.1
+
+
+@functools.cache
+def clean_run(count: int) -> tuple[np.ndarray, ...]:
+    """Joints after each of forty ticks of a row in which nothing goes wrong."""
+    plants = row(count)
+    plants.wake(np.arange(count))
+    plants.state.joint_qd[:, 1] = 0.3
+    seen = []
+    for _ in range(40):
+        plants.free()
+        plants.commit()
+        seen.append(plants.state.joint_q.copy())
+    return tuple(seen)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    tick=st.integers(0, 30),
+    body=st.integers(7, 11),  # not the root: a force on what is clamped moves nothing
+    entry=st.integers(0, 2),
+    value_in=st.one_of(
+        st.tuples(st.sampled_from([np.nan, np.inf, -np.inf, 3e38]), st.sampled_from(["joint_q", "joint_qd", "wrench"])),
+        st.tuples(st.sampled_from([np.nan, np.inf, -np.inf]), st.just("body_load")),
+    ),
+)
+def test_no_bad_number_survives_a_tick(tick: int, body: int, entry: int, value_in: tuple[float, str]) -> None:
+    """Written anywhere, at any time: its tree sleeps, finite, reported, wakeable; the others are equal to the bit."""
+    value, what = value_in
+    plants = row(3)
+    guard = Guard(plants)
+    plants.wake(np.arange(3))
+    plants.state.joint_qd[:, 1] = 0.3
+    others = np.r_[0:6, 12:18]
+    for now in range(40):
+        wrench = None
+        if now == tick and what == "wrench":
+            wrench = np.zeros((1, 6))
+            wrench[0, entry] = value
+        elif now == tick:
+            array = plants.body_load if what == "body_load" else getattr(plants.state, what)
+            array[body, entry] = value
+        plants.free()
+        plants.commit(None if wrench is None else np.array([body]), wrench)
+        stopped = guard.check()
+        assert stopped.tolist() == ([1] if now == tick else [])
+        everything_is_finite(plants)
+        np.testing.assert_array_equal(plants.state.joint_q[others], clean_run(3)[now][others])
+        if now == tick:
+            assert plants.awake.tolist() == [0, 2]
+        if now == tick + 1:
+            plants.wake(1)
+    assert [fault.tree for fault in guard.report()] == [1]
+    assert plants.awake.tolist() == [0, 1, 2]
+    assert np.isfinite(plants.tree_rate).all()
+
+
+def everything_is_finite(plants: Plants) -> None:
+    plants.kinematics()
+    state = plants.state
+    for array in (state.joint_q, state.joint_qd, state.body_q, state.body_qd, plants.body_load, plants.acceleration):
+        assert np.isfinite(array).all()
+
+
+def test_a_tree_woken_at_once_after_a_bad_wrench_is_sound() -> None:
+    plants = row(1)
+    guard = Guard(plants)
+    plants.wake(0)
+    plants.free()
+    plants.commit(np.array([3]), np.full((1, 6), np.nan))
+    assert guard.check().tolist() == [0]
+    plants.wake(0)
+    plants.free()
+    plants.commit()
+    assert guard.check().size == 0
+
+
+def test_a_cut_body_without_a_place_is_put_back_where_it_grew() -> None:
+    plants = row(2)
+    state = plants.state
+    drawn = state.body_q[9, :3].copy()
+    state.body_cut[9] = True
+    state.joint_x[9], state.joint_xd[9] = np.nan, 3.0
+    plants.wake(1)
+    plants.tree_rate[1] = np.nan
+    assert Guard(plants).check().tolist() == [1]
+    np.testing.assert_array_equal(state.joint_x[9], drawn)
+    assert not state.joint_xd[9].any()
+
+
+def wild(rng: np.random.Generator) -> Tree:
+    """Any tree that the model can say: lengths 1 mm to 3 m, E 1e5 to 1e11 Pa, masses 1 mg to 1 t, damped or not."""
+    tree = Tree(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
+    ends = [-1]
+    for _ in range(rng.integers(1, 4)):
+        length = 10 ** rng.uniform(-3.0, 0.5)
+        radius = length * 10 ** rng.uniform(-3.5, -0.5)
+        beta = rng.choice([0.0, 10 ** rng.uniform(-4.0, 3.0)])
+        wood = Wood(10 ** rng.uniform(5.0, 11.0), 10 ** rng.uniform(1.0, 4.3), beta)
+        turn = frames.exp(rng.normal(size=3))
+        tapered = (radius, rng.uniform(0.2, 1.0) * radius)
+        ends += tree.rod(int(rng.choice(ends)), length, tapered, wood, int(rng.integers(1, 9)), rest=turn)
+    if rng.random() < 0.5:
+        mass, reach = 10 ** rng.uniform(-6.0, 3.0), 10 ** rng.uniform(-3.0, -0.5)
+        tree.add(
+            int(rng.choice(ends[1:])), offset=(0.01, 0, 0), mass=mass, com=(reach, 0, 0), length=reach,
+            inertia=[0.4 * mass * reach**2] * 3, stiffness=[rng.choice([0.0, 10 ** rng.uniform(-4.0, 4.0)])] * 3,
+            damping=[rng.choice([0.0, 10 ** rng.uniform(-6.0, 2.0)])] * 3,
+        )  # fmt: skip
+    for body in tree.bodies:
+        share = np.clip(body["mass"], 1e-6, 1e3) / body["mass"]
+        body["mass"] *= share
+        body["inertia"] = np.maximum(share * np.asarray(body["inertia"]), 1e-18)
+    return tree
+
+
+def thrown(seed: int, trees: list[Tree], ticks: int, start: int = 0) -> tuple[Plants, Guard]:
+    """Trees in any pose, up to 1e4 rad/s, under loads and pushes up to 1e6 N, half the time; checked every tick.
+
+    Each tree draws from its own stream, numbered from ``start``: it meets the same whoever is beside it.
+    """
+    draws = [np.random.default_rng((seed, start + i)) for i in range(len(trees))]
+    model = assemble(trees)
+    plants = Plants(model, State.at_rest(model))
+    guard = Guard(plants)
+    spans = [model.bodies_of(i) for i in range(len(trees))]
+    sizes = []
+    for rng, span in zip(draws, spans, strict=True):
+        count = span.stop - span.start
+        plants.state.joint_q[span] = frames.normalize(rng.normal(size=(count, 4)))
+        rate = frames.normalize(rng.normal(size=(count, 3))) * 10 ** rng.uniform(-2.0, 4.0)
+        plants.state.joint_qd[span] = rate
+        sizes.append(10 ** rng.uniform(-3.0, 6.0))
+    plants.wake(np.arange(len(trees)))
+    for tick in range(ticks):
+        loaded = tick < ticks // 2
+        for rng, span, size in zip(draws, spans, sizes, strict=True):
+            plants.body_load[span] = loaded * size * rng.uniform(-1.0, 1.0, (span.stop - span.start, 6))
+        plants.free()
+        bodies = model.tree_first[plants.awake]
+        pushes = [loaded * draws[i].uniform(-1e6, 1e6, 6) for i in plants.awake]
+        plants.commit(bodies, np.array(pushes).reshape(-1, 6))
+        guard.check()
+        everything_is_finite(plants)
+        assert np.linalg.norm(plants.state.joint_qd, axis=1).max() <= 1.001 * plants.limit or tick == 0
+    return plants, guard
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**31))
+def test_no_tree_and_no_load_breaks_the_world(seed: int) -> None:
+    """Anything at all: nothing that is not finite survives a tick, faults are counted, whatever stopped wakes again."""
+    rng = np.random.default_rng(seed)
+    plants, guard = thrown(seed, [wild(rng) for _ in range(24)], 40)
+    stopped = np.flatnonzero(guard.count)
+    assert not plants.state.tree_awake[stopped].any()
+    assert sorted({fault.tree for fault in guard.report()}) == stopped.tolist()
+    plants.wake(stopped)
+    assert plants.state.tree_awake.all()
+    for _ in range(100):
+        plants.free()
+        plants.commit()
+        guard.check()
+    everything_is_finite(plants)
+
+
+def test_neighbours_of_wild_trees_are_equal_to_the_bit() -> None:
+    rng = np.random.default_rng(7)
+    trees = [wild(rng) for _ in range(12)]
+    together, _ = thrown(3, trees, 40)
+    for i in (0, 5, 11):
+        alone, _ = thrown(3, [trees[i]], 40, start=i)
+        for name in ("joint_q", "joint_qd", "body_q"):
+            mine = getattr(together.state, name)[together.model.bodies_of(i)]
+            np.testing.assert_array_equal(mine, getattr(alone.state, name))
+
+
+def test_a_vineyard_calms_down_after_any_load() -> None:
+    """Every shoot of the demo under loads up to 1e6 N, ten ticks at a time: ten seconds later all hang quietly."""
+    rng = np.random.default_rng(1)
+    model = generate(spec.load("demo"))
+    plants = Plants(model, State.at_rest(model))
+    guard, sleep = Guard(plants), Sleep(plants)
+    everyone = np.arange(len(model.tree_first))
+    size = 10 ** rng.uniform(0.0, 6.0, len(everyone))[model.body_tree]
+    for tick in range(60):
+        if tick % 10 == 0:
+            chosen = rng.random(len(size)) < 0.1
+            plants.body_load[:, :3] = (chosen * size)[:, None] * frames.normalize(rng.normal(size=(len(size), 3)))
+        plants.wake(everyone)
+        plants.free()
+        plants.commit()
+        guard.check()
+    assert guard.count.sum() > 10
+    plants.body_load[:] = 0.0
+    plants.wake(everyone)
+    before = guard.count.sum()
+    for _ in range(1000):
+        plants.free()
+        plants.commit()
+        guard.check()
+        sleep.update()
+    assert guard.count.sum() == before
+    assert plants.tree_rate.max() < 2.0
+    plants.kinematics()
+    fallen = np.linalg.norm(plants.state.body_q[:, :3] - model.forward(model.joint_settled)[:, :3], axis=1)
+    assert np.median(fallen) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"length": 0.0}, r"rod of length 0.0 m, .*all must be positive"),
+        ({"radius": (0.004, -0.001)}, r"rod of .*radius \(0.004, -0.001\) m.*all must be positive"),
+        ({"wood": Wood(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
+        ({"wood": Wood(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
+        ({"pieces": 0}, r"rod of .* 0 pieces.*all must be positive"),
+        ({"parent": 3, "offset": (0, 0, 0)}, r"body 0 names parent 3, which does not stand before it"),
+    ],
+)
+def test_wood_that_cannot_be_is_refused_in_words(change: dict, says: str) -> None:
+    given = {"parent": -1, "length": 1.0, "radius": (0.004, 0.004), "wood": Wood(5e9, 800.0), "pieces": 4} | change
+    with pytest.raises(ValueError, match=says):
+        Tree(frames.pose(np.zeros(3))).rod(**given)

@@ -1,0 +1,362 @@
+"""Hands and vines: pushing, holding, pulling off, carrying, letting go; and what the controllers feel of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.physics.test_human_body import eva, put
+from tests.support.contact_scenes import bunch_scene, cane, gripper, probe
+from vinesim import frames
+from vinesim.physics.plants.articulation_solver import HANDS, HELD, Plants
+from vinesim.physics.rigid.human_body import THICK
+from vinesim.physics.step import Physics
+from vinesim.scene.builder import assemble
+from vinesim.scene.state import State
+from vinesim.scene.values import POINTS, Drive, HumanPose, HumanSpec
+
+FORWARD = frames.multiply(frames.yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
+"""Fingers up, palm along +y."""
+SIGNS = {"left": 1.0, "right": -1.0}
+SOFT = (Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), Drive("press", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0))
+
+
+def before_a_bunch(mass: float = 0.5, pull: float = 1e3) -> tuple[Physics, HumanSpec, int, np.ndarray]:
+    """A person before a hanging bunch, the right palm 3 cm away from it; the bunch's body and its middle."""
+    model, body, middle = bunch_scene(mass)
+    model.bunch_pull[0], model.bunch_bend[0] = pull, 1e3
+    physics = Physics(model)
+    spec = eva(middle[0], middle[1] - 0.6, 0.5 * np.pi)
+    at = frames.pose(middle - np.array([0.0, 0.075 + THICK, 0.0]), FORWARD)
+    spec = dataclasses.replace(spec, pose=put(spec.pose, at))
+    physics.add_human(spec)
+    return physics, spec, body, middle
+
+
+def led(spec: HumanSpec, *way: float, closed: bool = False) -> HumanPose:
+    """The person with the right controller ``way`` m further."""
+    at = frames.pose(spec.pose.right[:3] + np.array(way), FORWARD)
+    return put(spec.pose, at, right_closed=closed)
+
+
+def move(physics: Physics, spec: HumanSpec, *way: float, ticks: int, wait: int = 0, closed: bool = False) -> HumanSpec:
+    """Lead the right controller from its place in ``spec`` by ``way``, wait there; returns the person who stands so."""
+    for share in np.append(np.linspace(0.0, 1.0, ticks), np.ones(wait)):
+        physics.move_human("eva", led(spec, *(share * np.array(way)), closed=closed))
+        physics.step()
+    return dataclasses.replace(spec, pose=led(spec, *way, closed=closed))
+
+
+def middle_of(physics: Physics, body: int) -> np.ndarray:
+    pose = physics.view().body_q[body].astype(float)
+    return pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
+
+
+# ---------------------------------------------------------------------- pushing
+
+
+def test_a_hand_pushes_a_bunch_with_what_it_is_held_back():
+    physics, spec, body, middle = before_a_bunch()
+    move(physics, spec, 0.0, 0.2, 0.0, ticks=200, wait=500)
+    hand = physics.hand("eva", "right")
+    pressing = sum(contact.force for contact in physics.contacts if contact.actor == "eva")
+    assert middle_of(physics, body)[1] > middle[1] + 0.05
+    assert hand.force[1] > 0.5
+    np.testing.assert_allclose(pressing, -hand.force, atol=0.02)
+    np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], atol=0.05)
+    assert physics.touched == ((0, "eva"),)
+
+
+def test_a_body_that_walks_takes_canes_along():
+    """Head and trunk move at 1.4 m/s as told, the canes before them: none passes through."""
+    model = assemble([cane((-0.5, 0.3 * i, 1.25)) for i in range(3)])
+    physics = Physics(model)
+    spec = eva(0.2, -0.6, 0.5 * np.pi)
+    physics.add_human(spec)
+    furthest = 0.0
+    for tick in range(60):
+        walk = np.array([0.0, 0.014 * tick, 0, 0, 0, 0, 0])
+        moved = {name: getattr(spec.pose, name) + walk for name in POINTS}
+        physics.move_human("eva", dataclasses.replace(spec.pose, **moved))
+        physics.step()
+        furthest = max(furthest, *(-contact.distance for contact in physics.contacts), 0.0)
+    front = -0.6 + 0.014 * 59
+    tips = model.bodies_of(0).stop - 1, model.bodies_of(1).stop - 1
+    assert all(physics.view().body_q[tip, 1] > front for tip in tips)
+    assert furthest < 0.01
+    assert {contact.link for contact in physics.contacts} <= {"chest", "left_hand", "right_hand", "hips"}
+
+
+# ---------------------------------------------------------------------- holding
+
+
+def test_a_tie_holds_a_body_beside_its_own_ties():
+    """A spring of 200 N/m at the tip of a cane that is tied already: statically, both carry."""
+    tree = cane((0.0, 0.0, 2.0))
+    model = assemble([tree], tie_body=[15], tie_point=np.zeros((1, 3)), tie_anchor=np.zeros((1, 3)),
+                     tie_stiffness=[500.0], tie_damping=[5.0])  # fmt: skip
+    model.tie_anchor[0] = model.forward(model.joint_settled)[15, :3]
+    twin = assemble([tree], tie_body=[15, 15], tie_point=[[0.0, 0, 0], [0.05, 0, 0]], tie_anchor=np.zeros((2, 3)),
+                    tie_stiffness=[500.0, 200.0], tie_damping=[5.0, 10.0])  # fmt: skip
+    at = model.forward(model.joint_settled)[15]
+    twin.tie_anchor[:] = model.tie_anchor[0], at[:3] + frames.rotate(at[3:], np.array([0.05, 0.0, 0.0]))
+    held, drawn = Plants(model, State.at_rest(model)), Plants(twin, State.at_rest(twin))
+    tie = held.hold(15, np.array([0.05, 0.0, 0.0]), 200.0, 10.0)
+    np.testing.assert_allclose(held.tie_anchor[tie], twin.tie_anchor[1], atol=1e-6)
+    drawn.tie_anchor[1] = held.tie_anchor[tie]
+    for plants, k in ((held, tie), (drawn, 1)):
+        plants.tie_anchor[k, 1] += 0.1
+        plants.wake(0)
+        for _ in range(100):
+            plants.free()
+            plants.commit()
+    np.testing.assert_array_equal(held.state.joint_q, drawn.state.joint_q)
+    assert np.abs(held.state.joint_q - model.joint_settled).max() > 1e-3
+    held.let_go(15, tie)
+    drawn.tie_stiffness[1] = drawn.tie_damping[1] = 0.0
+    for plants in (held, drawn):
+        for _ in range(100):
+            plants.free()
+            plants.commit()
+    np.testing.assert_array_equal(held.state.joint_q, drawn.state.joint_q)
+
+
+def test_so_many_can_be_held():
+    model = assemble([cane((0.0, y, 2.0)) for y in range(2)])
+    plants = Plants(model, State.at_rest(model))
+    for _ in range(HANDS):
+        plants.hold(0, np.zeros(3), 1.0, 0.0)
+    with pytest.raises(ValueError, match=f"body 0 is held in {HANDS} places already"):
+        plants.hold(0, np.zeros(3), 1.0, 0.0)
+    for body in range(1, HELD):
+        plants.hold(body, np.zeros(3), 1.0, 0.0)
+    with pytest.raises(ValueError, match=f"body {HELD} is one too many"):
+        plants.hold(HELD, np.zeros(3), 1.0, 0.0)
+
+
+def test_a_bunch_is_held_and_follows():
+    physics, spec, body, middle = before_a_bunch()
+    near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
+    move(physics, near, 0.0, -0.3, 0.0, ticks=150, wait=550, closed=True)
+    hand = physics.hand("eva", "right")
+    assert hand.holds == ("plants", f"body/{body}")
+    assert middle_of(physics, body)[1] < middle[1] - 0.05
+    offset = hand.controller[:3] - hand.pose[:3]
+    assert np.linalg.norm(offset) > 0.02
+    np.testing.assert_allclose(hand.force, 100.0 * offset, atol=0.02)
+    assert physics.touched == ((0, "eva"),)
+    (contact,) = [contact for contact in physics.contacts if contact.actor == "eva"]
+    np.testing.assert_allclose(contact.force, -hand.force)
+    for _ in range(200):  # nothing moves, and yet what is held stays awake
+        physics.step()
+    assert physics.state.tree_awake[0]
+    physics.move_human("eva", put(spec.pose))
+    for _ in range(600):
+        physics.step()
+    assert physics.hand("eva", "right").holds is None
+    assert abs(middle_of(physics, body)[1] - middle[1]) < 0.02
+    assert physics.contacts == ()
+
+
+def test_a_bunch_pulled_off_stays_in_the_hand_and_weighs_there_what_it_weighed_on_the_vine():
+    """F34: 0.8 kg hang 7.8 cm below the controller."""
+    physics, spec, _, _ = before_a_bunch(0.8, pull=15.0)
+    near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
+    parted = []
+    for share in np.append(np.linspace(0.0, 1.0, 200), np.ones(600)):
+        physics.move_human("eva", led(near, 0.0, -0.3 * share, -0.6 * share, closed=True))
+        physics.step()
+        parted += physics.partings
+    assert [(parting.bunch, parting.cause, parting.actor) for parting in parted] == [(0, "pull", "eva")]
+    hand = physics.hand("eva", "right")
+    assert hand.holds == ("bunch/0", "bunch")
+    assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=5e-4)
+    assert hand.force[2] == pytest.approx(0.8 * 9.81, rel=5e-3)
+    assert physics.rigid.bunch_pose(0)[2] > 0.5
+    physics.move_human("eva", led(near, 0.0, -0.3, -0.6))
+    for _ in range(150):
+        physics.step()
+    assert physics.hand("eva", "right").holds is None
+    assert physics.rigid.bunch_pose(0)[2] < 0.2
+
+
+def test_what_lies_on_the_ground_is_picked_up():
+    """F34: a loose bunch of 0.8 kg comes off the ground when the controller is 7.8 cm above the hand."""
+    model, _, middle = bunch_scene(0.8)
+    physics = Physics(model)
+    physics.pick(0)
+    for _ in range(200):
+        physics.step()
+    lies = physics.rigid.bunch_pose(0)
+    middle = lies[:3] + frames.rotate(lies[3:], np.array([0.085, 0.0, 0.0]))
+    spec = eva(middle[0] - 0.5, middle[1])
+    physics.add_human(spec)
+    above = middle + np.array([0.0, 0.0, 0.045 + 2.0 * THICK])
+    for share in np.linspace(0.0, 1.0, 150):
+        physics.move_human("eva", put(spec.pose, (1.0 - share) * spec.pose.right[:3] + share * above))
+        physics.step()
+    for rise in np.concatenate([np.linspace(0.0, 0.4, 200), np.full(400, 0.4)]):
+        physics.move_human("eva", put(spec.pose, above + np.array([0.0, 0.0, rise]), right_closed=True))
+        physics.step()
+    hand = physics.hand("eva", "right")
+    assert hand.holds == ("bunch/0", "bunch")
+    assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=5e-4)
+    assert physics.rigid.bunch_pose(0)[2] > lies[2] + 0.2
+
+
+def test_shears_leave_a_bunch_in_the_hand_that_holds_it():
+    physics, spec, body, _ = before_a_bunch(0.8)
+    near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
+    move(physics, near, 0.0, 0.0, 0.0, ticks=50, closed=True)
+    assert physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    physics.pick(0)
+    move(physics, near, 0.0, 0.0, 0.0, ticks=400, closed=True)
+    hand = physics.hand("eva", "right")
+    assert hand.holds == ("bunch/0", "bunch")
+    assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=1e-3)
+    assert not physics.plants.tie_stiffness.any()
+
+
+def test_a_robot_joins_while_a_hand_holds_a_plant():
+    physics, spec, body, middle = before_a_bunch()
+    near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
+    move(physics, near, 0.0, -0.2, 0.0, ticks=100, wait=50, closed=True)
+    before = physics.hand("eva", "right")
+    physics.add_robot(gripper(middle + np.array([5.0, 0.0, 0.0])))
+    np.testing.assert_array_equal(physics.hand("eva", "right").pose, before.pose)
+    for _ in range(20):
+        physics.step()
+    hand = physics.hand("eva", "right")
+    assert hand.holds == ("plants", f"body/{body}")
+    assert np.linalg.norm(hand.force - before.force) < 0.3
+
+
+def test_a_cane_is_held_too():
+    model = assemble([cane((-0.5, 0.0, 1.1))])
+    physics, spec = Physics(model), eva(0.2, -0.6, 0.5 * np.pi)
+    spec = dataclasses.replace(spec, pose=put(spec.pose, frames.pose(np.array([0.2, -0.1, 1.1]), FORWARD)))
+    physics.add_human(spec)
+    near = move(physics, spec, 0.0, 0.09, 0.0, ticks=60, wait=30)
+    move(physics, near, 0.0, -0.2, 0.1, ticks=100, wait=500, closed=True)
+    hand = physics.hand("eva", "right")
+    assert hand.holds[0] == "plants"
+    np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], atol=0.02)
+    assert np.linalg.norm(hand.force) > 1.0
+    assert physics.view().body_q[12, 1] < -0.05
+
+
+def test_two_hands_share_a_box():
+    """F34: 10 kg on two hands, 49 cm each."""
+    model = assemble([cane((0.0, -5.0, 3.0))], box_pose=[[0, 0, 0.002, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.24]],
+                     box_mass=[10.0])  # fmt: skip
+    physics, spec = Physics(model), eva(-0.7, 0.0)
+    physics.add_human(spec)
+
+    def hold(inside: float, height: float, *, closed: bool) -> None:
+        at = {side: np.array([0.0, sign * (0.2 + 0.1 - inside), height, 0, 0, 0, 1]) for side, sign in SIGNS.items()}
+        for side, sign in SIGNS.items():  # palms to the box
+            at[side][3:] = frames.exp(np.array([-sign * 0.5 * np.pi, 0.0, 0.0]))
+        physics.move_human("eva", put(spec.pose, **at, left_closed=closed, right_closed=closed))
+        physics.step()
+
+    for _ in range(150):
+        hold(0.0, 0.15, closed=False)
+    for inside in np.linspace(0.0, 0.1, 100):
+        hold(inside, 0.15, closed=False)
+    for rise in np.append(np.linspace(0.0, 0.8, 200), np.full(1200, 0.8)):
+        hold(0.1, 0.15 + rise, closed=True)
+    left, right = physics.hand("eva", "left"), physics.hand("eva", "right")
+    assert left.holds == right.holds == ("box/0", "box")
+    for hand in (left, right):
+        assert hand.controller[2] - hand.pose[2] == pytest.approx(0.4905, rel=0.02)
+    assert physics.rigid.data.body("box/0").xpos[2] == pytest.approx(0.8 - 0.4905, abs=0.02)
+
+
+def test_a_robot_is_led_by_the_hand():
+    """F14: a closed hand takes the link it is at; the robot's drive is led away from where it would be."""
+    model = assemble([cane((0.0, -5.0, 3.0))])
+    physics, spec = Physics(model), eva(-1.0)
+    physics.add_robot(probe((0.0, 0.0, 1.1), drives=SOFT))
+    physics.add_human(spec)
+
+    def lead(x: float, *, closed: bool) -> None:
+        physics.move_human("eva", put(spec.pose, (x, 0.0, 1.1), right_closed=closed))
+        physics.step()
+
+    for x in np.append(np.linspace(-0.6, -0.05, 200), np.full(50, -0.05)):
+        lead(x, closed=False)
+    for x in np.append(np.linspace(-0.05, -0.6, 200), np.full(400, -0.6)):
+        lead(x, closed=True)
+    assert physics.hand("eva", "right").holds == ("probe", "rod")
+    position, _, effort, _ = physics.rigid.read("probe")
+    assert position[0] < -0.05
+    assert effort[0] == pytest.approx(-physics.hand("eva", "right").force[0], rel=1e-2)
+    for _ in range(300):
+        lead(-0.6, closed=False)
+    assert physics.hand("eva", "right").holds is None
+    assert abs(physics.rigid.read("probe")[0][0]) < 1e-4
+
+
+def test_a_fist_takes_nothing():
+    physics, spec, _, _ = before_a_bunch()
+    away = move(physics, spec, 0.0, -0.2, 0.0, ticks=50)
+    move(physics, away, 0.0, 0.0, 0.0, ticks=30, closed=True)
+    move(physics, away, 0.0, 0.3, 0.0, ticks=100, wait=100, closed=True)
+    assert physics.hand("eva", "right").holds is None
+    assert physics.hand("eva", "right").touching
+
+
+def test_who_leaves_lets_go():
+    physics, spec, body, _ = before_a_bunch()
+    near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50)
+    move(physics, near, 0.0, -0.1, 0.0, ticks=50, closed=True)
+    assert physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    physics.remove_human("eva")
+    assert not physics.plants.tie_stiffness.any()
+    physics.step()
+    assert physics.contacts == ()
+
+
+# ---------------------------------------------------------------------- what is felt
+
+
+def test_a_touch_is_felt_at_once_and_as_strong_as_it_is():
+    """F33"""
+    physics, spec, _, _ = before_a_bunch()
+    told = []
+    for share in np.concatenate([np.linspace(0.0, 1.0, 100), np.ones(200)]):
+        physics.move_human("eva", led(spec, 0.0, 0.15 * share, 0.0))
+        physics.step()
+        touching = physics.hand("eva", "right").touching
+        told += [(physics.tick, haptic, touching) for haptic in physics.haptics]
+    ticks, haptics, touching = zip(*told, strict=True)
+    assert all(touching)
+    assert {(haptic.actor, haptic.hand) for haptic in haptics} == {("eva", "right")}
+    assert haptics[0].onset
+    assert haptics[0].amplitude >= 0.2
+    assert sum(haptic.onset for haptic in haptics) <= 3
+    last = haptics[-1]
+    assert not last.onset
+    assert last.amplitude == pytest.approx(np.linalg.norm(physics.hand("eva", "right").force) / 100.0, rel=0.05)
+    assert np.diff(ticks).min() >= 2
+    assert last.duration == pytest.approx(0.05)
+
+
+def test_a_free_hand_feels_nothing():
+    physics, _, _, _ = before_a_bunch()
+    for _ in range(50):
+        physics.step()
+        assert physics.haptics == ()
+
+
+def test_twice_the_same_bits():
+    def run() -> bytes:
+        physics, spec, _, _ = before_a_bunch(0.8, pull=15.0)
+        near = move(physics, spec, 0.0, 0.04, 0.0, ticks=30)
+        move(physics, near, 0.0, -0.3, -0.2, ticks=100, closed=True)
+        data = physics.rigid.data
+        return data.qpos.tobytes() + data.qvel.tobytes() + physics.state.joint_q.tobytes()
+
+    assert run() == run()

@@ -1,0 +1,215 @@
+"""Coarse and fine bunches: switched in time, without a jump, and without a difference that the branch would feel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import DOWN, bar
+from vinesim import frames
+from vinesim.physics.plants.level_of_detail import LINGER
+from vinesim.physics.step import Physics
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.sensors.scene.primitives import Primitives
+
+
+def laden(rows: int = 1) -> Model:
+    """Level canes of 1 m, 0.6 m apart, each with a bunch of 0.6 kg at three quarters of its length."""
+    trees = []
+    for row in range(rows):
+        tree = Tree(frames.pose(np.array([0.0, 0.6 * row, 1.8])))
+        cane = tree.rod(-1, 1.0, (0.006, 0.005), Wood(5e9, 900.0, 0.01), 10)
+        stalk = tree.rod(
+            cane[7], 0.07, (0.0022, 0.0022), Wood(3e8, 1000.0, 0.05), 2, organ=Organ.PEDUNCLE, rest=DOWN
+        )  # fmt: skip
+        tree.bunch(stalk[-1], 0.6, count=100, seed=4 + row, pull=1e4, bend=1e4)
+        tree.settle()
+        trees.append(tree)
+    return assemble(trees)
+
+
+def middle(model: Model, bunch: int = 0) -> np.ndarray:
+    pose = model.forward(model.joint_settled)[model.bunch_body[bunch]]
+    return pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
+
+
+def clusters(model: Model, bunch: int = 0) -> np.ndarray:
+    first = int(model.bunch_cluster[bunch])
+    return np.arange(first, first + int(model.bunch_clusters[bunch]))
+
+
+def pushed(physics: Physics, at: np.ndarray, depth: float = 0.05, stay: int = 60):
+    """A bar comes at walking pace, pushes the bunch ``depth`` aside, holds it, and leaves; yields after each tick."""
+    radius = float(physics.model.bunch_radius[0])
+    physics.add_robot(bar(at - [0.0, radius + 0.03 + 0.08, 0.0], stiffness=4e3, damping=400.0))
+    reach = 0.08 + depth
+    for tick in range(2000):
+        t = 0.01 * tick
+        target = (
+            min(0.25 * t, reach) if tick < 25 * 4 * reach + stay + 20 else reach - 0.5 * (t - 0.01 * stay) + 4 * reach
+        )
+        physics.rigid.command("bar", np.array([np.clip(target, -1.5, reach)]))
+        physics.step()
+        yield tick
+
+
+def momentum(physics: Physics, bodies: np.ndarray) -> np.ndarray:
+    """Linear momentum [3] of bodies as ``kinematics`` shows them, kg m/s."""
+    plants, state = physics.plants, physics.state
+    com = frames.rotate(state.body_q[bodies, 3:].astype(float), plants.body_com[bodies].astype(float))
+    velocity = state.body_qd[bodies, :3] + np.cross(state.body_qd[bodies, 3:].astype(float), com)
+    return (plants.body_mass[bodies, None] * velocity).sum(0)
+
+
+def moving(physics: Physics) -> np.ndarray:
+    model = physics.model
+    size = model.tree_size if physics.state.tree_fine[0] else model.tree_core
+    return np.arange(int(size[0]))
+
+
+def test_touched_pushed_released_coarsened_without_a_jump():
+    """At both switches no pose changes by a bit and no momentum by 1e-6; what was bent stays as it came to rest."""
+    model = laden()
+    physics = Physics(model)
+    detail, switches = physics.detail, []
+    refine, coarsen = physics.plants.refine, physics.plants.coarsen
+
+    def seen(change, trees):
+        physics.plants.kinematics(np.array([0]))
+        pose, before = physics.state.body_q.copy(), momentum(physics, moving(physics))
+        change(trees)
+        physics.plants.kinematics(np.array([0]))
+        assert np.array_equal(pose, physics.state.body_q)
+        switches.append((physics.tick, change.__name__, momentum(physics, moving(physics)) - before, before))
+
+    physics.plants.refine = lambda trees: seen(refine, trees)
+    physics.plants.coarsen = lambda trees: seen(coarsen, trees)
+    first_touch = gone = None
+    bent = 0.0
+    for tick in pushed(physics, middle(model)):
+        if first_touch is None and any(c.actor == "bar" for c in physics.contacts):
+            first_touch = tick
+        if first_touch is not None and gone is None and not len(physics.touching.near):
+            gone = tick
+        turn = frames.log(frames.multiply(
+            frames.conjugate(model.joint_settled[clusters(model)]), physics.state.joint_q[clusters(model)]
+        ))  # fmt: skip
+        bent = max(bent, float(np.linalg.norm(turn, axis=1).max()))
+        if gone is not None and not physics.state.tree_fine[0]:
+            break
+    (refined, name, jump, _), (coarsened, other, drop, before) = switches
+    assert (name, other) == ("refine", "coarsen")
+    assert refined <= first_touch  # never late
+    assert coarsened - gone > LINGER
+    assert bent > 0.05
+    assert np.abs(jump).max() < 1e-6
+    assert np.linalg.norm(drop) < 1e-6 + 0.02 * np.linalg.norm(before)
+    assert len(detail.fine) == 0
+
+
+def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
+    """A cane plucked by a centimetre goes the same way within a millimetre, always coarse or fine for a second."""
+    model = laden()
+    ways = []
+    for closely in (False, True):
+        physics = Physics(model)
+        if closely:
+            physics.watch(middle(model)[None], 0.3)
+        physics.plants.wake(0)
+        physics.state.joint_qd[0] = 0.0, 0.05, 0.05
+        at, fine = [], 0
+        for tick in range(400):
+            if tick == 100:
+                physics.watch(np.zeros((0, 3)), 0.0)
+            physics.step()
+            at.append(physics.view().body_q[9, :3])
+            fine += int(physics.state.tree_fine[0])
+        assert (fine > 100) == closely
+        ways.append(np.array(at))
+    moved = np.abs(ways[0] - model.forward(model.joint_settled)[9, :3]).max()
+    print("tip", np.abs(ways[0] - ways[1]).max(), moved, fine)
+    assert moved > 5e-3
+    assert np.abs(ways[0] - ways[1]).max() < 1e-3
+
+
+def test_looking_closely_refines_what_moves_and_looking_away_coarsens_it():
+    model = laden(3)
+    physics = Physics(model)
+    physics.watch(middle(model, 1)[None], 0.2)
+    physics.step()
+    assert len(physics.detail.fine) == 0  # asleep: nothing of it moves
+    physics.plants.wake(np.arange(3))
+    for _ in range(3):
+        physics.step()
+    assert physics.detail.fine.tolist() == [1]
+    physics.watch(np.zeros((0, 3)), 0.0)
+    for _ in range(LINGER + 40):
+        physics.step()
+    assert len(physics.detail.fine) == 0
+
+
+def test_a_tree_stays_fine_while_somebody_is_there_and_not_once_its_bunch_is_gone():
+    model = laden()
+    physics = Physics(model)
+    at = middle(model)
+    physics.add_robot(bar(at - [0.0, 0.025 + model.bunch_radius[0], 0.0], stiffness=4e3, damping=400.0))
+    for _ in range(3 * LINGER):
+        physics.step()
+    assert physics.state.tree_fine[0]
+    physics.pick(0)
+    for _ in range(2 * LINGER):
+        physics.step()
+    assert not physics.state.tree_fine[0]
+
+
+def test_berries_are_the_same_ones_before_and_after():
+    model = laden()
+    physics = Physics(model)
+    primitives = Primitives(model, grass=0.0)
+    labels, kinds = primitives.label.copy(), primitives.shapes.kind.numpy().copy()
+    radii = primitives.shapes.a.numpy()[kinds == 1, 3].copy()
+    start = primitives.shapes.a.numpy()[kinds == 1, :3].copy()
+    for tick in pushed(physics, middle(model)):
+        if tick % 50 == 0:
+            primitives.update(physics.view(), np.array([0]))
+            berries = primitives.shapes.a.numpy()[: len(kinds)][kinds == 1]
+            assert len(berries) == model.bunch_berries[0]
+            assert np.array_equal(berries[:, 3], radii)
+        if tick > 300 and not physics.state.tree_fine[0]:
+            break
+    assert np.array_equal(primitives.label[: len(labels)], labels)
+    # back where it hung, but for the swing that goes on and what the clusters came to rest with
+    assert np.abs(primitives.shapes.a.numpy()[: len(kinds)][kinds == 1, :3] - start).max() < 0.05
+
+
+def test_twice_the_same_bits():
+    ends = []
+    for _ in range(2):
+        physics = Physics(laden())
+        for tick in pushed(physics, middle(physics.model)):
+            if tick == 400:
+                break
+        state = physics.state
+        ends.append(state.joint_q.tobytes() + state.joint_qd.tobytes() + state.tree_fine.tobytes())
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("bunches", [0, 2])
+def test_trees_without_clusters_are_left_alone(bunches):
+    trees = []
+    for row in range(2):
+        tree = Tree(frames.pose(np.array([0.0, 0.6 * row, 1.8])))
+        cane = tree.rod(-1, 1.0, (0.006, 0.005), Wood(5e9, 900.0, 0.01), 4)
+        if row < bunches:
+            stalk = tree.rod(cane[2], 0.05, (0.002, 0.002), Wood(3e8, 1000.0, 0.05), 1, organ=Organ.PEDUNCLE, rest=DOWN)
+            tree.bunch(stalk[-1], 0.4, clusters=False)
+        tree.settle()
+        trees.append(tree)
+    physics = Physics(assemble(trees))
+    physics.plants.wake(np.arange(2))
+    physics.watch(np.zeros((1, 3)), 10.0)
+    for _ in range(5):
+        physics.step()
+    assert not physics.state.tree_fine.any()

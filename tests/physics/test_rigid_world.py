@@ -1,0 +1,534 @@
+"""The rigid world: the split tick is MuJoCo's own, drives feel what they carry, robots come and go in mid-motion."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.physics.rigid import free_bunch as loose_module
+from vinesim.physics.rigid import static_world as yard_module
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.urdf import RobotError
+from vinesim.scene.builder import assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import Drive, RobotSpec
+
+ARM = """<robot name="arm">
+<material name="red"><color rgba="0.8 0.1 0.1 1"/></material>
+<link name="base_footprint"/>
+<link name="chassis"><inertial><mass value="60"/><inertia ixx="2" iyy="2" izz="3" ixy="0" ixz="0" iyz="0"/></inertial>
+ <visual><geometry><box size="0.6 0.5 0.3"/></geometry><material name="red"/></visual>
+ <collision><geometry><box size="0.6 0.5 0.3"/></geometry></collision></link>
+<joint name="stand" type="fixed"><parent link="base_footprint"/><child link="chassis"/><origin xyz="0 0 0.25"/></joint>
+<link name="upper"><inertial><origin xyz="0.2 0 0"/><mass value="4"/>
+  <inertia ixx="0.01" iyy="0.06" izz="0.06" ixy="0" ixz="0" iyz="0"/></inertial>
+ <collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/><geometry><cylinder radius="0.04" length="0.4"/></geometry>
+ </collision></link>
+<joint name="shoulder" type="revolute"><parent link="chassis"/><child link="upper"/><origin xyz="0.3 0 0.5"/>
+ <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="90" velocity="2"/></joint>
+<link name="lower"><inertial><origin xyz="0.2 0 0"/><mass value="2"/>
+  <inertia ixx="0.005" iyy="0.03" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial>
+ <collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/><geometry><cylinder radius="0.03" length="0.4"/></geometry>
+ </collision></link>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/>
+ <axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="60" velocity="2"/></joint>
+<link name="slider"><inertial><mass value="0.5"/>
+  <inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+ <collision><geometry><sphere radius="0.04"/></geometry></collision></link>
+<joint name="extend" type="prismatic"><parent link="lower"/><child link="slider"/><origin xyz="0.4 0 0"/>
+ <axis xyz="1 0 0"/><limit lower="0" upper="0.1" effort="80" velocity="0.5"/></joint>
+<link name="tool"/>
+<joint name="mount" type="fixed"><parent link="slider"/><child link="tool"/><origin xyz="0.06 0 0"/></joint>
+<link name="wheel"><inertial><mass value="1"/>
+  <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="axle" type="continuous"><parent link="chassis"/><child link="wheel"/><axis xyz="0 1 0"/></joint>
+</robot>"""
+
+DRIVES = (
+    Drive("shoulder", 4000.0, 250.0, 90.0, 2.0, -2.0, 2.0),
+    Drive("elbow", 2500.0, 150.0, 60.0, 2.0, -2.5, 2.5),
+    Drive("extend", 8000.0, 400.0, 80.0, 0.5, 0.0, 0.1),
+)
+HOME = np.array([0.4, -0.9, 0.05])
+
+
+def arm(name: str = "anna", index: int = 0, x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> RobotSpec:
+    pose = frames.pose(np.array([x, y, 0.0]), frames.yaw(heading))
+    return RobotSpec(name, index, ARM, "base_footprint", pose, DRIVES, HOME)
+
+
+def yard(boxes: int = 0, **counts: int) -> Model:
+    model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=2, tie=0, box=boxes)
+    model.fixed_start[:], model.fixed_end[:] = [[3, 0, 0], [3, 2, 0]], [[3, 0, 2], [3, 2, 2]]
+    model.fixed_radius[:] = 0.05
+    model.fixed_organ[:] = Organ.POLE, Organ.WIRE
+    for i in range(boxes):
+        model.box_pose[i, :3] = 0.0, 5.0 + i, 0.002
+    model.box_size[:], model.box_mass[:] = (0.6, 0.4, 0.3), 2.0
+    return model
+
+
+def step(rigid: Rigid, ticks: int = 1) -> None:
+    for _ in range(ticks):
+        rigid.prep()
+        rigid.finish()
+
+
+def test_only_poles_and_trunks_stand_in_the_way():
+    names = [yard_geom.name for yard_geom in map(Rigid(yard()).world.geom, range(2))]
+    assert names == ["ground", "fixed/0"]
+
+
+def test_split_step_is_mj_step_to_the_bit():
+    rigid = Rigid(yard(boxes=2))
+    rigid.add_robot(arm())
+    rigid.add_robot(arm("bert", 1, y=1.5))
+    twin = mujoco.MjData(rigid.world)
+    mujoco.mj_copyData(twin, rigid.world, rigid.data)
+    rng = np.random.default_rng(3)
+    for tick in range(200):
+        if tick % 20 == 0:
+            rigid.command("anna", HOME + rng.normal(size=3) * 0.3, rng.normal(size=3))
+            rigid.drive_base("bert", (0.4, -0.1, 0.5))
+        rigid.prep()
+        rigid.velocity_free  # noqa: B018 (reading the prediction must not disturb the step)
+        rigid.inverse(np.eye(rigid.world.nv)[:4])
+        rigid.finish()
+        twin.ctrl[:] = rigid.data.ctrl
+        mujoco.mj_step(rigid.world, twin)
+        assert (twin.qpos == rigid.data.qpos).all()
+        assert (twin.qvel == rigid.data.qvel).all()
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_prediction_and_response_are_what_the_second_half_does(exact):
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    if exact:
+        rigid.tune("anna", np.full(3, 60.0), np.full(3, 5.0), np.zeros(3), exact=np.ones(3, bool))
+    rigid.command("anna", HOME + np.array([0.2, -0.3, 0.02]))
+    step(rigid, 5)
+    rng = np.random.default_rng(1)
+    force = np.zeros(rigid.world.nv)
+    force[rigid._robots["anna"].v] = rng.normal(size=3) * 3.0
+    rigid.prep()
+    predicted = rigid.velocity_free + rigid.inverse(force[None])[:, 0] * rigid.dt
+    rigid.finish(force)
+    np.testing.assert_allclose(rigid.data.qvel, predicted, atol=1e-12)
+
+
+def test_response_holds_the_stiffness_of_a_limit_that_is_active():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.command("anna", np.array([0.4, -0.9, 0.2]))  # beyond the stop at 0.1
+    step(rigid, 100)
+    rigid.prep()
+    assert rigid.data.nefc == 1
+    force = np.zeros(rigid.world.nv)
+    force[rigid._robots["anna"].v[2]] = -1.0
+    predicted = rigid.velocity_free + rigid.inverse(force[None])[:, 0] * rigid.dt
+    rigid.finish(force)
+    np.testing.assert_allclose(rigid.data.qvel, predicted, atol=1e-7)
+
+
+def test_new_gains_do_not_change_what_was_felt():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.command("anna", HOME + 0.02)
+    step(rigid, 10)
+    before = rigid.read("anna")[2].copy()
+    assert np.abs(before).max() > 1.0
+    rigid.tune("anna", np.full(3, 50.0), np.full(3, 5.0), np.full(3, 7.0), exact=np.ones(3, bool))
+    rigid.command("anna", HOME - 1.0)
+    np.testing.assert_allclose(rigid.read("anna")[2], before, atol=1e-9)
+
+
+def test_gravity_compensation_holds_the_pose_and_effort_is_the_weight():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    step(rigid, 300)
+    position, velocity, effort, contact = rigid.read("anna")
+    np.testing.assert_allclose(position, HOME, atol=1e-6)
+    np.testing.assert_allclose(velocity, 0.0, atol=1e-6)
+    assert (contact == 0.0).all()
+    weight = np.zeros(3)
+    for link, mass, com in (("upper", 4.0, 0.2), ("lower", 2.0, 0.2), ("slider", 0.5, 0.0)):
+        pose = rigid.link_pose("anna", link)
+        point = pose[:3] + frames.rotate(pose[3:], np.array([com, 0.0, 0.0]))
+        weight += rigid.jacobian("anna", link, point)[2] * -9.81 * mass
+    assert abs(weight[0]) > 10.0
+    np.testing.assert_allclose(effort, -weight, rtol=1e-4)
+
+
+def test_a_weak_drive_gives_no_more_than_its_effort():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.push("anna", "slider", np.array([0.0, 0.0, -300.0]))
+    step(rigid, 3)
+    _, _, effort, _ = rigid.read("anna")
+    assert abs(effort[0]) <= 90.0 + 1e-9
+    assert np.abs(rigid.data.qfrc_actuator[rigid._robots["anna"].v]).max() <= 90.0 + 1e-9
+
+
+def test_known_contact_is_read_as_contact_and_balanced_by_the_drives():
+    """A force on the tool, handed in as the contact solve does: contact = J^T f, effort balances load and contact."""
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    step(rigid, 50)
+    _, _, at_rest, _ = rigid.read("anna")
+    push = np.array([6.0, 0.0, -12.0])
+    for _ in range(400):
+        rigid.prep()
+        point = rigid.data.body("anna/tool").xpos
+        J = np.zeros((3, rigid.world.nv))
+        mujoco.mj_jac(rigid.world, rigid.data, J, None, point, rigid.data.body("anna/tool").id)
+        rigid.finish(J.T @ push)
+    _, velocity, effort, contact = rigid.read("anna")
+    expected = rigid.jacobian("anna", "tool", rigid.link_pose("anna", "tool")[:3])[:3].T @ push
+    assert np.abs(velocity).max() < 1e-6
+    np.testing.assert_allclose(contact, expected, rtol=2e-2, atol=1e-2)
+    np.testing.assert_allclose(effort - at_rest, -contact, rtol=2e-2, atol=2e-2)
+
+
+def test_contact_with_a_pole_is_read_too_and_the_tracks_slip_at_their_effort():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm(x=2.6))
+    rigid.drive_base("anna", (0.3, 0.0, 0.0))
+    step(rigid, 300)
+    pose, _ = rigid.base("anna")
+    assert pose[0] == pytest.approx(3.0 - 0.05 - 0.3, abs=0.02)
+    assert rigid._contact[rigid._robots["anna"].base_v[0]] == pytest.approx(-800.0, rel=3e-2)
+
+
+def test_tracks_drive_and_hold():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm(heading=np.pi / 2))
+    rigid.drive_base("anna", (0.5, 0.0, 0.0))
+    step(rigid, 200)
+    pose, velocity = rigid.base("anna")
+    np.testing.assert_allclose(velocity[:2], [0.0, 0.5], atol=1e-3)
+    assert pose[1] == pytest.approx(1.0, abs=0.05)
+    rigid.drive_base("anna", (0.0, 0.0, 0.0))
+    step(rigid, 100)
+    held, _ = rigid.base("anna")
+    rigid.push("anna", "chassis", np.array([100.0, 0.0, 0.0]))
+    step(rigid, 500)
+    pushed, velocity = rigid.base("anna")
+    assert np.abs(pushed[:2] - held[:2]).max() < 2e-3  # 100 N of 800 N: an eighth of the give
+    assert np.abs(velocity).max() < 1e-5
+
+
+def test_base_turns_in_its_own_axes():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.drive_base("anna", (0.4, 0.0, 0.5))  # a circle of radius 0.8 m
+    step(rigid, 400)
+    pose, velocity = rigid.base("anna")
+    yaw = 2.0 * np.arctan2(pose[5], pose[6])
+    assert np.hypot(*velocity[:2]) == pytest.approx(0.4, rel=0.02)
+    np.testing.assert_allclose(pose[:2], [0.8 * np.sin(yaw), 0.8 * (1 - np.cos(yaw))], atol=0.05)
+
+
+def test_joining_in_mid_motion_carries_every_number_over():
+    rigid = Rigid(yard(boxes=1))
+    rigid.add_robot(arm())
+    rigid.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
+    rigid.drive_base("anna", (0.2, 0.0, 0.1))
+    rigid.push("anna", "lower", np.array([0.0, 5.0, 0.0]))
+    step(rigid, 13)
+    before = (
+        rigid.read("anna"),
+        rigid.base("anna"),
+        rigid.data.body("box/0").xpos.copy(),
+        rigid.link_pose("anna", "tool"),
+    )
+    alone = Rigid(yard(boxes=1))
+    alone.add_robot(arm())
+    alone.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
+    alone.drive_base("anna", (0.2, 0.0, 0.1))
+    alone.push("anna", "lower", np.array([0.0, 5.0, 0.0]))
+    step(alone, 13)
+
+    rigid.add_robot(arm("bert", 1, y=3.0))
+    for mine, old in zip(rigid.read("anna"), before[0], strict=True):
+        assert (mine == old).all()
+    for mine, old in zip(rigid.base("anna"), before[1], strict=True):
+        assert (mine == old).all()
+    assert (rigid.link_pose("anna", "tool") == before[3]).all()
+    step(rigid, 20)
+    step(alone, 20)
+    np.testing.assert_allclose(rigid.read("anna")[0], alone.read("anna")[0], atol=1e-9)
+    np.testing.assert_allclose(rigid.read("anna")[1], alone.read("anna")[1], atol=1e-8)
+
+    rigid.remove_robot("bert")
+    assert rigid.robots == ("anna",)
+    step(rigid, 20)
+    step(alone, 20)
+    np.testing.assert_allclose(rigid.read("anna")[0], alone.read("anna")[0], atol=1e-9)
+    np.testing.assert_allclose(rigid.base("anna")[0], alone.base("anna")[0], atol=1e-9)
+
+
+def test_a_copy_follows_the_pose_and_speed_it_receives():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.add_robot(arm("copy", 1, y=2.0))
+    rigid.drive_base("anna", (0.3, 0.0, 0.2))
+    for tick in range(300):
+        t = 0.01 * tick
+        rigid.command("anna", HOME + 0.3 * np.sin(t) * np.array([1, 1, 0.1]), 0.3 * np.cos(t) * np.array([1, 1, 0.1]))
+        base_q, base_qd = rigid.base("anna")
+        position, velocity, _, _ = rigid.read("anna")
+        base_q[1] += 2.0
+        rigid.follow("copy", base_q, base_qd, position, velocity)
+        step(rigid)
+    (mine, _), (copy, _) = rigid.base("anna"), rigid.base("copy")
+    np.testing.assert_allclose(copy[:2] - mine[:2], [0.0, 2.0], atol=5e-3)
+    np.testing.assert_allclose(rigid.read("copy")[0], rigid.read("anna")[0], atol=1e-2)
+
+
+def test_robots_meet_each_other_but_not_themselves():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.command("anna", np.array([-1.0, 2.5, 0.0]))  # folded into its own chassis
+    step(rigid, 100)
+    assert rigid.data.ncon == 0
+    rigid.add_robot(arm("bert", 1, x=-0.65))
+    rigid.drive_base("bert", (0.2, 0.0, 0.0))
+    step(rigid, 100)
+    assert rigid.data.ncon > 0
+    assert rigid.base("anna")[0][0] - rigid.base("bert")[0][0] == pytest.approx(0.6, abs=2e-3)
+
+
+def test_links_for_sensors_ride_on_the_bodies():
+    rigid = Rigid(yard(boxes=1))
+    rigid.add_robot(arm("anna", 7, x=1.0, heading=0.5))
+    step(rigid, 30)
+    links, poses = rigid.links(), rigid.link_q()
+    assert links is rigid.links()
+    assert [link.name for link in links] == ["box/0", "anna/chassis", "anna/upper", "anna/lower", "anna/slider"]
+    assert links[0].organ == Organ.BOX
+    assert {shape.kind for shape in links[0].shapes} == {"box"}
+    assert links[1].index == 7
+    assert links[1].shapes[0].rgba == (0.8, 0.1, 0.1, 1.0)
+    np.testing.assert_allclose(poses[1, :3], [1.0, 0.0, 0.25], atol=1e-9)
+    np.testing.assert_allclose(poses[4], rigid.link_pose("anna", "slider"), atol=1e-12)
+    np.testing.assert_allclose(links[2].shapes[0].pose[3:], [0, np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
+    np.testing.assert_allclose(poses[0, 2], 0.0, atol=2e-3)  # the box stands on the ground
+    # both wheel and axle nobody drives: fixed, and the wheel has no shape
+    assert "anna/axle" not in [rigid.world.joint(i).name for i in range(rigid.world.njnt)]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"name": "a/b"}, "must not"),
+        ({"base": "chassis"}, "root"),
+        ({"home": np.zeros(2)}, "3 drives"),
+        ({"urdf": "<robot"}, "not XML"),
+        ({"urdf": ARM.replace('<mass value="4"/>', '<mass value="-4"/>')}, "MuJoCo"),
+        ({"drives": (*DRIVES[:2], Drive("nose", 1, 1, 1, 1, 0, 1))}, "nose"),
+        ({"drives": (*DRIVES[:2], Drive("mount", 1, 1, 1, 1, 0, 1))}, "fixed"),
+    ],
+)
+def test_what_is_wrong_with_a_robot_is_said_and_the_world_goes_on(change, says):
+    rigid = Rigid(yard())
+    rigid.add_robot(arm("other"))
+    with pytest.raises(RobotError, match=says) as caught:
+        rigid.add_robot(dataclasses.replace(arm(), **change))
+    assert "\n" not in str(caught.value)
+    assert rigid.robots == ("other",)
+    step(rigid, 2)
+    with pytest.raises(ValueError, match="there are: other"):
+        rigid.read("anna")
+    with pytest.raises(RobotError, match="already here"):
+        rigid.add_robot(arm("other"))
+
+
+def test_a_mimicking_finger_copies_the_one_that_is_driven():
+    twin = ARM.replace(
+        '<link name="tool"/>',
+        '<link name="thumb"><inertial><mass value="0.2"/>'
+        '<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="oppose" type="prismatic"><parent link="lower"/><child link="thumb"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="10" velocity="1"/><mimic joint="extend" multiplier="-2" offset="0.3"/>'
+        '</joint><link name="tool"/>',
+    )
+    rigid = Rigid(yard())
+    rigid.add_robot(dataclasses.replace(arm(), urdf=twin))
+    thumb = rigid.data.joint("anna/oppose")
+    assert thumb.qpos[0] == pytest.approx(0.3 - 2 * 0.05)
+    rigid.command("anna", np.array([0.4, -0.9, 0.09]))
+    step(rigid, 200)
+    assert rigid.read("anna")[0][2] == pytest.approx(0.09, abs=1e-4)
+    assert rigid.data.joint("anna/oppose").qpos[0] == pytest.approx(0.3 - 2 * 0.09, abs=1e-3)
+
+
+def test_a_mesh_is_touched_as_the_box_around_it(tmp_path):
+    """An STL of a brick, off its link's origin: plants feel a box of its edges, sensors are told the file."""
+    low, high = np.array([0.1, -0.05, 0.2]), np.array([0.16, 0.07, 0.5])
+    corner = [np.where([i & 1, i & 2, i & 4], high, low) for i in range(8)]
+    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    record = np.zeros(12, dtype=[("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+    record["corner"] = [[corner[i] for i in t] for t in triangles]
+    file = tmp_path / "brick.stl"
+    file.write_bytes(b" " * 80 + np.uint32(12).tobytes() + record.tobytes())
+    mesh = f'<mesh filename="{file}"/>'
+    urdf = ARM.replace('<sphere radius="0.04"/>', mesh)
+    rigid = Rigid(yard())
+    rigid.add_robot(dataclasses.replace(arm(), urdf=urdf))
+    rigid.prep()
+    geom = rigid.geoms.link.index("slider")
+    assert rigid.geoms.kind[geom] == 6
+    np.testing.assert_allclose(np.sort(rigid.geoms.size[geom]), np.sort((high - low) / 2), atol=1e-6)
+    index = rigid.geoms.id[geom]
+    center = rigid.data.geom_xpos[index] + rigid.data.geom_xmat[index].reshape(3, 3) @ rigid.geoms.center[geom]
+    pose = rigid.link_pose("anna", "slider")
+    np.testing.assert_allclose(center, pose[:3] + frames.rotate(pose[3:], (low + high) / 2), atol=1e-6)
+    shape = next(link for link in rigid.links() if link.name == "anna/slider").shapes[0]
+    assert (shape.kind, shape.file, shape.size) == ("mesh", str(file), (1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("content", [b"", b"solid of nothing", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"])
+def test_a_mesh_that_is_none_is_named(content, tmp_path):
+    file = tmp_path / f"shell.{'obj' if content.startswith(b'v') else 'stl'}"
+    file.write_bytes(content)
+    urdf = ARM.replace('<sphere radius="0.04"/>', f'<mesh filename="{file}"/>')
+    rigid = Rigid(yard())
+    with pytest.raises(RobotError, match=r"'anna'.*shell") as caught:
+        rigid.add_robot(dataclasses.replace(arm(), urdf=urdf))
+    assert "\n" not in str(caught.value)
+    assert rigid.robots == ()
+
+
+def test_gains_can_be_tuned_and_survive_a_newcomer():
+    rigid = Rigid(yard())
+    rigid.add_robot(arm())
+    rigid.tune("anna", np.array([4000.0, 0.0, 8000.0]), np.array([250.0, 5.0, 400.0]), np.array([0.0, 2.0, 0.0]))
+    rigid.add_robot(arm("bert", 1, y=3.0))
+    step(rigid, 20)
+    _, velocity, effort, _ = rigid.read("anna")
+    gravity = rigid.data.qfrc_gravcomp[rigid._robots["anna"].v[1]]
+    assert effort[1] - gravity == pytest.approx(2.0 - 5.0 * velocity[1], abs=1e-9)
+    assert velocity[1] > 0.1
+
+
+def test_boxes_at_rest_sleep_until_something_pushes_them():
+    rigid = Rigid(yard(boxes=3))
+    rigid.add_robot(arm())
+    nothing = np.full(rigid.world.nv, -0.0)
+    for _ in range(100):
+        rigid.prep()
+        rigid.finish(nothing)
+    assert rigid.data.ncon == 0
+    assert (rigid.velocity_free[:18] == 0.0).all()
+    push = nothing.copy()
+    push[rigid.world.joint("box/1").dofadr[0]] = 30.0  # mu m g is 15.7 N
+    for _ in range(20):
+        rigid.prep()
+        rigid.finish(push)
+    rigid.prep()
+    moved = rigid.data.joint("box/1").qpos[0]
+    assert moved == pytest.approx(0.5 * (30.0 - 0.8 * 2.0 * 9.81) / 2.0 * 0.2**2, rel=0.25)
+    assert rigid.data.joint("box/0").qpos[0] == 0.0
+    assert rigid.data.joint("box/0").qvel[0] == 0.0
+
+
+def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
+    rigid, alone = Rigid(yard()), Rigid(yard())
+    for world in (rigid, alone):
+        world.add_robot(arm())
+        world.add_robot(arm("bert", 1, y=3.0))
+        world.drive_base("bert", (0.3, 0.0, 0.0))
+    step(rigid, 20)
+    step(alone, 20)
+    where = rigid.base("anna")[0]
+    rigid.prep()
+    rigid.data.qvel[rigid._robots["anna"].v[1]] = np.nan
+    rigid.finish()
+    step(rigid, 30)
+    step(alone, 31)
+    assert rigid.faults == 1
+    assert "anna" in rigid.complaint
+    assert "bert" not in rigid.complaint
+    np.testing.assert_allclose(rigid.base("anna")[0], where, atol=1e-3)
+    np.testing.assert_allclose(rigid.read("anna")[0], HOME, atol=1e-2)
+    np.testing.assert_allclose(rigid.base("bert")[0], alone.base("bert")[0], atol=1e-6)
+    assert rigid.data.time == pytest.approx(alone.data.time)
+
+
+def loose(shapes: int, mass: float = 0.6) -> loose_module.Loose:
+    """A bunch of some spheres and, last, a capsule."""
+    start = np.stack([0.02 * np.arange(shapes), 0.003 * np.arange(shapes), np.zeros(shapes)], 1)
+    end = start.copy()
+    end[-1, 0] += 0.03
+    inertia = np.array([6e-4, 1.5e-3, 1.4e-3])
+    radius, product = 0.04 - 0.001 * np.arange(shapes), np.array([1e-5, -3e-5, 4e-5])
+    return loose_module.Loose(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
+
+
+@pytest.mark.parametrize("shapes", [1, 5, loose_module.LUMPS])
+def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
+    """All constants that MuJoCo derives from weight and shapes, against a world compiled with the bunch in it."""
+    model = assemble([], box_pose=[[1.0, 0, 0, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.3]], box_mass=[[2.0]])
+    rigid = Rigid(model)
+    bunch = loose(shapes)
+    rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
+    spec = yard_module.furnished(model, rigid.dt)
+    loose_module.drop(spec, bunch)
+    ours, theirs = rigid.world, spec.compile()
+    a, b = ours.body("loose/0").id, theirs.nbody - 1
+    for name in loose_module.OF_BODY:
+        np.testing.assert_allclose(getattr(ours, name)[a], getattr(theirs, name)[b], rtol=1e-12, err_msg=name)
+    at, there = ours.body_geomadr[a], theirs.body_geomadr[b]
+    for name in loose_module.OF_GEOM:
+        mine, other = getattr(ours, name)[at : at + shapes], getattr(theirs, name)[there : there + shapes]
+        np.testing.assert_allclose(mine, other, rtol=1e-12, err_msg=name)
+    mine, other = slice(ours.body_dofadr[a], ours.body_dofadr[a] + 6), slice(theirs.nv - 6, theirs.nv)
+    for name in ("dof_M0", "dof_invweight0", "dof_length", "dof_simplenum"):
+        np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], rtol=1e-12, err_msg=name)
+    mine = slice(ours.body_bvhadr[a], ours.body_bvhadr[a] + ours.body_bvhnum[a])
+    other = slice(theirs.body_bvhadr[b], theirs.body_bvhadr[b] + theirs.body_bvhnum[b])
+    np.testing.assert_allclose(ours.bvh_aabb[mine], theirs.bvh_aabb[other], rtol=1e-12)
+    assert (ours.bvh_child[mine] == theirs.bvh_child[other]).all()
+    nodes, others = ours.bvh_nodeid[mine], theirs.bvh_nodeid[other]
+    assert (np.where(nodes < 0, -1, nodes - at) == np.where(others < 0, -1, others - there)).all()
+
+
+def test_waiting_bodies_sleep_and_nobody_sees_them():
+    rigid = Rigid(assemble([]))
+    for _ in range(20):
+        rigid.prep()
+        rigid.finish()
+    assert rigid.links() == ()
+    assert len(rigid.geoms.id) == 0
+    assert rigid.data.nv_awake == 0
+    assert rigid.data.ncon == 0
+
+
+def test_more_bunches_than_bodies_wait_for_them():
+    """The pool grows by a compilation when it is used up; those that fall go on falling."""
+    rigid = Rigid(assemble([]))
+    generations = []
+    for bunch in range(loose_module.WAITING + 2):
+        rigid.add_bunch(bunch, loose(3), frames.pose(np.array([float(bunch), 0.0, 5.0])), np.zeros(6))
+        generations.append(rigid.world)
+        rigid.prep()
+        rigid.finish()
+    assert all(world is generations[0] for world in generations[: loose_module.WAITING])
+    assert generations[-1] is not generations[0]
+    ticks = np.arange(len(generations), 0, -1)
+    fallen = 5.0 - 9.81 * rigid.dt**2 * ticks * (ticks + 1) / 2.0
+    heights = [rigid.bunch_pose(bunch)[2] for bunch in rigid.loose]
+    np.testing.assert_allclose(heights, fallen, atol=1e-9)
+    rigid.remove_bunch(4)
+    assert 4 not in rigid.loose
+    assert [link.name for link in rigid.links()] == [f"bunch/{bunch}" for bunch in rigid.loose]
+    with pytest.raises(ValueError, match="shapes; a loose one has"):
+        rigid.add_bunch(4, loose(loose_module.LUMPS + 1), frames.pose(np.zeros(3)), np.zeros(6))
+    assert 4 not in rigid.loose

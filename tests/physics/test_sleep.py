@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.sleep import Sleep
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.state import State
+
+
+def row(count: int) -> Plants:
+    trees = []
+    for i in range(count):
+        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
+        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 6)
+        tree.settle()
+        trees.append(tree)
+    model = assemble(trees)
+    return Plants(model, State.at_rest(model))
+
+
+def tick(plants: Plants, sleep: Sleep, busy: np.ndarray | None = None) -> np.ndarray:
+    plants.free()
+    plants.commit()
+    return sleep.update(busy)
+
+
+def test_a_kicked_tree_swings_then_sleeps_and_the_others_never_woke() -> None:
+    plants = row(5)
+    sleep = Sleep(plants)
+    state = plants.state
+    others = np.delete(np.arange(30), plants.model.bodies_of(2))
+    before = [getattr(state, name)[others].tobytes() for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
+    sleep.wake(2)
+    state.joint_qd[plants.model.bodies_of(2), 1] = 0.5
+    ticks = 0
+    while len(plants.awake):
+        tick(plants, sleep)
+        ticks += 1
+        assert ticks < 1000
+    assert ticks > 60  # it did swing
+    assert not state.joint_qd.any()
+    assert not state.tree_awake.any()
+    after = [getattr(state, name)[others].tobytes() for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
+    assert before == after
+    np.testing.assert_allclose(
+        state.body_q, plants.model.forward(state.joint_q), atol=1e-5
+    )  # up to date, not a tick old
+
+
+def test_a_tree_drawn_at_rest_sleeps_after_patience() -> None:
+    plants = row(2)
+    sleep = Sleep(plants, patience=7)
+    sleep.wake(np.array([0, 1]))
+    drawn = plants.state.body_q.copy()
+    rested = [tick(plants, sleep).tolist() for _ in range(7)]
+    assert rested == [[]] * 6 + [[0, 1]]
+    np.testing.assert_allclose(plants.state.body_q, drawn, atol=1e-5)
+
+
+def test_busy_trees_stay_awake() -> None:
+    plants = row(3)
+    sleep = Sleep(plants, patience=5)
+    sleep.wake(np.array([0, 2]))
+    for _ in range(20):
+        tick(plants, sleep, busy=np.array([2]))
+    assert plants.awake.tolist() == [2]

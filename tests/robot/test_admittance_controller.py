@@ -1,0 +1,91 @@
+"""Admittance: a hand that is pushed moves with the push (F18); one that ignores its sensor stays (F17)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.robot.control.admittance_controller import Admittance
+from vinesim.robot.description.description import load
+from vinesim.robot.drives import CommandError, Robot
+from vinesim.scene.builder import assemble
+
+
+class Pushed:
+    """A robot whose left hand somebody pushes."""
+
+    def __init__(self, *, heeding: bool, **gains: float) -> None:
+        self.rigid = Rigid(assemble([]))
+        self.robot = Robot(self.rigid, load("vinebot"), "anna")
+        self.time = 0.0
+        self.controller = Admittance(self.robot, "arm_left", "wrist_left_ft", **gains) if heeding else None
+        self._step()
+        self.run(0.3)
+
+    def _step(self) -> None:
+        self.robot.control(self.time)
+        self.rigid.prep()
+        self.rigid.finish()
+        self.time += self.rigid.dt
+
+    def run(self, seconds: float, force: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+        """Places of the hand [tick, 3] under a steady force."""
+        self.rigid.push("anna", "gripper_left_base_link", np.array(force))
+        places = []
+        for _ in range(round(seconds / self.rigid.dt)):
+            if self.controller is not None:
+                self.controller(self.robot.sample(self.time))
+            self._step()
+            places.append(self.robot.frame_pose("wrist_left_ft_link")[:3])
+        return np.array(places)
+
+
+@pytest.mark.parametrize("force", [(-6.0, 0.0, 0.0), (0.0, 6.0, 0.0), (0.0, 0.0, 6.0), (-4.0, 4.0, -4.0)])
+def test_a_hand_moves_with_the_push_at_force_over_damping(force: tuple[float, float, float]) -> None:
+    yard = Pushed(heeding=True, damping=60.0)
+    attitude = yard.robot.frame_pose("wrist_left_ft_link")[3:]
+    places = yard.run(1.0, force)
+    velocity = (places[-1] - places[-31]) / 0.3
+    np.testing.assert_allclose(velocity, np.array(force) / 60.0, atol=0.05 * np.linalg.norm(force) / 60.0)
+    turned = 2.0 * np.arccos(min(1.0, abs(attitude @ yard.robot.frame_pose("wrist_left_ft_link")[3:])))
+    assert turned < 0.03
+
+
+def test_it_gathers_speed_like_its_mass_and_rests_when_let_go() -> None:
+    """The pusher feels the mass asked for and that of the real hand, whose inertia the sensor feels too."""
+    yard = Pushed(heeding=True, mass=6.0, damping=30.0)
+    places = yard.run(0.8, (0.0, 0.0, 6.0))
+    speed = np.diff(places[:, 2]) / yard.rigid.dt
+    time_constant = yard.rigid.dt * (1 + np.argmax(speed > 0.632 * 0.2))
+    assert 6.0 / 30.0 < time_constant < 1.1 * (6.0 + 2.2) / 30.0
+    rest = yard.run(3.0)
+    assert np.abs(rest[-1] - rest[-50]).max() < 1e-4
+    assert rest[-1, 2] - places[0, 2] > 0.1, "it went back"
+
+
+def test_a_hand_that_heeds_no_sensor_stays() -> None:
+    yard = Pushed(heeding=False)
+    before = yard.run(0.1)[-1]
+    pushed = yard.run(1.0, (0.0, 0.0, 6.0))
+    assert np.abs(pushed[-1] - before).max() < 2e-3
+    assert np.abs(yard.run(1.0)[-1] - before).max() < 1e-4
+
+
+def test_weight_is_no_push_even_after_a_turn_of_the_hand() -> None:
+    yard = Pushed(heeding=True)
+    controller, yard.controller = yard.controller, None
+    joints = yard.robot.joint_indices(["arm_left_5_joint", "arm_left_7_joint"])
+    yard.robot.command_position(yard.robot.setpoint[joints] + 0.8, joints)
+    yard.run(2.0)
+    yard.controller = controller
+    places = yard.run(2.0)
+    assert np.abs(places[-1] - places[0]).max() < 1e-3
+
+
+def test_wrong_settings_are_named() -> None:
+    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    with pytest.raises(CommandError, match=r"no wrist sensor 'elbow'.*wrist_left_ft"):
+        Admittance(robot, "arm_left", "elbow")
+    with pytest.raises(CommandError, match="above 0"):
+        Admittance(robot, "arm_left", "wrist_left_ft", mass=0.0)

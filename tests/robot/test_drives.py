@@ -1,0 +1,627 @@
+"""Drives: commands become motion within the URDF's limits, and samples agree with the rigid world."""
+
+from __future__ import annotations
+
+import dataclasses
+from xml.etree import ElementTree
+
+import msgspec
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import bunch_scene
+from vinesim import frames
+from vinesim.physics.rigid.free_bunch import Loose
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.step import Physics
+from vinesim.robot.description.description import Description, load
+from vinesim.robot.drives import CommandError, Interface, RemoteRobot, Robot
+from vinesim.scene.builder import assemble
+from vinesim.scene.values import Contact, RobotUpdate
+
+
+@pytest.fixture(scope="module")
+def vinebot() -> Description:
+    return load("vinebot")
+
+
+class Yard:
+    """One robot on bare ground, and a clock."""
+
+    def __init__(self, description: Description, pose: np.ndarray | None = None) -> None:
+        self.rigid = Rigid(assemble([]))
+        self.robot = Robot(self.rigid, description, "anna", pose=pose)
+        self.time = 0.0
+
+    def run(self, seconds: float) -> np.ndarray:
+        """Positions, velocities, efforts and set-points of every tick [tick, 4, joint]."""
+        rows = []
+        for _ in range(round(seconds / self.rigid.dt)):
+            self.robot.control(self.time)
+            self.rigid.prep()
+            self.rigid.finish()
+            self.time += self.rigid.dt
+            position, velocity, effort, _ = self.rigid.read("anna")
+            rows.append((position, velocity, effort, self.robot.setpoint.copy()))
+        return np.array(rows)
+
+
+@pytest.fixture
+def yard(vinebot: Description) -> Yard:
+    return Yard(vinebot)
+
+
+def test_home_is_held_without_sag(yard: Yard, vinebot: Description) -> None:
+    position = yard.run(0.5)[-1, 0]
+    np.testing.assert_allclose(position, vinebot.home, atol=1e-9)
+
+
+def test_step_command_ramps_at_the_speed_limit(yard: Yard) -> None:
+    joint = yard.robot.joint_indices(["arm_left_4_joint"])[0]
+    limit, start = yard.robot.speed[joint], yard.robot.setpoint[joint]
+    yard.robot.command_position([start - 1.1], ["arm_left_4_joint"])
+    position, velocity, _, setpoint = yard.run(1.0)[:, :, joint].T
+    steps = np.abs(np.diff(setpoint, prepend=start))
+    assert steps.max() <= limit * yard.rigid.dt * (1.0 + 1e-9)
+    assert np.abs(velocity).max() <= limit * 1.02, "faster than the URDF allows"
+    cruise = slice(15, 45)
+    np.testing.assert_allclose(velocity[cruise], -limit, rtol=0.02)
+    arrived = np.flatnonzero(np.abs(setpoint - (start - 1.1)) < 1e-9)[0] * yard.rigid.dt
+    assert arrived == pytest.approx(1.1 / limit, abs=0.03)
+    assert position[-1] == pytest.approx(start - 1.1, abs=1e-3)
+    assert position.min() > start - 1.1 - 0.025, "overshoot"
+
+
+def test_smooth_commands_are_tracked(yard: Yard) -> None:
+    joints = yard.robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint", "arm_left_6_joint", "head_1_joint"])
+    start = yard.robot.setpoint[joints].copy()
+    worst = 0.0
+    for _ in range(300):
+        wanted = start + 0.3 * (1.0 - np.cos(2.0 * np.pi * 0.4 * yard.time)) * np.array([1, -1, 1, -1])
+        yard.robot.command_position(wanted, joints)
+        position = yard.run(yard.rigid.dt)[-1, 0, joints]
+        worst = max(worst, np.abs(position - wanted).max())
+    assert worst < 5e-3
+
+
+def test_commands_beyond_a_limit_go_to_the_limit(yard: Yard) -> None:
+    yard.robot.command_position([9.0, -9.0], ["head_1_joint", "head_2_joint"])
+    position = yard.run(1.5)[-1, 0]
+    i = yard.robot.joint_indices(["head_1_joint", "head_2_joint"])
+    np.testing.assert_allclose(position[i], [1.3, -1.05], atol=2e-3)
+
+
+def test_velocity_command_moves_and_ends_at_the_limit(yard: Yard) -> None:
+    joint = yard.robot.joint_indices(["arm_right_2_joint"])[0]
+    yard.robot.command_velocity([0.5], ["arm_right_2_joint"])
+    rows = yard.run(1.0)
+    np.testing.assert_allclose(rows[30:, 1, joint], 0.5, rtol=0.02)
+    yard.robot.command_velocity([50.0], ["arm_right_2_joint"])
+    rows = yard.run(2.0)
+    assert np.abs(np.diff(rows[:, 3, joint])).max() <= yard.robot.speed[joint] * yard.rigid.dt * (1.0 + 1e-9)
+    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper[joint], abs=2e-3)
+
+
+def test_effort_command_is_the_effort_at_rest(yard: Yard) -> None:
+    """The head pans about the vertical: no weight. Driven against its end stop it transmits what is asked."""
+    joint = yard.robot.joint_indices(["head_1_joint"])[0]
+    yard.robot.command_effort([2.0], ["head_1_joint"])
+    rows = yard.run(3.0)
+    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper[joint], abs=0.02)
+    assert rows[-1, 2, joint] == pytest.approx(2.0, rel=0.01)
+    yard.robot.command_effort([100.0], ["head_1_joint"])
+    assert yard.run(1.0)[-1, 2, joint] == pytest.approx(yard.robot.effort[joint], rel=0.01)
+
+
+def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
+    """Lift: 10 N beyond the weight on what it carries, its screw, and the URDF's friction of 50 N s/m."""
+    joint = yard.robot.joint_indices(["torso_lift_joint"])[0]
+    urdf = ElementTree.fromstring(yard.robot.description.urdf)
+    below = ("base", "torso_fixed")
+    masses = {link.get("name"): link.find("inertial/mass") for link in urdf.findall("link")}
+    carried = sum(float(m.get("value")) for name, m in masses.items() if m is not None and not name.startswith(below))
+    yard.robot.command_effort([10.0], ["torso_lift_joint"])
+    velocity = np.concatenate([[0.0], yard.run(0.8)[:, 1, joint]])
+    acceleration = np.diff(velocity) / yard.rigid.dt
+    expected = (10.0 - 50.0 * velocity[1:]) / (carried + yard.robot.description.drives[joint].rotor)
+    assert 0.04 < velocity[-1] < 0.15
+    np.testing.assert_allclose(acceleration[5:], expected[5:], rtol=0.02)  # until then the arms sag in their joints
+
+
+def test_zero_effort_lets_the_joint_be_moved_and_position_does_not(yard: Yard) -> None:
+    joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
+    start = yard.run(0.2)[-1, 0, joint]
+    yard.rigid.push("anna", "arm_left_7_link", np.array([0.0, 0.0, 20.0]))
+    assert abs(yard.run(1.0)[-1, 0, joint] - start) < 0.01
+    yard.robot.command_effort([0.0], ["arm_left_1_joint"])
+    assert abs(yard.run(1.0)[-1, 0, joint] - start) > 0.2
+
+
+def test_impedance_gives_way_as_its_stiffness_says(yard: Yard) -> None:
+    """Oracle: k times deflection is J^T f of a known push (D6.4 section 3.1: compliance by stiffness gains)."""
+    joint = yard.robot.joint_indices(["arm_left_4_joint"])[0]
+    start = yard.run(0.1)[-1, 0, joint]
+    yard.robot.command_impedance([60.0], [12.0], ["arm_left_4_joint"])
+    force = np.array([0.0, 0.0, -12.0])
+    yard.rigid.push("anna", "arm_left_7_link", force)
+    rows = yard.run(4.0)
+    body = yard.rigid.world.body("anna/arm_left_7_link").id
+    jacobian = yard.rigid.jacobian("anna", "arm_left_7_link", yard.rigid.data.xipos[body])[:3, joint]
+    assert abs(rows[-1, 0, joint] - start) > 0.03
+    assert 60.0 * (rows[-1, 0, joint] - start) == pytest.approx(jacobian @ force, rel=0.01)
+    with pytest.raises(CommandError, match="below zero"):
+        yard.robot.command_impedance([-1.0], [1.0], ["arm_left_4_joint"])
+
+
+def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: Description) -> None:
+    yard.robot.command_effort([0.0], ["arm_left_1_joint"])
+    yard.run(0.02)
+    Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
+    joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
+    start = yard.rigid.read("anna")[0][joint]
+    yard.rigid.push("anna", "arm_left_7_link", np.array([0.0, 0.0, 20.0]))
+    assert abs(yard.run(1.0)[-1, 0, joint] - start) > 0.2
+
+
+def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yard) -> None:
+    before = yard.run(0.2)[-1, 0]
+    yard.rigid.push("anna", "arm_left_4_link", np.array([900.0, 0.0, 0.0]))
+    rows = yard.run(0.6)
+    assert (np.abs(rows[:, 2]) <= yard.robot.effort * (1.0 + 1e-9)).all()
+    joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
+    yielded = rows[-1, 0, joint] - before[joint]
+    assert abs(yielded) > 0.1
+    yard.rigid.push("anna", "arm_left_4_link", np.zeros(3))
+    back = yard.run(2.5)
+    assert back[-1, 0, joint] == pytest.approx(before[joint], abs=1e-3)
+    beyond = (before[joint] - back[:, 0, joint]) * np.sign(yielded)
+    assert beyond.max() < 0.05, "the servo had wound up"
+
+
+def test_gripper_opens_by_the_given_width(yard: Yard) -> None:
+    fingers = yard.robot.description.indices("gripper_left")
+    for opening in (0.0, 0.1):
+        yard.robot.command_gripper("gripper_left", opening)
+        assert yard.run(1.2)[-1, 0, fingers].sum() == pytest.approx(opening, abs=1e-4)
+
+
+def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard) -> None:
+    limits = yard.robot.description.base_limits
+    yard.robot.command_base(0.5, 0.4, yard.time)
+    speeds, turns = [], []
+    for _ in range(200):
+        yard.run(yard.rigid.dt)
+        _, velocity = yard.rigid.base("anna")
+        speeds.append(np.hypot(velocity[0], velocity[1]))
+        turns.append(velocity[5])
+    speeds = np.array(speeds)
+    commanded = 0.5 / limits.linear_acceleration
+    assert speeds[5] < 0.15, "it jumped"
+    assert speeds[48] == pytest.approx(0.5, abs=0.05)
+    assert turns[48] == pytest.approx(0.4, abs=0.02)
+    stopped = round((limits.timeout + commanded + 0.4) / yard.rigid.dt)
+    assert speeds[stopped:].max() < 0.03
+    assert np.abs(turns[stopped:]).max() < 0.01
+    yard.robot.command_base(9.0, 9.0, yard.time)
+    yard.run(0.45)
+    assert np.linalg.norm(yard.rigid.base("anna")[1][:2]) < limits.linear * 1.1
+
+
+def test_samples_agree_with_the_rigid_world(vinebot: Description) -> None:
+    """Oracle: MuJoCo's kinematics of every moving link; odometry: the way since the start."""
+    start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
+    yard = Yard(vinebot, start)
+    first = yard.robot.sample(0.0)
+    np.testing.assert_allclose(first.odom_q, frames.pose([0.0, 0.0, 0.0]), atol=1e-12)
+    yard.robot.command_position(vinebot.home + 0.05)
+    for _ in range(60):
+        yard.robot.command_base(0.4, 0.3, yard.time)
+        yard.run(yard.rigid.dt)
+    sample = yard.robot.sample(yard.time)
+    assert sample.transforms is first.transforms
+    assert sample.joints.names == vinebot.joints
+    for (parent, child), pose in zip(sample.transforms, sample.transform_q, strict=True):
+        expected = yard.robot.frame_pose(child)
+        found = frames.compose(yard.robot.frame_pose(parent), pose)
+        np.testing.assert_allclose(found[:3], expected[:3], atol=1e-9)
+        assert abs(found[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-9)
+    for (parent, child), pose in zip(vinebot.fixed, vinebot.fixed_q, strict=True):
+        found = frames.compose(yard.robot.frame_pose(parent), pose)
+        np.testing.assert_allclose(found[:3], yard.robot.frame_pose(child)[:3], atol=1e-9)
+    np.testing.assert_allclose(frames.compose(start, sample.odom_q), sample.base_q, atol=1e-9)
+    np.testing.assert_allclose(yard.robot.frame_pose("base_footprint"), sample.base_q, atol=1e-9)
+    assert np.linalg.norm(sample.odom_q[:3]) > 0.05
+
+
+def test_samples_keep_their_own_contacts(yard: Yard) -> None:
+    mine, other = (Contact(name, "link", 0, np.zeros(3), np.zeros(3), 0.0) for name in ("anna", "bert"))
+    assert yard.robot.sample(0.0, (other, mine)).contacts == (mine,)
+
+
+def test_two_runs_are_the_same_to_the_bit(vinebot: Description) -> None:
+    ends = []
+    for _ in range(2):
+        yard = Yard(vinebot)
+        yard.robot.command_position(vinebot.home * 0.7)
+        yard.robot.command_effort([3.0], ["head_1_joint"])
+        yard.robot.command_base(0.3, -0.2, 0.0)
+        ends.append(yard.run(1.0).tobytes())
+    assert ends[0] == ends[1]
+
+
+def test_stop_holds_everything_where_it_is(yard: Yard) -> None:
+    yard.robot.command_velocity(0.3 * yard.robot.speed)
+    yard.robot.command_base(0.5, 0.0, yard.time)
+    yard.run(0.3)
+    yard.robot.stop()
+    assert (yard.robot.interface == Interface.POSITION).all()
+    rows = yard.run(1.5)
+    np.testing.assert_allclose(rows[-1, 1], 0.0, atol=1e-3)
+    assert np.abs(yard.rigid.base("anna")[1]).max() < 0.02
+
+
+def test_wrong_commands_are_named(yard: Yard) -> None:
+    with pytest.raises(CommandError, match=r"anna has no drive for 'arm_left_9_joint'.*arm_left_1_joint"):
+        yard.robot.command_position([0.0], ["arm_left_9_joint"])
+    with pytest.raises(CommandError, match="2 values for 1 joints"):
+        yard.robot.command_position([0.0, 1.0], ["head_1_joint"])
+    with pytest.raises(CommandError, match=r"'head_2_joint' is not finite"):
+        yard.robot.command_effort([0.0, np.nan], ["head_1_joint", "head_2_joint"])
+    with pytest.raises(CommandError, match="base velocity"):
+        yard.robot.command_base(np.inf, 0.0, 0.0)
+
+
+def test_remote_copy_follows_its_original(vinebot: Description) -> None:
+    here = Yard(vinebot)
+    far = Rigid(assemble([]))
+    copy = RemoteRobot(far, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
+    home = vinebot.home.copy()
+    reach = here.robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint", "torso_lift_joint"])
+    joints, bases = [], []
+    for tick in range(300):
+        here.robot.command_position(home[reach] + 0.15 * np.sin(1.5 * here.time) * np.array([1, -1, 0.5]), reach)
+        here.robot.command_base(0.3, 0.2, here.time)
+        here.run(here.rigid.dt)
+        copy.follow(here.robot.update(here.time))
+        far.prep()
+        far.finish()
+        if tick > 50:
+            joints.append(np.abs(far.read("anna")[0] - here.rigid.read("anna")[0]).max())
+            bases.append(np.linalg.norm(far.base("anna")[0][:3] - here.rigid.base("anna")[0][:3]))
+    assert max(joints) < 0.01
+    assert max(bases) < 0.03
+    assert copy.sample(0.0).base_q[2] == 0.0
+    with pytest.raises(CommandError, match="same robot on both clients"):
+        copy.follow(RobotUpdate("anna", 0.0, np.zeros(7), np.zeros(6), np.zeros(3), np.zeros(3)))
+
+
+def test_robots_leave(yard: Yard, vinebot: Description) -> None:
+    second = Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
+    yard.run(0.05)
+    second.leave()
+    assert yard.rigid.robots == ("anna",)
+    np.testing.assert_allclose(yard.run(0.05)[-1, 0], vinebot.home, atol=1e-9)
+
+
+def test_foreign_robot_moves(tmp_path) -> None:
+    """Continuous joints have no limits; a mimicking finger follows through MuJoCo's equality."""
+    inertial = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    joints = """<joint name="spin_joint" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+        <limit effort="20" velocity="2"/></joint>
+      <joint name="left_joint" type="prismatic"><parent link="arm"/><child link="left"/><axis xyz="0 1 0"/>
+        <limit lower="0" upper="0.1" effort="50" velocity="0.1"/></joint>
+      <joint name="right_joint" type="prismatic"><parent link="arm"/><child link="right"/><axis xyz="0 -1 0"/>
+        <limit lower="0" upper="0.1" effort="50" velocity="0.1"/><mimic joint="left_joint" multiplier="0.5"/></joint>"""
+    links = "".join(f'<link name="{name}">{inertial}</link>' for name in ("arm", "left", "right"))
+    file = tmp_path / "foreign.urdf"
+    file.write_text(f'<robot name="foreign"><link name="base">{inertial}</link>{links}{joints}</robot>')
+    yard = Yard(load(file))
+    yard.robot.command_position([7.0, 0.08])
+    yard.run(5.0)
+    sample = yard.robot.sample(yard.time)
+    np.testing.assert_allclose(sample.joints.position, [7.0, 0.08], atol=2e-3)
+    right = sample.transforms.index(("arm", "right"))
+    np.testing.assert_allclose(sample.transform_q[right, :3], [0.0, -0.04, 0.0], atol=2e-3)
+    offset = yard.robot.frame_pose("right")[:3] - yard.robot.frame_pose("arm")[:3]
+    assert np.linalg.norm(offset) == pytest.approx(0.04, abs=2e-3)
+
+
+# ---------------------------------------------------------------------- F83: three interfaces that track
+
+
+@pytest.mark.parametrize("interface", ["position", "velocity", "effort"])
+def test_each_interface_tracks_a_swing(vinebot: Description, interface: str) -> None:
+    """0.3 rad at 0.4 Hz in shoulder and elbow; by effort a controller outside closes the loop at 100 Hz."""
+    yard, names = Yard(vinebot), ["arm_left_1_joint", "arm_left_4_joint"]
+    joints = yard.robot.joint_indices(names)
+    start, w, worst = yard.robot.setpoint[joints].copy(), 2.0 * np.pi * 0.4, 0.0
+    for _ in range(400):
+        t = yard.time + yard.rigid.dt
+        wanted = start + 0.15 * (1.0 - np.cos(w * t)) * np.array([1, -1])
+        rate = 0.15 * w * np.sin(w * t) * np.array([1, -1])
+        position, velocity, _, _ = yard.rigid.read("anna")
+        if interface == "position":
+            yard.robot.command_position(wanted, names)
+        elif interface == "velocity":
+            yard.robot.command_velocity(rate, names)
+        else:
+            effort = 1500.0 * (wanted - position[joints]) + 80.0 * (rate - velocity[joints])
+            yard.robot.command_effort(effort, names)
+        now = yard.run(yard.rigid.dt)[-1, 0, joints]
+        worst = max(worst, np.abs(now - wanted).max())
+    assert worst < {"position": 2e-3, "velocity": 2e-3, "effort": 1e-2}[interface]
+
+
+def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
+    yard.robot.command_position(yard.robot.description.home * 0.8)
+    yard.run(3.0)
+    joints = yard.robot.joint_indices(None)
+    for command in (
+        lambda: yard.robot.command_velocity(np.zeros(len(joints))),
+        lambda: yard.robot.command_elastic(yard.robot.sample(yard.time).elements.motor),
+        lambda: yard.robot.command_position(yard.rigid.read("anna")[0]),
+        lambda: yard.robot.command_effort(np.zeros(len(joints))),
+        lambda: yard.robot.command_velocity(np.zeros(len(joints))),
+    ):
+        before = yard.rigid.read("anna")[0].copy()
+        command()
+        rows = yard.run(0.5)
+        assert np.abs(rows[:, 0] - before).max() < 2e-4
+
+
+def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
+    """All of the effort is there at rest, as good as none at the largest speed."""
+    joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
+    yard.robot.command_effort([yard.robot.effort[joint]], ["arm_left_1_joint"])
+    rows = yard.run(1.5)[:, :, joint]
+    moving = rows[:, 0] < yard.robot.upper[joint] - 0.2
+    assert rows[moving, 1].max() == pytest.approx(yard.robot.speed[joint], rel=0.02)
+    assert rows[0, 2] == pytest.approx(yard.robot.effort[joint], rel=1e-6)
+    assert np.abs(rows[10:40, 2] - yard.rigid.weight("anna")[joint]).max() < 0.2 * yard.robot.effort[joint]
+
+
+# ---------------------------------------------------------------------- what sensors on it feel
+
+
+def hand_of(description: Description, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
+    """Mass [kg] of what hangs on the left wrist sensor, and its centre [3] in the base, from the URDF; at home."""
+    poses, mass, moment = description.frame_poses(description.home if position is None else position), 0.0, np.zeros(3)
+    for link in ElementTree.fromstring(description.urdf).iterfind("link"):
+        name = link.get("name")
+        if (name.startswith("gripper_left") or name == "wrist_left_ft_link") and link.find("inertial") is not None:
+            own = float(link.find("inertial/mass").get("value"))
+            at = np.array(link.find("inertial/origin").get("xyz").split(), float)
+            mass, moment = mass + own, moment + own * (poses[name][:3] + frames.rotate(poses[name][3:], at))
+    return mass, moment / mass
+
+
+def centre_of_hand(yard: Yard) -> np.ndarray:
+    """[3] in the base."""
+    return hand_of(yard.robot.description, yard.rigid.read("anna")[0])[1]
+
+
+def wrench_of(yard: Yard) -> tuple[np.ndarray, np.ndarray]:
+    """Force and torque [3] of the left wrist, world axes."""
+    wrench = next(w for w in yard.robot.sample(yard.time).wrenches if w.name == "wrist_left_ft")
+    turn = yard.robot.frame_pose(wrench.frame)[3:]
+    return frames.rotate(turn, wrench.force), frames.rotate(turn, wrench.torque)
+
+
+def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: Description) -> None:
+    yard.run(0.5)
+    force, torque = wrench_of(yard)
+    mass, centre = hand_of(vinebot)
+    down = np.array([0.0, 0.0, -9.81 * mass])
+    place = yard.robot.frame_pose("wrist_left_ft_link")[:3]
+    np.testing.assert_allclose(force, down, atol=0.01)
+    np.testing.assert_allclose(torque, np.cross(centre - place, down), atol=0.01)
+    push = np.array([6.0, -8.0, 3.0])
+    yard.rigid.push("anna", "gripper_left_base_link", push)
+    yard.run(3.0)
+    pushed, twisted = wrench_of(yard)
+    np.testing.assert_allclose(pushed - force, push, atol=0.03)
+    body = yard.rigid.world.body("anna/gripper_left_base_link").id
+    lever = yard.rigid.data.xipos[body] - yard.robot.frame_pose("wrist_left_ft_link")[:3]
+    np.testing.assert_allclose(twisted - torque, np.cross(lever, push), atol=0.03)
+    other = next(w for w in yard.robot.sample(yard.time).wrenches if w.name == "wrist_right_ft")
+    assert np.linalg.norm(other.force) == pytest.approx(9.81 * mass, rel=0.01)
+
+
+def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: Description) -> None:
+    """Inertia counts: as the lift drops and the hand with it, the wrist carries m (g + a)."""
+    hand, _ = hand_of(vinebot)
+    yard.run(0.2)
+    yard.robot.command_effort([-400.0], ["torso_lift_joint"])
+    heights, forces = [], []
+    for _ in range(8):
+        yard.run(yard.rigid.dt)
+        heights.append(centre_of_hand(yard)[2])
+        forces.append(wrench_of(yard)[0][2])
+    acceleration = np.diff(heights, 2) / yard.rigid.dt**2
+    assert acceleration.min() < -0.5
+    np.testing.assert_allclose(forces[2:], -hand * (9.81 + acceleration), atol=0.1)
+
+
+def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
+    yard.run(0.3)
+    imu = yard.robot.sample(yard.time).imus[0]
+    assert (imu.name, imu.frame) == ("base_imu", "base_imu_link")
+    np.testing.assert_allclose(imu.linear_acceleration, [0.0, 0.0, 9.81], atol=1e-3)
+    np.testing.assert_allclose(imu.angular_velocity, 0.0, atol=1e-6)
+    yard.robot.command_base(0.8, 0.0, yard.time)
+    yard.run(0.4)
+    imu = yard.robot.sample(yard.time).imus[0]
+    assert imu.linear_acceleration[0] == pytest.approx(yard.robot.description.base_limits.linear_acceleration, rel=0.05)
+    for _ in range(200):
+        yard.robot.command_base(0.5, 0.6, yard.time)
+        yard.run(yard.rigid.dt)
+    imu = yard.robot.sample(yard.time).imus[0]
+    x, y = yard.robot.description.frame_poses(yard.robot.description.home)["base_imu_link"][:2]
+    np.testing.assert_allclose(imu.angular_velocity, [0.0, 0.0, 0.6], atol=0.005)
+    expected = [-(0.6**2) * x, 0.5 * 0.6 - 0.6**2 * y, 9.81]
+    np.testing.assert_allclose(imu.linear_acceleration, expected, atol=0.02)
+
+
+# ---------------------------------------------------------------------- odometry
+
+
+@pytest.mark.parametrize(("ahead", "turning"), [(0.0, 0.0), (0.08, 0.0), (0.05, 0.2)])
+def test_odometry_believes_in_what_the_tracks_travelled(vinebot: Description, ahead: float, turning: float) -> None:
+    """Straight on, then a turn on the spot: travel = way / (1 - slip)."""
+    limits = msgspec.structs.replace(vinebot.base_limits, slip=(ahead, turning))
+    start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
+    yard = Yard(dataclasses.replace(vinebot, base_limits=limits), start)
+    for drive in ((0.5, 0.0), (0.0, 0.8)):
+        for _ in range(250):
+            yard.robot.command_base(*drive, yard.time)
+            yard.run(yard.rigid.dt)
+        yard.run(1.5)
+        sample = yard.robot.sample(yard.time)
+        way = frames.compose(frames.inverse(start), sample.base_q)
+        assert sample.odom_q[0] == pytest.approx(way[0] / (1.0 - ahead), abs=2e-3)
+        assert sample.odom_q[1] == pytest.approx(way[1], abs=2e-3)
+        turned, believed = (2.0 * np.arctan2(q[5], q[6]) for q in (way, sample.odom_q))
+        assert believed == pytest.approx(turned / (1.0 - turning), abs=2e-3)
+    assert turned > 1.5
+
+
+# ---------------------------------------------------------------------- grippers and cutters
+
+
+def bunch_in_hand(description: Description, effort: float) -> tuple[Yard, int]:
+    """A loose round bunch of 0.3 kg between the fingers of the left hand, held with ``effort`` [N] each."""
+    yard = Yard(description)
+    yard.robot.command_gripper("gripper_left", 0.08)
+    yard.run(0.5)
+    middle = yard.robot.frame_pose("gripper_left_grasping_link")
+    ball = Loose(0.3, np.zeros(3), np.full(3, 1e-4), np.zeros(3), np.zeros((1, 3)), np.zeros((1, 3)), np.array([0.03]))
+    yard.rigid.add_bunch(0, ball, middle, np.zeros(6))
+    yard.robot.command_gripper("gripper_left", 0.0, effort)
+    body = yard.rigid.world.body("loose/0").id
+    weight = yard.rigid.data.xfrc_applied[body]
+    weight[2] = 0.3 * 9.81  # somebody holds it until it is held
+    yard.run(1.0)
+    weight[:] = 0.0
+    yard.run(1.0)
+    return yard, body
+
+
+def slid(yard: Yard, body: int, force: np.ndarray) -> float:
+    """How far a bunch moves in the hand [m] within a second of a pull."""
+
+    def place() -> np.ndarray:
+        hand = yard.robot.frame_pose("gripper_left_grasping_link")
+        return frames.compose(frames.inverse(hand), yard.rigid.bunch_pose(0))[:3]
+
+    before = place()
+    yard.rigid.data.xfrc_applied[body, :3] = force
+    yard.run(1.0)
+    return float(np.linalg.norm(place() - before))
+
+
+def test_a_bunch_is_held_by_friction_and_no_more(vinebot: Description) -> None:
+    """Two pads of 15 N and mu 0.8 hold 24 N: with the weight of 2.9 N, 16 N more hold and 25 N more do not."""
+    yard, body = bunch_in_hand(vinebot, 15.0)
+    fingers = vinebot.indices("gripper_left")
+    squeeze = yard.rigid.read("anna")[3][fingers]
+    np.testing.assert_allclose(squeeze, 15.0, atol=0.3 * 9.81 * 0.2)  # the hand is tilted: a bit of the bunch's weight
+    along = frames.rotate(yard.robot.frame_pose("gripper_left_grasping_link")[3:], np.array([0.0, 0.0, -1.0]))
+    assert slid(yard, body, 16.0 * along) < 1e-3
+    assert slid(yard, body, 25.0 * along) > 0.02
+
+
+def test_a_held_bunch_weighs_on_the_wrist_what_it_weighs(vinebot: Description) -> None:
+    yard, _ = bunch_in_hand(vinebot, 30.0)
+    mass, _ = hand_of(vinebot)
+    np.testing.assert_allclose(wrench_of(yard)[0], [0.0, 0.0, -9.81 * (mass + 0.3)], atol=0.05)
+
+
+def test_gripper_commands_that_make_no_sense_are_named(yard: Yard) -> None:
+    with pytest.raises(CommandError, match=r"no gripper 'claw'.*gripper_left"):
+        yard.robot.command_gripper("claw", 0.1)
+    with pytest.raises(CommandError, match="gripper effort -1"):
+        yard.robot.command_gripper("gripper_left", 0.1, -1.0)
+    with pytest.raises(CommandError, match="no cutter at 'gripper_left'; cutters fitted: none"):
+        yard.robot.command_cutter("gripper_left")
+
+
+def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: Description) -> None:
+    """Beside the peduncle it cuts nothing, over it the bunch; and the wrist feels the vine that touches the hand."""
+    model, body, _ = bunch_scene()
+    stalk = Physics(model).view().body_q[body - 1, :3].astype(float)
+    cutter = next(c for c in vinebot.cutters if c.group == "gripper_left")
+    home = vinebot.frame_poses(vinebot.home)[cutter.frame]
+    ahead = np.array([cutter.half[0] - 0.005, 0.0, 0.0])  # before the blades' cover, not in it
+    mouth = frames.compose(home, frames.pose(np.array(cutter.origin) + ahead))[:3]
+    physics = Physics(model)
+    robot = Robot(physics.rigid, vinebot, "anna", pose=frames.pose(stalk - mouth + np.array([-0.1, 0.0, 0.0])))
+    robot.fit_cutters(physics)
+
+    def cut(group: str) -> tuple:
+        robot.command_cutter(group)
+        robot.control(physics.time)
+        physics.step()
+        return physics.partings
+
+    assert cut("gripper_left") == ()
+    physics.rigid.place("anna", frames.pose(stalk - mouth), vinebot.home)
+    assert cut("gripper_right") == ()
+    (parting,) = cut("gripper_left")
+    assert (parting.bunch, parting.cause, parting.actor) == (0, "blade", "anna")
+    robot.leave()
+    assert physics.parting.blades == []
+    physics.step()
+
+
+def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
+    """Oracle: MuJoCo knows nothing of them, so weight and contact forces must make up the reading at rest."""
+    description = load("vinebot")
+    model, _, middle = bunch_scene()
+    physics = Physics(model)
+    tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
+    ahead = np.array([0.15, 0.0, 0.0])  # it comes from beyond the cane's tip
+    place = middle + ahead - frames.rotate(frames.yaw(np.pi), tip)
+    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
+    met = 0
+    for _ in range(900):
+        met += any(c.link.startswith("gripper_left") for c in physics.contacts)
+        if met < 20:
+            robot.command_base(0.2, 0.0, physics.time)
+        robot.control(physics.time)
+        physics.step()
+    sample = robot.sample(physics.time, physics.contacts)
+    hand = [c for c in sample.contacts if c.link.startswith("gripper_left")]
+    force = np.sum([c.force for c in hand], axis=0)
+    assert np.linalg.norm(force) > 0.3
+    wrench = next(w for w in sample.wrenches if w.name == "wrist_left_ft")
+    turn = robot.frame_pose(wrench.frame)[3:]
+    mass, _ = hand_of(description)
+    felt = frames.rotate(turn, wrench.force) + np.array([0.0, 0.0, 9.81 * mass])
+    np.testing.assert_allclose(felt, force, atol=0.05)
+
+
+def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
+    """All joints soft, a set-point behind the bunch: at rest K times what is missing is what the plants press."""
+    description = load("vinebot")
+    model, _, middle = bunch_scene()
+    physics = Physics(model)
+    tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
+    place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.yaw(np.pi), tip)
+    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
+    joints = description.indices("arm_left")
+    stiffness = np.array([60.0, 60.0, 40.0, 40.0, 15.0, 15.0, 15.0])
+    robot.command_impedance(stiffness, 0.2 * stiffness, joints)
+    robot.control(physics.time)
+    physics.step()
+    here = robot.frame_pose("gripper_left_grasping_link")[:3]
+    J = physics.rigid.jacobian("anna", "gripper_left_grasping_link", here)[:3, joints]
+    wanted = robot.setpoint[joints] + np.linalg.pinv(J) @ np.array([-0.25, 0.0, 0.0])
+    robot.command_position(wanted, joints)
+    for _ in range(1500):
+        robot.control(physics.time)
+        physics.step()
+    position, velocity, _, contact = physics.rigid.read("anna")
+    assert any(c.link.startswith("gripper_left") for c in physics.contacts)
+    assert np.abs(contact[joints]).max() > 0.3
+    assert np.abs(velocity[joints]).max() < 2e-3
+    np.testing.assert_allclose(stiffness * (wanted - position[joints]), -contact[joints], atol=0.03)

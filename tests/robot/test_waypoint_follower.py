@@ -1,0 +1,66 @@
+"""A base on its way: points in their order, the heading at the end, and an obstacle that is noticed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.robot.control.waypoint_follower import PATIENCE, Way
+from vinesim.robot.description.description import load
+from vinesim.robot.drives import Robot
+from vinesim.scene.builder import assemble
+
+
+def heading(pose: np.ndarray) -> float:
+    return 2.0 * float(np.arctan2(pose[5], pose[6]))
+
+
+def drive(way: Way, seconds: float = 60.0) -> np.ndarray:
+    """Poses of the base [tick, 7] until the way is done, or the base stuck."""
+    robot, poses = way.robot, []
+    while not way.done and not way.stuck and len(poses) < 100 * seconds:
+        time = 0.01 * len(poses)
+        way.control(time)
+        robot.control(time)
+        robot.rigid.prep()
+        robot.rigid.finish()
+        poses.append(robot.rigid.base(robot.name)[0])
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_points_are_passed_in_their_order_and_the_heading_is_the_last(backwards: bool):
+    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    points = np.array([[1.0, 0.5], [1.0, 1.5], [0.2, 1.0]])
+    way = Way(robot, points, 2.0, backwards=backwards)
+    poses = drive(way)
+    assert way.done
+    off = np.linalg.norm(poses[:, None, :2] - points, axis=-1)
+    assert (off.min(0) < 0.015).all()
+    assert (np.diff(off.argmin(0)) > 0).all()
+    assert heading(poses[-1]) == pytest.approx(2.0, abs=0.02)
+    # straight between the points, looking along each leg or back along it
+    leg = poses[off[:, 0].argmin() + 1 : off[:, 1].argmin(), :2]
+    assert np.abs(leg[:, 0] - 1.0).max() < 0.03
+    middle = poses[int(0.5 * (off[:, 0].argmin() + off[:, 1].argmin()))]
+    assert np.cos(heading(middle) - (-1.0 if backwards else 1.0) * np.pi / 2) > 0.99
+
+
+def test_a_base_keeps_to_its_speeds():
+    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    poses = drive(Way(robot, np.array([[2.0, 0.0]]), 1.0, speed=0.4, turn=0.3))
+    assert np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).max() / 0.01 < 1.1 * 0.4
+    assert np.abs(np.diff([heading(pose) for pose in poses])).max() / 0.01 < 1.1 * 0.3
+
+
+def test_an_obstacle_is_noticed():
+    wall = {"fixed_start": [[1.0, 0.0, -0.3]], "fixed_end": [[1.0, 0.0, 2.0]], "fixed_radius": [[0.1, 0.1]]}
+    robot = Robot(Rigid(assemble([], **wall)), load("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0]))
+    way = Way(robot, np.array([[2.0, 0.0]]))
+    poses = drive(way, 30.0)
+    assert way.stuck
+    assert not way.done
+    assert poses[-1][0] < 1.0
+    assert len(poses) > 100 * PATIENCE

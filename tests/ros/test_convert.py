@@ -1,0 +1,345 @@
+"""Values to ROS messages and back, exactly."""
+
+# ruff: noqa: E402 (messages are imported only where ROS is installed)
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vinesim import frames
+from vinesim.ros import ros_setup
+
+pytestmark = pytest.mark.ros
+if ros_setup.available() is not None:
+    pytest.skip(str(ros_setup.available()), allow_module_level=True)
+
+from geometry_msgs.msg import TransformStamped, TwistStamped
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Image, PointCloud2, PointField
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from vinesim.ros.messages import convert, interfaces
+from vinesim.ros.messages.transforms import Transforms, split
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
+
+INFO = CameraInfo(64, 48, 50.0, 51.0, 31.5, 23.5, "head_front_camera_optical")
+
+
+def camera_frame(seed: int = 0) -> CameraFrame:
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.2, 5.0, (48, 64)).astype(np.float32)
+    depth[0, 0], depth[0, 1], depth[0, 2] = np.nan, np.inf, -np.inf
+    rgb = rng.integers(0, 256, (48, 64, 3), np.uint8)
+    labels = rng.integers(0, 2**31 - 1, (48, 64), np.int32)
+    return CameraFrame(12.34, "head_front_camera", INFO, frames.pose(np.zeros(3)), rgb, depth, labels)
+
+
+def lidar_scan(count: int) -> LidarScan:
+    rng = np.random.default_rng(1)
+    xyz = rng.normal(size=(count, 3)).astype(np.float32)
+    intensity = rng.uniform(0, 255, count).astype(np.float32)
+    ring = rng.integers(0, 65536, count).astype(np.uint16)
+    offset = np.linspace(0.0, 0.1, count, dtype=np.float32)
+    labels = np.zeros(count, np.int32)
+    return LidarScan(2.0, "lidar", "lidar_link", frames.pose(np.zeros(3)), xyz, intensity, ring, offset, labels)
+
+
+def over_the_wire(message):
+    """What a peer gets: the message through its serialised form."""
+    return deserialize_message(serialize_message(message), type(message))
+
+
+def points(cloud: PointCloud2) -> np.ndarray:
+    """A cloud read as a stranger would: by its own fields."""
+    formats = {PointField.FLOAT32: "f4", PointField.UINT16: "u2", PointField.UINT8: "u1"}
+    dtype = np.dtype(
+        {
+            "names": [f.name for f in cloud.fields],
+            "formats": [formats[f.datatype] for f in cloud.fields],
+            "offsets": [f.offset for f in cloud.fields],
+            "itemsize": cloud.point_step,
+        }
+    )
+    assert cloud.row_step == cloud.point_step * cloud.width
+    assert len(cloud.data) == cloud.row_step * cloud.height
+    return np.frombuffer(cloud.data, dtype).reshape(cloud.height, cloud.width)
+
+
+@given(st.integers(0, 2**31 * 10**6 - 1))
+def test_stamp_keeps_every_microsecond(microseconds):
+    seconds, nanoseconds = split(microseconds * 1e-6)
+    assert 0 <= nanoseconds < 10**9
+    assert abs(seconds * 10**9 + nanoseconds - microseconds * 1000) <= 300  # half a float64 spacing at 2^31 s
+
+
+def test_stamp_of_ticks_is_exact():
+    for tick in range(0, 400_000, 37):
+        seconds, nanoseconds = split(tick / 100)
+        assert seconds * 100 + nanoseconds // 10_000_000 == tick
+        assert nanoseconds % 10_000_000 == 0
+
+
+@pytest.mark.parametrize(
+    ("convert_image", "field", "encoding", "dtype", "channels"),
+    [
+        (convert.rgb_image, "rgb", "rgb8", np.uint8, 3),
+        (convert.depth_image, "depth", "32FC1", np.float32, 1),
+        (convert.label_image, "labels", "32SC1", np.int32, 1),
+    ],
+)
+def test_image_round_trip_is_bitwise(convert_image, field, encoding, dtype, channels):
+    frame = camera_frame()
+    image = over_the_wire(convert_image(frame))
+    assert (image.encoding, image.height, image.width) == (encoding, 48, 64)
+    assert image.step == 64 * channels * np.dtype(dtype).itemsize
+    assert (image.header.frame_id, image.header.stamp.sec, image.header.stamp.nanosec) == (
+        INFO.frame_id,
+        12,
+        340_000_000,
+    )
+    assert bytes(image.data) == getattr(frame, field).tobytes()
+
+
+def test_image_of_a_strided_array_is_the_same():
+    frame = camera_frame()
+    mirrored = CameraFrame(
+        frame.time, frame.name, INFO, frame.pose, frame.rgb[:, ::-1], frame.depth[:, ::-1], frame.labels[:, ::-1]
+    )
+    assert bytes(convert.rgb_image(mirrored).data) == frame.rgb[:, ::-1].tobytes()
+
+
+def test_image_of_wrong_size_says_so():
+    frame = camera_frame()
+    small = CameraFrame(frame.time, "left", INFO, frame.pose, frame.rgb[:10], frame.depth, frame.labels)
+    with pytest.raises(ValueError, match="camera left: rgb8 picture is 64x10, its info says 64x48"):
+        convert.rgb_image(small)
+
+
+def test_depth_image_keeps_what_has_no_return():
+    depth = np.frombuffer(over_the_wire(convert.depth_image(camera_frame())).data, np.float32)
+    assert math.isnan(depth[0])
+    assert depth[1] == math.inf
+    assert depth[2] == -math.inf
+
+
+def test_depth_in_millimetres():
+    frame = camera_frame()
+    image = convert.depth_image_millimetres(frame)
+    assert image.encoding == "16UC1"
+    millimetres = np.frombuffer(image.data, np.uint16).reshape(48, 64)
+    assert millimetres[0, :3].tolist() == [0, 0, 0]
+    assert np.abs(millimetres[1:] - 1000.0 * frame.depth[1:]).max() <= 0.5001
+
+
+def test_compressed_image_shows_the_same_colours():
+    cv2 = pytest.importorskip("cv2")
+    frame = camera_frame()
+    plain = CameraFrame(
+        0.0, "c", INFO, frame.pose, np.full((48, 64, 3), (200, 100, 30), np.uint8), frame.depth, frame.labels
+    )
+    message = convert.compressed_image(plain)
+    assert "jpeg" in message.format
+    decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert np.abs(decoded.astype(int) - plain.rgb).max() <= 4
+
+
+def test_label_map_takes_labels_apart():
+    known = json.loads(convert.label_map().data)
+    value = label(Organ.BUNCH, 4711)
+    assert known["organs"][str(value // known["stride"])] == "bunch"
+    assert value % known["stride"] == 4711
+
+
+def test_camera_info_projects_like_the_camera():
+    message = over_the_wire(convert.camera_info(INFO, 3.0))
+    projection = np.array(message.p).reshape(3, 4)
+    u, v, w = projection @ [0.3, -0.2, 2.0, 1.0]
+    assert u / w == pytest.approx(50.0 * 0.15 + 31.5)
+    assert v / w == pytest.approx(51.0 * -0.1 + 23.5)
+    assert np.array_equal(np.array(message.k).reshape(3, 3), projection[:, :3])
+    assert message.distortion_model == "plumb_bob"
+    assert list(message.d) == [0.0] * 5
+
+
+def test_depth_cloud_projects_back_onto_its_pixels():
+    frame = camera_frame()
+    message = over_the_wire(convert.depth_cloud(frame))
+    assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
+        (name, 4 * i, PointField.FLOAT32) for i, name in enumerate(("x", "y", "z", "rgb"))
+    ]
+    cloud = points(message)
+    assert np.isnan(cloud["x"][0, :3]).all()
+    assert np.isnan(cloud["z"][0, :3]).all()
+    assert not message.is_dense
+    seen = np.isfinite(cloud["z"])
+    v, u = np.nonzero(seen)
+    assert np.abs(INFO.fx * cloud["x"][seen] / cloud["z"][seen] + INFO.cx - u).max() < 1e-4
+    assert np.abs(INFO.fy * cloud["y"][seen] / cloud["z"][seen] + INFO.cy - v).max() < 1e-4
+    assert np.array_equal(cloud["z"][seen], frame.depth[seen])
+    packed = np.ascontiguousarray(cloud["rgb"]).view(np.uint32)
+    assert np.array_equal(np.stack([packed >> 16, packed >> 8 & 255, packed & 255], -1), frame.rgb)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_lidar_cloud_round_trip_is_exact(count):
+    scan = lidar_scan(count)
+    message = over_the_wire(convert.lidar_cloud(scan))
+    assert [f.name for f in message.fields] == ["x", "y", "z", "intensity", "ring", "time"]
+    assert (message.height, message.width, message.header.frame_id) == (1, count, "lidar_link")
+    if count:
+        cloud = points(message)[0]
+        assert np.array_equal(np.stack([cloud["x"], cloud["y"], cloud["z"]], -1), scan.xyz)
+        assert np.array_equal(cloud["intensity"], scan.intensity)
+        assert np.array_equal(cloud["ring"], scan.ring)
+        assert np.array_equal(cloud["time"], scan.offset)
+
+
+def test_a_lidar_with_two_returns_says_which_is_which():
+    """One more field in what was padding: readers of x y z intensity ring time find them where they were."""
+    scan = lidar_scan(6)
+    dual = dataclasses.replace(scan, returned=np.array([1, 1, 2, 1, 2, 1], np.uint8))
+    message, plain = (over_the_wire(convert.lidar_cloud(s)) for s in (dual, scan))
+    assert [f.name for f in message.fields] == ["x", "y", "z", "intensity", "ring", "return_type", "time"]
+    assert message.point_step == plain.point_step
+    assert points(message)[0]["return_type"].tolist() == [1, 1, 2, 1, 2, 1]
+    where = {f.name: f.offset for f in message.fields}
+    assert {f.name: f.offset for f in plain.fields} == {k: v for k, v in where.items() if k != "return_type"}
+
+
+def joint_sample() -> JointSample:
+    position = np.array([0.1, -0.2])
+    return JointSample(7.25, ("a_joint", "b_joint"), position, 2 * position, 3 * position, 4 * position)
+
+
+def test_joint_state_round_trip_is_exact():
+    message = over_the_wire(convert.joint_state(joint_sample()))
+    assert message.name == ["a_joint", "b_joint"]
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (7, 250_000_000)
+    assert list(message.position) == [0.1, -0.2]
+    assert list(message.velocity) == [0.2, -0.4]
+    assert list(message.effort) == (3 * np.array([0.1, -0.2])).tolist()
+
+
+def test_odometry_velocity_is_in_the_axes_of_the_base():
+    turned = frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(math.pi / 2))
+    ahead = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.3])  # it looks along world y, and drives there
+    sample = RobotSample("r", joint_sample(), turned, ahead, turned, (), np.zeros((0, 7)))
+    twist = over_the_wire(convert.odometry(sample, "base_footprint")).twist.twist
+    assert (twist.linear.x, twist.linear.y) == pytest.approx((0.5, 0.0), abs=1e-12)
+    assert twist.angular.z == pytest.approx(0.3)
+
+
+def test_wrench_is_the_same_force_seen_from_the_link():
+    link = frames.pose(np.array([1.0, 0.0, 1.0]), frames.yaw(math.pi / 2))
+    force, position = np.array([0.0, 2.0, 0.0]), np.array([1.5, 0.0, 1.0])
+    contact = Contact("r", "finger", 3, position, force, -0.001)
+    message = over_the_wire(convert.wrench(contact, 1.0, "finger", link)).wrench
+    assert (message.force.x, message.force.y, message.force.z) == pytest.approx((2.0, 0.0, 0.0), abs=1e-12)
+    world_torque = np.cross(position - link[:3], force)
+    seen = np.array([message.torque.x, message.torque.y, message.torque.z])
+    assert frames.rotate(link[3:], seen) == pytest.approx(world_torque, abs=1e-12)
+
+
+def test_transforms_equal_stock_serialisation_field_for_field():
+    interfaces.ensure(["tf2_msgs"])
+    from tf2_msgs.msg import TFMessage
+
+    pairs = [("map", "odom"), ("odom", "b"), ("b", "arm_left_1_link"), ("", "xyz"), ("é", "four")]
+    rng = np.random.default_rng(2)
+    buffer = Transforms(pairs)
+    for time in (1.5, 2.25):  # the same buffer again: nothing of the first remains
+        poses = rng.normal(size=(len(pairs), 7))
+        stock = TFMessage()
+        for (parent, child), q in zip(pairs, poses, strict=True):
+            transform = TransformStamped(header=convert.header(time, parent), child_frame_id=child)
+            v, r = transform.transform.translation, transform.transform.rotation
+            v.x, v.y, v.z = map(float, q[:3])
+            r.x, r.y, r.z, r.w = map(float, q[3:])  # xyzw, as everywhere
+            stock.transforms.append(transform)
+        ours = buffer.message(time, poses)
+        assert deserialize_message(ours, TFMessage) == stock
+        assert len(ours) == len(serialize_message(stock))  # only the padding may differ: stock leaves it as it was
+    assert deserialize_message(Transforms([]).message(0.0, np.zeros((0, 7))), TFMessage) == TFMessage()
+
+
+def test_transforms_want_one_pose_per_frame():
+    with pytest.raises(ValueError, match=r"shape \(2, 7\), expected \(1, 7\)"):
+        Transforms([("a", "b")]).message(0.0, np.zeros((2, 7)))
+
+
+def test_base_velocity_comes_back():
+    message = TwistStamped(header=convert.header(3.5, "base_footprint"))
+    message.twist.linear.x, message.twist.angular.z = 0.4, -0.2
+    velocity = convert.base_velocity(over_the_wire(message))
+    assert velocity.time == 3.5
+    assert velocity.linear.tolist() == [0.4, 0.0, 0.0]
+    assert velocity.angular.tolist() == [0.0, 0.0, -0.2]
+    message.twist.linear.y = math.nan
+    with pytest.raises(convert.CommandError, match="not finite"):
+        convert.base_velocity(message)
+
+
+def test_joint_positions_come_back():
+    commands = convert.joint_positions(over_the_wire(Float64MultiArray(data=[1.0, -2.5])), "forward")
+    assert commands.positions.tolist() == [1.0, -2.5]
+    with pytest.raises(convert.CommandError, match="not finite"):
+        convert.joint_positions(Float64MultiArray(data=[math.inf]), "forward")
+
+
+def trajectory(*points: tuple[float, list[float], list[float]]) -> JointTrajectory:
+    message = JointTrajectory(joint_names=["a", "b"])
+    for time, positions, velocities in points:
+        point = JointTrajectoryPoint(positions=positions, velocities=velocities)
+        point.time_from_start.sec, point.time_from_start.nanosec = int(time), round(time % 1 * 1e9)
+        message.points.append(point)
+    return message
+
+
+def test_joint_trajectory_comes_back():
+    message = trajectory((0.5, [1.0, 2.0], [0.1, 0.2]), (1.25, [3.0, 4.0], [0.0, 0.0]))
+    value = convert.joint_trajectory(over_the_wire(message), "arm_left_controller")
+    assert value.joints == ("a", "b")
+    assert value.times.tolist() == [0.5, 1.25]
+    assert value.positions.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert value.velocities is not None
+    assert value.velocities.tolist() == [[0.1, 0.2], [0.0, 0.0]]
+    assert convert.joint_trajectory(trajectory((1.0, [1.0, 2.0], [])), "c").velocities is None
+    assert convert.joint_trajectory(trajectory(), "c").positions.shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (trajectory((0.5, [1.0], [])), "point 0 has 1 positions and 0 velocities for 2 joints"),
+        (trajectory((0.5, [1.0, 2.0], [1.0])), "point 0 has 2 positions and 1 velocities"),
+        (trajectory((0.5, [1.0, 2.0], []), (0.5, [1.0, 2.0], [])), "does not rise"),
+        (trajectory((0.5, [1.0, math.nan], [])), "not finite"),
+    ],
+)
+def test_bad_trajectories_are_refused_in_words(message, words):
+    with pytest.raises(convert.CommandError, match=words):
+        convert.joint_trajectory(message, "arm_left_controller")
+
+
+def test_diagnostics_carry_the_figures():
+    message = over_the_wire(convert.diagnostics(1.0, "client", {"real_time_factor": 0.5, "dropped": 3}, healthy=False))
+    status = message.status[0]
+    assert {value.key: value.value for value in status.values} == {"real_time_factor": "0.5", "dropped": "3"}
+    assert status.level == b"\x01"
+
+
+def test_filling_copies_so_that_the_value_stays_its_owners():
+    frame = camera_frame()
+    image = convert.rgb_image(frame)
+    before = bytes(image.data)
+    frame.rgb[...] = 0
+    assert isinstance(image, Image)
+    assert bytes(image.data) == before

@@ -1,0 +1,114 @@
+"""Message packages built from definitions equal the official ones."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from vinesim.ros import ros_setup
+from vinesim.ros.messages import interfaces
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(ros_setup.available() is not None, reason=str(ros_setup.available())),
+]
+
+# As `ros2 topic info --verbose /tf` prints it on ROS 2 Jazzy.
+OFFICIAL = {
+    "tf2_msgs/msg/TFMessage": "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "tf2_msgs/msg/TF2Error": "RIHS01_db2485e7d6a0ec75bf087e058ee45df682acc3a621ca7780503d10aac141809a",
+}
+
+ASK_HASHES = """
+import rclpy
+from rclpy.context import Context
+from vinesim.ros import interfaces
+interfaces.ensure(["tf2_msgs"])
+from tf2_msgs.msg import TF2Error, TFMessage
+context = Context()
+context.init([])
+node = rclpy.create_node("ask", context=context, start_parameter_services=False)
+for message in (TFMessage, TF2Error):
+    node.create_publisher(message, message.__name__, 1)
+    for info in node.get_publishers_info_by_topic("/" + message.__name__):
+        print(info.topic_type, info.topic_type_hash)
+node.destroy_node()
+context.shutdown()
+"""
+
+BUILD = "import sys; from vinesim.ros import interfaces; sys.stdout.write(str(interfaces.build('tf2_msgs')))"
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> str:
+    return str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture
+def own_cache(cache, monkeypatch) -> str:
+    monkeypatch.setenv("XDG_CACHE_HOME", cache)
+    return cache
+
+
+def test_two_processes_build_at_once_and_agree(cache):
+    surroundings = os.environ | {"XDG_CACHE_HOME": cache}
+    builds = [
+        subprocess.Popen([sys.executable, "-c", BUILD], env=surroundings, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    places = [build.communicate(timeout=120)[0] for build in builds]
+    assert [build.returncode for build in builds] == [0, 0]
+    assert places[0] == places[1]
+    built = sorted(os.listdir(os.path.join(cache, "vinesim", "interfaces")))
+    assert built == [os.path.basename(places[0])]  # no scratch left behind
+
+
+def test_type_hashes_are_the_official_ones(own_cache):
+    surroundings = os.environ | {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)}
+    asked = subprocess.run(
+        [sys.executable, "-c", ASK_HASHES], env=surroundings, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert dict(line.split() for line in asked.stdout.splitlines()) == OFFICIAL
+
+
+def test_what_can_be_imported_is_not_built(own_cache, monkeypatch):
+    def refuse(package: str):
+        raise AssertionError(f"built {package}")
+
+    monkeypatch.setattr(interfaces, "build", refuse)
+    interfaces.ensure(["std_msgs", "sensor_msgs"])
+
+
+def test_unknown_package_names_the_folder():
+    with pytest.raises(interfaces.InterfacesError, match=r"'no_such_msgs'.*add its \.msg files to .*msgs/no_such_msgs"):
+        interfaces.build("no_such_msgs")
+
+
+def test_missing_compiler_names_the_remedy(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    which = shutil.which
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == "g++" else which(name))
+    with pytest.raises(interfaces.InterfacesError, match=r"g\+\+ is missing; apt install g\+\+"):
+        interfaces.build("tf2_msgs")
+
+
+def test_missing_generators_name_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rosidl_generator_py" else find(name))
+    with pytest.raises(interfaces.InterfacesError, match=r"vinesim\[ros\]"):
+        interfaces.build("tf2_msgs")
+
+
+def test_a_changed_definition_changes_the_key(tmp_path, monkeypatch):
+    before = interfaces._key("tf2_msgs")
+    monkeypatch.setattr(interfaces, "DEFINITIONS", tmp_path)
+    folder = tmp_path / "tf2_msgs" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\nuint8 more\n")
+    assert interfaces._key("tf2_msgs") != before

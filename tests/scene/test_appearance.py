@@ -1,0 +1,231 @@
+"""What people and crates look like: as large as what touches, closed, mirrored, labelled, and read from files."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.support import sensor_scenes
+from vinesim import frames
+from vinesim.kernels.shading import materials
+from vinesim.physics.rigid.human_body import PARTS, figure, hand_shapes, standing
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.static_world import CRATE_WALL
+from vinesim.robot.description import description
+from vinesim.scene import appearance
+from vinesim.scene.appearance import FigureError
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.values import HumanSpec, Link, Mesh, Shape
+from vinesim.sensors.camera.camera import Camera
+from vinesim.sensors.export.images import looking
+from vinesim.sensors.scene import rigid_primitives
+
+ROOM = 0.06
+"""[m] So much of what touches may lie outside what is seen: hips are wider than a waist in trousers."""
+SIZES = [(0.6, 0.4, 0.15), (0.6, 0.4, 0.24), (0.6, 0.4, 0.3), (0.4, 0.3, 0.24)]
+
+
+def person(name: str, height: float = 1.75) -> Rigid:
+    rigid = Rigid(sensor_scenes.empty())
+    pose = appearance.posed(standing(frames.pose(np.zeros(3)), height), name, height)
+    rigid.add_human(HumanSpec("eva", 4, pose, height))
+    rigid.prep()
+    rigid.finish()
+    return rigid
+
+
+def silhouette(shapes: tuple[Link, ...], poses: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Pixels [height, width] that show a person who stands at the origin."""
+    primitives, _ = sensor_scenes.world(*shapes, at=poses)
+    _, seen = sensor_scenes.raster(primitives, looking(eye, np.array([0.0, 0.0, 0.95])))
+    names = np.where(seen >= 0, primitives.label[np.maximum(seen, 0)], 0)
+    return names == label(Organ.HUMAN, 4)
+
+
+@pytest.mark.parametrize("side", [0.0, 0.8, 1.6, 3.14, 4.4])
+@pytest.mark.parametrize("height", [1.6, 1.9])
+def test_a_person_looks_as_large_as_what_touches(side: float, height: float) -> None:
+    """From anywhere what is drawn, grown by a few centimetres, covers the bodies that touch, and nearly the reverse."""
+    rigid = person("stand", height)
+    eye = 4.0 * np.array([np.cos(side), np.sin(side), 0.0]) + [0.0, 0.0, 1.3]
+    seen = silhouette(rigid.links(), rigid.link_q(), eye)
+    touching = dict(zip(PARTS, ((shape,) for shape in figure(height)), strict=True))
+    touching |= {f"{hand}_hand": hand_shapes(hand) for hand in ("left", "right")}
+    rows = [i for i, link in enumerate(rigid.links()) if link.name.partition("/")[2] in touching]
+    named = [rigid.links()[i].name for i in rows]
+    bodies = tuple(Link(name, Organ.HUMAN, 4, touching[name.partition("/")[2]]) for name in named)
+    felt = silhouette(bodies, rigid.link_q()[rows], eye)
+    reach = round(ROOM * sensor_scenes.SMALL.fx / 4.0)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    assert felt.sum() > 500
+    assert not (felt & (cv2.dilate(seen.astype(np.uint8), disc) == 0)).any()
+    # arms, neck and a hat's brim touch nothing
+    assert (seen & (cv2.dilate(felt.astype(np.uint8), disc) == 0)).sum() < 0.25 * seen.sum()
+
+
+def test_everything_drawn_of_somebody_carries_that_label() -> None:
+    rigid = person("pick")
+    primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
+    mine = primitives.label == label(Organ.HUMAN, 4)
+    shapes = [shape for link in rigid.links() for shape in link.shapes]
+    assert mine.sum() == sum(len(shape.mesh.corners) if shape.mesh else 1 for shape in shapes)
+    assert mine.sum() == len(primitives.label) - 1  # the stand-in for plants
+    assert mine.sum() < 5000
+
+
+def test_left_mirrors_right() -> None:
+    parts = appearance.person(1.75).parts
+    for name in (name for name in parts if name.startswith("left_")):
+        for one, other in zip(parts[name], parts[name.replace("left_", "right_")], strict=True):
+            assert (one.kind, one.size, one.rgba, one.surface) == (other.kind, other.size, other.rgba, other.surface)
+            if one.mesh and other.mesh:
+                flipped = np.sort((one.mesh.corners * [1, -1, 1]).reshape(-1, 3), 0)
+                assert np.allclose(flipped, np.sort(other.mesh.corners.reshape(-1, 3), 0))
+            elif not name[-1].isdigit():  # a finger's own axis is no mirror image: see its root
+                assert one.pose[:3] * [1, -1, 1] == pytest.approx(other.pose[:3])
+
+
+def volume(corners: np.ndarray) -> float:
+    """Enclosed by triangles that run counter-clockwise seen from outside (divergence theorem)."""
+    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
+
+
+def meshes() -> list[Mesh]:
+    return [s.mesh for shapes in appearance.person(1.75).parts.values() for s in shapes if s.mesh]
+
+
+def test_meshes_face_outward() -> None:
+    """Normals at corners agree with their faces, within half of a right angle at creases."""
+    for mesh in meshes():
+        face = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
+        size = np.linalg.norm(face, axis=1)
+        there = size > 1e-9
+        cosine = np.einsum("fi,fki->fk", face[there] / size[there, None], mesh.normals[there])
+        assert cosine.min() > 0.6
+        assert np.linalg.norm(mesh.normals, axis=2) == pytest.approx(1.0)
+
+
+def test_a_head_is_as_large_as_a_head() -> None:
+    """Volume of a head of 197 mm x 154 mm x 231 mm, between its ellipsoid and its box."""
+    corners = np.concatenate(
+        [s.mesh.corners for s in appearance.person(1.75).parts["head"][:8] if s.mesh and s.surface == "skin"]
+    )
+    ellipsoid = np.pi / 6.0 * 0.197 * 0.154 * 0.231
+    assert 0.9 * ellipsoid < volume(corners) < 0.197 * 0.154 * 0.231
+
+
+def test_normals_survive_their_packing() -> None:
+    way = frames.normalize(np.random.default_rng(3).normal(size=(4000, 3)))
+    code = rigid_primitives.packed(way)
+    assert (code == np.round(code)).all()
+    assert code.min() >= 1.0
+    assert code.max() < 2**24
+    k = code.astype(np.int64) - 1
+    xy = np.stack([k % 2047, k // 2047], -1) * (2.0 / 2046.0) - 1.0
+    z = 1.0 - np.abs(xy).sum(-1)
+    fold = np.maximum(-z, 0.0)
+    found = frames.normalize(np.concatenate([xy - np.where(xy >= 0.0, 1.0, -1.0) * fold[:, None], z[:, None]], -1))
+    assert np.arccos(np.clip((found * way).sum(-1), -1.0, 1.0)).max() < 2e-3
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_crate_is_as_large_as_it_says_and_free_inside(size: tuple[float, float, float]) -> None:
+    boxes = appearance.crate(size, 0)
+    low = np.array([b.pose[:3] - b.size for b in boxes])
+    high = np.array([b.pose[:3] + b.size for b in boxes])
+    half = np.array(size) / 2.0
+    assert low.min(0) == pytest.approx([-half[0], -half[1], 0.0])
+    assert high.max(0) == pytest.approx([half[0], half[1], size[2]])
+    inside = np.array([half[0] - CRATE_WALL, half[1] - CRATE_WALL, size[2]])
+    reaches = (low < inside - 1e-6) & (high > np.array([-inside[0], -inside[1], CRATE_WALL]) + 1e-6)
+    assert not reaches.all(1).any()
+    rim = (high[:, 2] > size[2] - 1e-6) & ((high - low)[:, :2].max(1) > 0.9 * min(size[:2]) - 0.03)
+    assert rim.sum() == 4
+    assert len(boxes) < 150
+
+
+def test_neighbouring_crates_differ_in_colour() -> None:
+    assert appearance.crate(SIZES[0], 0)[0].rgba != appearance.crate(SIZES[0], 1)[0].rgba
+
+
+def test_every_surface_has_its_material() -> None:
+    assert set(appearance.SURFACES) == set(rigid_primitives._MATERIAL)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('neck = [{ kind = "cone", paint = "gold" }]', r"parts\.neck\[0\]\.paint is 'gold'; give one of: skin"),
+        ('neck = [{ kind = "blob", paint = "skin" }]', r"parts\[\.\.\.\]\[0\]\.kind: Invalid enum value 'blob'"),
+        ('neck = [{ kind = "loft", paint = "skin", rings = [[0, 0, 0, 0]] }]', "give two rings or more"),
+        (
+            'neck = [{ kind = "loft", paint = ["skin", "skin"], rings = [[0, 0, 0, 0], [1, 0, 0, 0]] }]',
+            "names 2 paints; give one, or 1",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_figure_is_said_in_one_line(tmp_path, line: str, words: str) -> None:
+    text = (appearance.find("figures", "worker", ".toml")).read_text()
+    file = tmp_path / "odd.toml"
+    file.write_text(text[: text.index("[parts]")] + f"[parts]\n{line}\n")
+    with pytest.raises(FigureError, match=words) as said:
+        appearance.person(1.75, str(file))
+    assert "\n" not in str(said.value)
+
+
+def test_an_unknown_posture_is_said() -> None:
+    with pytest.raises(FigureError, match="posture 'dance' is unknown; give one of: stand, pick"):
+        appearance.posed(standing(frames.pose(np.zeros(3))), "dance", 1.75)
+
+
+def test_a_cone_tapers_the_way_it_says() -> None:
+    """Thin above, thick below: silhouette widths of a round cone on its axis."""
+    cone = Shape("cone", (0.2, 0.05, 0.4), frames.pose(np.array([2.0, 0.0, 1.0])))
+    primitives, _ = sensor_scenes.world(sensor_scenes.thing(cone))
+    depth, _ = sensor_scenes.raster(primitives, sensor_scenes.AHEAD)
+    rows = (np.isfinite(depth) & (depth < 2.0)).sum(1)
+    scale = sensor_scenes.SMALL.fx / 2.0
+    low, high = (round(sensor_scenes.SMALL.cy + z * scale) for z in (0.4, -0.4))
+    assert rows[low] == pytest.approx(2 * 0.2 * scale, rel=0.1)
+    assert rows[high] == pytest.approx(2 * 0.05 * scale, abs=3)
+
+
+def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
+    """F48: an open hand before a camera shows gaps between fingers and reaches further than a fist."""
+    views = {}
+    for name, bent in (("open", 0.0), ("fist", 1.0)):
+        pose = standing(frames.pose(np.zeros(3)))
+        up = frames.aligned(np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0]))
+        hand = {"right": frames.pose(np.array([0.5, -0.4, 1.4]), up), "right_fingers": (bent,) * 5}
+        rigid = Rigid(sensor_scenes.empty())
+        rigid.add_human(HumanSpec("eva", 4, dataclasses.replace(pose, **hand)))
+        primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
+        depth, _ = sensor_scenes.raster(primitives, looking(np.array([1.1, -0.4, 1.4]), np.array([0.5, -0.4, 1.42])))
+        views[name] = depth < 0.75
+    rows = {name: np.flatnonzero(view.any(1)) for name, view in views.items()}
+    scale = sensor_scenes.SMALL.fx / 0.6
+    assert rows["fist"].min() - rows["open"].min() > 0.04 * scale
+    across = [np.abs(np.diff(row.astype(int))).sum() for row in views["open"]]
+    assert max(across) >= 8  # four fingers or more side by side
+    assert max(np.abs(np.diff(row.astype(int))).sum() for row in views["fist"][: rows["fist"].min() + 10]) < 8
+
+
+def test_a_lamp_is_seen_in_its_colour() -> None:
+    """F41: the lit tier of a robot's signal tower is the greenest thing in a picture of it, in the shade too."""
+    rigid = Rigid(sensor_scenes.empty())
+    rigid.add_robot(description.load("vinebot").spec("bot"))
+    primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
+    pose = looking(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
+    frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.6, 0.3, 0.5)).render(primitives, pose)
+    _, seen = sensor_scenes.raster(primitives, pose)
+    material = primitives.looks.material.numpy()
+    tint = primitives.looks.tint.numpy()
+    lit = (seen >= 0) & (material[seen] == int(materials.LAMP)) & (tint[seen][..., 1] > 2.0 * tint[seen][..., 0])
+    assert lit.sum() > 20
+    green = frame.rgb[..., 1].astype(int) - frame.rgb[..., 0]
+    assert np.median(green[lit]) > 60
+    robot = (frame.labels >> 20 == int(Organ.ROBOT)) & ~lit
+    assert np.median(green[robot]) < 20

@@ -1,0 +1,23 @@
+"""Labels: organ and index go into one int32 and come out again."""
+
+import numpy as np
+import pytest
+
+from vinesim.scene.ids import LABEL_STRIDE, Organ, label, unlabel
+
+
+@pytest.mark.parametrize("organ", list(Organ))
+@pytest.mark.parametrize("index", [0, 1, 9999, LABEL_STRIDE - 1])
+def test_there_and_back_within_int32(organ, index):
+    value = label(organ, index)
+    assert int(np.int32(value)) == value
+    assert unlabel(value) == (organ, index)
+
+
+def test_labels_are_one_to_one():
+    values = {label(o, i) for o in Organ for i in range(50)}
+    assert len(values) == len(Organ) * 50
+
+
+def test_nothing_is_zero():
+    assert label(Organ.NOTHING, 0) == 0

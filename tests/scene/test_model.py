@@ -1,0 +1,67 @@
+"""The model: forward kinematics against composing poses by hand, depth, digest."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vinesim import frames
+from vinesim.scene import builder
+
+WOOD = builder.Wood(1e9, 900.0)
+
+
+@pytest.fixture
+def model():
+    trees = []
+    for k in range(3):
+        tree = builder.Tree(frames.pose(np.array([k, 0.5 * k, 2.0]), frames.yaw(0.3 * k)), vine=k)
+        tree.rod(-1, 0.8, (0.004, 0.002), WOOD, 4 + k, rest=frames.exp(np.array([0.1, 0.2, 0.3])))
+        tree.rod(1, 0.3, (0.002, 0.001), WOOD, 2, rest=frames.yaw(0.7))
+        trees.append(tree)
+    return builder.assemble(trees)
+
+
+def test_forward_is_the_chain_of_transforms(model):
+    joint_q = Rotation.random(len(model.body_mass), random_state=5).as_quat()
+    found = model.forward(joint_q)
+
+    def matrix(position, quaternion):
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
+        return m
+
+    for body in range(len(joint_q)):
+        chain, at = np.eye(4), body
+        while at >= 0:
+            chain = matrix(model.body_offset[at], model.body_rest[at]) @ matrix(np.zeros(3), joint_q[at]) @ chain
+            root, at = model.tree_pose[model.body_tree[at]], int(model.body_parent[at])
+        chain = matrix(root[:3], root[3:]) @ chain
+        assert np.allclose(found[body, :3], chain[:3, 3], atol=1e-6)
+        assert np.allclose(frames.matrix(found[body, 3:]), chain[:3, :3], atol=1e-6)
+
+
+def test_depth_counts_ancestors(model):
+    for body, depth in enumerate(model.depth()):
+        count, at = 0, model.body_parent[body]
+        while at >= 0:
+            count, at = count + 1, model.body_parent[at]
+        assert count == depth
+
+
+def test_bodies_of_a_tree(model):
+    assert [model.bodies_of(t) for t in range(3)] == [slice(0, 6), slice(6, 13), slice(13, 21)]
+    assert model.tree_vine.tolist() == [0, 1, 2]
+
+
+def test_the_digest_sees_one_bit(model):
+    before, twin = model.digest(), model.copy()
+    assert twin.digest() == before
+    twin.body_mass[3] = np.nextafter(twin.body_mass[3], np.float32(1.0))
+    assert twin.digest() != before
+    assert len(before) == 16
+
+
+def test_an_empty_model_stands():
+    empty = builder.assemble([])
+    assert empty.forward(empty.joint_settled).shape == (0, 7)
+    assert set(empty.counts().values()) == {0}

@@ -1,0 +1,127 @@
+"""Scene files: those that ship load, and each kind of mistake is told in one line with file, place and remedy."""
+
+import math
+import pathlib
+
+import pytest
+
+from vinesim.scene import spec
+from vinesim.scene.data_files import data_dir
+from vinesim.scene.spec import Sun, sun_at
+
+GOOD = """
+name = "small"
+seed = 1
+training = "tendone"
+
+[layout]
+rows = 1
+vines = 2
+row_spacing = 2.5
+vine_spacing = 2.5
+height = 2.0
+
+[fruit]
+bunches = [2, 4]
+varieties = ["italia"]
+
+[[boxes]]
+x = 1.0
+y = 1.0
+
+[[spawns]]
+name = "here"
+x = 0.0
+y = 1.0
+"""
+
+
+@pytest.mark.parametrize("path", sorted((data_dir() / "scenes").glob("*.toml")), ids=lambda p: p.stem)
+def test_every_scene_that_ships_loads_by_its_name(path):
+    assert spec.load(path.stem).name == path.stem
+
+
+def test_defaults_and_values(tmp_path):
+    file = tmp_path / "small.toml"
+    file.write_text(GOOD)
+    small = spec.load(file)
+    assert (small.layout.row_spacing, small.fruit.bunches, small.boxes[0].size[0]) == (2.5, (2, 4), 0.6)
+    assert math.isclose(math.hypot(*small.sun.direction()), 1.0)
+    assert small.spawns[0] == spec.Spawn(name="here", x=0.0, y=1.0, yaw=0.0)
+
+
+MANY = "".join(f'\n[[spawns]]\nname = "r{i}"\nx = {i}.0\ny = 0.0\n' for i in range(10))
+MISTAKES = {
+    "unknown field": (("row_spacing", "row_spacng"), ["layout.row_spacng", "did you mean 'row_spacing'?"]),
+    "unknown table": (("[fruit]", "[friut]"), ["friut", "did you mean 'fruit'?"]),
+    "unknown in a list": (('name = "here"\nx', 'name = "here"\nhight = 2\nx'), ["spawns[0].hight", "remove it"]),
+    "wrong type": (("rows = 1", 'rows = "one"'), ["layout.rows", "'one'", "give a whole number"]),
+    "fraction": (("rows = 1", "rows = 1.5"), ["layout.rows", "1.5", "give a whole number"]),
+    "negative": (("height = 2.0", "height = -2.0"), ["layout.height", "-2.0", "give a number > 0"]),
+    "zero": (("height = 2.0", "height = 0"), ["layout.height is 0", "give a number > 0"]),
+    "nothing planted": (("vines = 2", "vines = 0"), ["layout.vines is 0", "give a whole number >= 1"]),
+    "nan": (("height = 2.0", "height = nan"), ["layout.height is nan", "finite"]),
+    "infinite": (("x = 0.0", "x = inf"), ["spawns[0].x is inf", "finite"]),
+    "missing": (("rows = 1\n", ""), ["layout.rows is missing", "rows = ..."]),
+    "missing table": (('[fruit]\nbunches = [2, 4]\nvarieties = ["italia"]', ""), ["fruit is missing", "add it"]),
+    "syntax": (("vines = 2", "vines = = 2"), ["line 8", "correct the syntax"]),
+    "choice": (('"tendone"', '"pergola"'), ["training is 'pergola'", "give one of: tendone, vsp"]),
+    "variety": (('["italia"]', '["merlot"]'), ["fruit.varieties[0] is 'merlot'", "italia, redglobe, black"]),
+    "no variety": (('["italia"]', "[]"), ["fruit.varieties is []", "length >= 1"]),
+    "range": (("[2, 4]", "[4, 2]"), ["fruit.bunches is [4, 2]", "fewest <= most"]),
+    "range of three": (("[2, 4]", "[2, 3, 4]"), ["fruit.bunches is [2, 3, 4]", "length 2"]),
+    "too many robots": (
+        ('[[spawns]]\nname = "here"', MANY + '\n[[spawns]]\nname = "here"'),
+        ["spawns has 11", "at most 10"],
+    ),
+    "same name twice": (
+        ('[[spawns]]\nname = "here"', '[[spawns]]\nname = "here"\nx = 1\ny = 1\n[[spawns]]\nname = "here"'),
+        ["spawns[1].name is 'here'", "spawns[0].name", "own name"],
+    ),
+    "no such plants": (("[layout]", 'plants = "oak"\n[layout]'), ["plants", "'oak'", "vine"]),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line_with_file_place_and_remedy(mistake, tmp_path):
+    (old, new), expected = MISTAKES[mistake]
+    assert old in GOOD
+    file = tmp_path / "broken.toml"
+    file.write_text(GOOD.replace(old, new))
+    with pytest.raises(spec.SceneError) as caught:
+        spec.load(file)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.startswith(f"{file}: ")
+    assert [e for e in expected if e not in text] == [], text
+
+
+def test_an_unknown_scene_names_those_that_ship():
+    with pytest.raises(spec.SceneError, match=r"'vineyard'.*demo, harvest, tendone, vsp"):
+        spec.load("vineyard")
+
+
+def test_a_folder_or_binary_is_no_scene(tmp_path):
+    binary = pathlib.Path(tmp_path / "x.toml")
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(spec.SceneError, match="UTF-8"):
+        spec.load(binary)
+
+
+def test_the_sun_of_an_equinox() -> None:
+    """Due south at noon and as high as the latitude is far from the pole; due west at six, on the horizon."""
+    latitude = math.radians(41.6)
+    assert sun_at(12.0, 0.0, latitude) == pytest.approx([0.0, -math.sin(latitude), math.cos(latitude)], abs=1e-12)
+    assert sun_at(18.0, 0.0, latitude) == pytest.approx([-1.0, 0.0, 0.0], abs=1e-12)
+    assert math.hypot(*sun_at(15.3, 0.2, latitude)) == pytest.approx(1.0)
+
+
+def test_a_sun_with_an_hour_moves() -> None:
+    """From nine in the morning to noon in three hours; day 80 is the equinox, to the half degree of the formula."""
+    sun = Sun(hour=9.0, day=80, latitude=0.7)
+    east, north, up = sun.direction(3 * 3600.0)
+    assert (east, north) == pytest.approx((0.0, -math.sin(0.7)), abs=0.01)
+    assert sun.direction(0.0)[0] > 0.6
+    assert sun.direction(0.0)[2] < up
+    fixed = Sun(azimuth=0.3, elevation=0.4)
+    assert fixed.direction(0.0) == fixed.direction(9000.0)

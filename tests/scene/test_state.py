@@ -1,0 +1,29 @@
+"""A fresh state: everything asleep, attached, and where the model's settled joints put it."""
+
+import numpy as np
+
+from vinesim.scene import builder
+from vinesim.scene.ids import Organ
+from vinesim.scene.state import State
+
+
+def test_at_rest_is_the_settled_shape():
+    tree = builder.Tree(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0]))
+    tip = tree.rod(-1, 1.0, (0.004, 0.003), builder.Wood(5e9, 900.0), 8)[-1]
+    stalk = tree.rod(tip, 0.06, (0.002, 0.002), builder.Wood(3e8, 900.0), 2, organ=Organ.PEDUNCLE)[-1]
+    body = tree.add(
+        stalk, offset=(0.03, 0, 0), mass=0.5, inertia=(1e-3,) * 3, stiffness=(0.2,) * 3, organ=int(Organ.BUNCH)
+    )
+    tree.bunches.append({"body": body, "berries": 80})
+    tree.settle()
+    model = builder.assemble([tree])
+    state = State.at_rest(model)
+    state.check()
+    assert np.array_equal(state.joint_q, model.joint_settled)
+    assert np.allclose(state.body_q[:, 2], 2.0, atol=1e-5)
+    assert np.allclose(state.body_q[1:9, 0], np.arange(1, 9) / 8.0, atol=1e-5)
+    assert not state.joint_qd.any()
+    assert not state.body_qd.any()
+    assert not state.tree_awake.any()
+    assert state.bunch_attached.all()
+    assert state.counts() == {"body": 11, "tree": 1, "bunch": 1}

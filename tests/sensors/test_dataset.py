@@ -1,0 +1,335 @@
+"""Pictures and data sets as files: formats as their readers read them, bitwise repeatable, whole after any end."""
+
+import json
+import pathlib
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+
+from vinesim.cli.render import run as render
+from vinesim.cli.robot_client import WrongUse
+from vinesim.client.composition.composer import NoRoom
+from vinesim.client.composition.randomizer import Life
+from vinesim.robot.description.description import DescriptionError
+from vinesim.scene.data_files import NotFoundInData
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.spec import load
+from vinesim.sensors.export import annotations, dataset
+from vinesim.sensors.export.dataset import DatasetError, Plan
+from vinesim.sensors.spec_file import SensorError
+
+IMAGES = 6  # of two vineyards
+LIFE = Life(0.5)
+SCENE = """
+name = "one vine"
+seed = 1
+training = "tendone"
+layout = { rows = 1, vines = 1, row_spacing = 2.5, vine_spacing = 2.5, height = 2.0 }
+fruit = { bunches = [6, 8], varieties = ["italia"] }
+"""
+
+
+def _files(folder: pathlib.Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """A scene file: one vine, soon grown."""
+    file = tmp_path_factory.mktemp("scene") / "vine.toml"
+    file.write_text(SCENE)
+    return file
+
+
+def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
+    options = {"images": IMAGES, "size": "160x120", "seed": 5, "scene": scene, "out": out, "workers": workers}
+    options["actors"] = LIFE.share
+    given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    return [sys.executable, "-m", "vinesim.cli", "dataset", *given]
+
+
+@pytest.fixture(scope="module")
+def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """A data set made in this process, in one go."""
+    out = tmp_path_factory.mktemp("whole") / "set"
+    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    dataset.begin(plan, out)
+    assert list(dataset.draw(plan, out, dataset.missing(out, IMAGES))) == list(range(IMAGES))
+    dataset.finish(out, IMAGES)
+    return out
+
+
+def _until(condition, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def _records(out: pathlib.Path) -> dict[str, int]:
+    return {p.name: p.stat().st_mtime_ns for p in (out / "records").glob("*.json")}
+
+
+def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    out = tmp_path / "set"
+    command = _command(scene, out, 1)
+    for end, images in ((signal.SIGINT, 0), (signal.SIGKILL, 1)):  # Ctrl-C while vines grow, a kill after an image
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+            _until(lambda: (out / "dataset.json").exists() and len(_records(out)) >= images)  # noqa: B023
+            run.send_signal(end)
+            said = run.communicate(timeout=30)[0]
+        assert run.returncode == (130 if end == signal.SIGINT else -signal.SIGKILL)
+        if end == signal.SIGINT:
+            assert f"0 of {IMAGES} images" in said
+            assert list(_files(out)) == ["dataset.json"]
+    done = _records(out)
+    assert 0 < len(done) < IMAGES
+    assert not (out / "annotations.json").exists()
+    (out / "images" / ".000001.png.1.part").write_bytes(b"half")  # as a kill may leave it
+    last = subprocess.run(_command(scene, out, 2), capture_output=True, text=True, timeout=120)
+    assert last.returncode == 0, last.stderr
+    assert {name: _records(out)[name] for name in done} == done
+    assert _files(out) == _files(whole)
+
+
+def test_pycocotools_reads_it(whole: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    read = COCO(str(whole / "annotations.json"))
+    capsys.readouterr()
+    assert read.getImgIds() == list(range(IMAGES))
+    assert [c["name"] for c in read.loadCats(read.getCatIds())] == ["bunch"]
+    assert len(read.anns) > IMAGES
+    for one in read.loadAnns(read.getAnnIds()):
+        image = read.loadImgs(one["image_id"])[0]
+        ids = _ids(whole / "ids" / pathlib.Path(image["file_name"]).name)
+        mask = read.annToMask(one).astype(bool)
+        assert np.array_equal(mask, ids == label(Organ.BUNCH, one["bunch"]))
+        assert one["area"] == mask.sum() >= annotations.LEAST_PIXELS
+        assert one["bbox"] == coco_mask.toBbox(one["segmentation"]).tolist()
+        amodal = coco_mask.decode(one["amodal_segmentation"]).astype(bool)
+        assert not (mask & ~amodal).any()
+        assert one["occlusion"] == pytest.approx(1.0 - mask.sum() / amodal.sum())
+        assert one["amodal_bbox"] == coco_mask.toBbox(one["amodal_segmentation"]).tolist()
+        assert len(one["keypoints"]) == 3 * len(read.cats[one["category_id"]]["keypoints"])
+
+
+def _ids(file: pathlib.Path) -> np.ndarray:
+    blue, green, red = np.moveaxis(cv2.imread(str(file)).astype(np.int32), -1, 0)
+    return red + 256 * green + 65536 * blue
+
+
+def test_every_image_has_its_yolo_boxes_depth_berries_and_pose(whole: pathlib.Path) -> None:
+    records = [json.loads(p.read_text()) for p in sorted((whole / "records").glob("*.json"))]
+    assert len(records) == IMAGES
+    assert len({r["scene"]["digest"] for r in records}) == 2
+    assert len({r["sun"]["hour"] for r in records}) == IMAGES
+    for record in records:
+        stem = f"{record['image']:06d}"
+        rgb = cv2.imread(str(whole / record["file"]))
+        depth = cv2.imread(str(whole / "depth" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+        berry = cv2.imread(str(whole / "berries" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+        ids = _ids(whole / "ids" / f"{stem}.png")
+        assert rgb.shape == (120, 160, 3)
+        assert depth.shape == berry.shape == ids.shape == (120, 160)
+        assert depth.dtype == berry.dtype == np.uint16
+        assert ((ids[berry > 0] >> 20) == int(Organ.BUNCH)).all()
+        lines = np.array([line.split() for line in (whole / "labels" / f"{stem}.txt").read_text().splitlines()], float)
+        large = [b for b in record["bunches"] if b["pixels"] >= annotations.LEAST_PIXELS]
+        assert len(lines) == len(large) >= 1
+        for line, one in zip(lines, large, strict=True):
+            rows, columns = np.nonzero(ids == one["label"])
+            box = (line[1:] * [160, 120, 160, 120]).round(3)
+            low, size = box[:2] - 0.5 * box[2:], box[2:]
+            assert low == pytest.approx([columns.min(), rows.min()], abs=1e-3)
+            assert size == pytest.approx([np.ptp(columns) + 1, np.ptp(rows) + 1], abs=1e-3)
+            seen = np.unique(berry[ids == one["label"]])
+            assert one["berries_seen"] <= (seen > 0).sum() <= one["berries"]
+        # the pose puts the depth of the largest bunch where truth has its box
+        one = max(large, key=lambda b: b["pixels"])
+        camera, box = record["camera"], one["box_3d"]
+        fx, _, cx, _, fy, cy = camera["k"][:6]
+        rows, columns = np.nonzero((ids == one["label"]) & (depth > 0))
+        z = depth[rows, columns] * 1e-3
+        points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
+        points = _turned(camera["quaternion_xyzw"], points) + camera["position"]
+        local = _turned(np.array(box["quaternion_xyzw"]) * [-1, -1, -1, 1], points - box["position"])
+        assert (np.abs(local) <= 0.5 * np.array(box["size"]) + 1e-3).all()
+
+
+def test_life_is_in_a_share_of_the_images_and_all_bunches_have_their_ripeness(whole: pathlib.Path) -> None:
+    records = [json.loads(p.read_text()) for p in sorted((whole / "records").glob("*.json"))]
+    lively = [record for record in records if record["actors"]]
+    assert 0 < len(lively) < IMAGES
+    for record in lively:
+        ids = _ids(whole / "ids" / f"{record['image']:06d}.png")
+        assert [one["pixels"] for one in record["actors"]] == [(ids == one["label"]).sum() for one in record["actors"]]
+        assert {one["kind"] for one in record["actors"]} <= {"robot", "human", "box"}
+    still = _ids(whole / "ids" / f"{next(r['image'] for r in records if not r['actors']):06d}.png")
+    assert (still < label(Organ.BOX, 0)).all()
+    ripeness = {}
+    for one in json.loads((whole / "annotations.json").read_text())["annotations"]:
+        vineyard = records[one["image_id"]]["scene"]["seed"]
+        assert ripeness.setdefault((vineyard, one["bunch"]), one["ripeness"]) == one["ripeness"]
+    assert len(set(ripeness.values())) > 3
+    assert all(0.0 <= value <= 1.0 for value in ripeness.values())
+
+
+def test_an_image_is_the_same_whatever_was_drawn_before(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """The last image of a vineyard, alone: wind, company and picked bunches of the others leave no trace."""
+    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    dataset.begin(plan, tmp_path)
+    last = dataset.IMAGES_A_VINEYARD - 1
+    list(dataset.draw(plan, tmp_path, [last]))
+    alone = {name: data for name, data in _files(tmp_path).items() if f"{last:06d}" in name}
+    assert len(alone) == 7
+    assert alone == {name: _files(whole)[name] for name in alone}
+
+
+def _turned(q, v: np.ndarray) -> np.ndarray:
+    u, w = np.asarray(q[:3], float), float(q[3])
+    return v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
+
+
+def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    before = _files(whole)
+    dataset.begin(plan, whole)
+    assert _files(whole) == before
+    for other, words in (
+        (Plan(load(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
+        (Plan(load("vsp"), 5, "d435", (160, 120), LIFE), "scene"),
+        (Plan(load(scene), 5, "d435", (320, 240), LIFE), "size"),
+        (Plan(load(scene), 5, "d435", (160, 120)), "life"),
+    ):
+        with pytest.raises(DatasetError, match=words):
+            dataset.begin(other, whole)
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(DatasetError, match="other things"):
+        dataset.begin(plan, tmp_path)
+    with pytest.raises(DatasetError, match="cannot be used"):
+        dataset.begin(plan, tmp_path / "mine.txt")
+
+
+def test_a_full_disk_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    """No file may grow beyond 20 kB: to a program that is a full disk, at the first picture."""
+    plan = Plan(load(scene), 5, "d435", (160, 120))
+    dataset.begin(plan, tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(DatasetError, match=r"image 0 cannot be written .* make room"):
+            list(dataset.draw(plan, tmp_path, [0]))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(_files(tmp_path)) == ["dataset.json"]
+
+
+def test_what_stops_a_worker_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    bare = tmp_path / "bare.toml"
+    bare.write_text(scene.read_text().replace("[6, 8]", "[0, 0]"))
+    done = subprocess.run(_command(bare, tmp_path / "set", 1), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert [line for line in done.stderr.splitlines() if line.strip()] == [
+        "vinesim: scene 'one vine' bears no bunch to look at; raise fruit.bunches"
+    ]
+    assert list(_files(tmp_path / "set")) == ["dataset.json"]
+
+
+# ---- one picture -----------------------------------------------------------------------------------------------------
+
+
+def _render(out: pathlib.Path, **changed) -> int:
+    given = {"camera": "d435", "at": "0.4,1.2,1.3", "look": "3,1,1.7", "size": "160x120", "seed": None, "out": out}
+    return render(changed.pop("scene", "demo"), **{**given, **changed})
+
+
+def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
+    assert _render(tmp_path / "shot") == 0
+    names = {"rgb.png", "depth.png", "measured.png", "labels.png", "overlay.png", "camera.json", "truth.json"}
+    assert {p.name for p in (tmp_path / "shot").iterdir()} == names
+    camera = json.loads((tmp_path / "shot/camera.json").read_text())
+    assert camera["k"][0] == camera["k"][4] == pytest.approx(617.0 / 4)
+    assert camera["position"] == [0.4, 1.2, 1.3]
+    assert _turned(camera["quaternion_xyzw"], np.array([[0.0, 0.0, 1.0]]))[0] @ [2.6, -0.2, 0.4] > 0.99 * 2.63
+    ids = _ids(tmp_path / "shot/labels.png")
+    said = json.loads((tmp_path / "shot/truth.json").read_text())
+    for one in said["bunches"]:
+        assert one["pixels"] == (ids == one["label"]).sum() == coco_mask.area(one["mask"])
+    assert sum(one["pixels"] > 0 for one in said["bunches"]) > 5
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "words"),
+    [
+        ({"camera": "kinect"}, NotFoundInData, "d435, pinhole"),
+        ({"size": "99999x4"}, SensorError, "16x16 to 4096x4096"),
+        ({"size": "640*480"}, WrongUse, "WxH"),
+        ({"at": "1,2"}, WrongUse, "X,Y,Z"),
+        ({"at": "1,2,nan"}, WrongUse, "X,Y,Z"),
+        ({"look": "0.4,1.2,1.3"}, WrongUse, "where the camera stands"),
+        ({"at": "1,2,-0.1"}, WrongUse, "in the ground"),
+        ({"at": "0,0,1"}, WrongUse, "inside"),
+        ({"robots": ["vinebot"]}, WrongUse, "give NAME@X,Y,YAW"),
+        ({"robots": ["vinebot@1"]}, WrongUse, "--robot is at '1'; give X,Y,YAW"),
+        ({"robots": ["dalek@1,2"]}, DescriptionError, "dalek.* give a path or one of: logistic, vinebot"),
+        ({"robots": ["vinebot@0.1,0.1"]}, NoRoom, r"robot_0 stands \d+ cm deep in (trunk|pole)"),
+        ({"people": ["1,1,0,dance"]}, WrongUse, "posture 'dance' is none of stand, pick"),
+        ({"people": ["1,1.2", "1.1,1.2"]}, NoRoom, "person_. stands .* deep in person_.; move one"),
+        ({"crates": ["1,1,0,1.5"]}, WrongUse, "the fill is 1.5; give 0"),
+        ({"crates": ["1,inf"]}, WrongUse, "--crate is at '1,inf'; give X,Y,YAW,FILL"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said(tmp_path: pathlib.Path, changed: dict, error: type, words: str) -> None:
+    with pytest.raises(error, match=words) as said:
+        _render(tmp_path / "shot", **changed)
+    assert "\n" not in str(said.value)
+    assert not (tmp_path / "shot").exists()
+
+
+def test_a_picture_with_company(tmp_path: pathlib.Path) -> None:
+    """Whoever is asked for is there, where asked, with a label that truth tells; the vineyard is the same one."""
+    things = {"robots": ["vinebot@3,1.3,-2.5"], "people": ["2.2,0.9,2.4,pick"], "crates": ["1.6,1.4,0.2,0.25"]}
+    assert _render(tmp_path / "shot", look="2.2,1.2,0.6", **things) == 0
+    assert _render(tmp_path / "bare", look="2.2,1.2,0.6") == 0
+    said, bare = (json.loads((tmp_path / name / "truth.json").read_text()) for name in ("shot", "bare"))
+    ids = _ids(tmp_path / "shot/labels.png")
+    depth = cv2.imread(str(tmp_path / "shot/depth.png"), cv2.IMREAD_UNCHANGED) * 1e-3
+    assert said["digest"] == bare["digest"]
+    assert [one["kind"] for one in said["actors"]] == ["robot", "human", "box"]
+    camera = json.loads((tmp_path / "shot/camera.json").read_text())
+    fx, _, cx, _, fy, cy = camera["k"][:6]
+    for one in said["actors"][:2]:
+        rows, columns = np.nonzero((ids == one["label"]) & (depth > 0))
+        assert one["pixels"] == (ids == one["label"]).sum() > 50
+        z = depth[rows, columns]
+        points = _turned(camera["quaternion_xyzw"], np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1))
+        away = np.hypot(*(points + camera["position"] - [one["x"], one["y"], 0.0])[:, :2].T)
+        assert np.quantile(away, 0.95) < 0.8
+    loose = [one for one in said["bunches"] if not one["attached"]]
+    assert loose
+    assert all(one["cut"] is None for one in loose)
+
+
+def test_a_camera_of_absurd_resolution_is_refused(tmp_path: pathlib.Path) -> None:
+    text = (pathlib.Path(dataset.__file__).parents[3] / "data/cameras/d435.toml").read_text()
+    (tmp_path / "huge.toml").write_text(text.replace("width = { value = 640", "width = { value = 640000"))
+    with pytest.raises(SensorError, match="width is 640000 px; give 1 to 8192 px"):
+        _render(tmp_path / "shot", camera=str(tmp_path / "huge.toml"), size=None)
+
+
+def test_a_camera_without_range_is_refused(tmp_path: pathlib.Path) -> None:
+    text = (pathlib.Path(dataset.__file__).parents[3] / "data/cameras/d435.toml").read_text()
+    (tmp_path / "blind.toml").write_text(text.replace("nearest = { value = 0.158", "nearest = { value = 10.0"))
+    with pytest.raises(SensorError, match="no range"):
+        _render(tmp_path / "shot", camera=str(tmp_path / "blind.toml"))

@@ -1,0 +1,28 @@
+"""docs/modules.md lists the modules as they are, and every module says what it is for."""
+
+import importlib.util
+import pathlib
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+def _tool():
+    spec = importlib.util.spec_from_file_location("list_modules", ROOT / "tools/list_modules.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_list_of_modules_is_up_to_date():
+    assert _tool().PAGE.read_text() == _tool().render(), "run: python tools/list_modules.py"
+
+
+def test_every_module_says_what_it_is_for():
+    summary = _tool().summary
+    assert [str(p.relative_to(ROOT)) for p in (ROOT / "vinesim").rglob("*.py") if not summary(p)] == []
+
+
+def test_the_page_of_the_architecture_names_every_package():
+    text = (ROOT / "docs/architecture.md").read_text()
+    packages = {p.parent.relative_to(ROOT / "vinesim") for p in (ROOT / "vinesim").rglob("__init__.py")}
+    assert [str(p) for p in packages if len(p.parts) == 1 and f"{p}/" not in text] == []

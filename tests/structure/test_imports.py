@@ -1,0 +1,27 @@
+"""Import weight and one-way imports, seen from outside."""
+
+import subprocess
+import sys
+
+HEAVY = ("warp", "mujoco", "zenoh", "rclpy", "taichi", "cv2", "numpy", "open3d")
+
+
+def modules_after(statement):
+    code = f"{statement}; import sys; print(*sorted(m for m in sys.modules if m in {HEAVY!r}))"
+    return set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
+
+
+def test_the_command_line_opens_without_the_engines():
+    assert modules_after("import vinesim.cli") == set()
+
+
+def test_the_server_simulates_nothing():
+    assert modules_after("import vinesim.net.server.server").isdisjoint({"warp", "mujoco", "rclpy"})
+
+
+def test_physics_needs_no_network_and_no_ros():
+    assert modules_after("import vinesim.physics.step").isdisjoint({"zenoh", "rclpy", "cv2"})
+
+
+def test_a_client_without_ros_imports_no_ros():
+    assert modules_after("import vinesim.client.client").isdisjoint({"rclpy"})

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import vinesim
+from tests.structure.kernel_grammar import breaches
+
+KERNELS = sorted((Path(vinesim.__file__).parent / "kernels").rglob("*.py"))
+
+GOOD = '''
+@wp.kernel
+def fade(
+    # model
+    rate: float,
+    # in
+    light: wp.array(dtype=float),
+    # out
+    shade_out: wp.array(dtype=float),
+):
+    """Fade one light."""
+    i = wp.tid()
+    pair = wp.vec2()
+    pair[0] = light[i]
+    shade_out[i] = rate * pair[0]
+'''
+
+
+@pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.name)
+def test_kernels_speak_the_grammar(path: Path) -> None:
+    assert breaches(path.read_text(), path.name) == []
+
+
+def test_there_are_kernels() -> None:
+    assert any("@wp.kernel" in path.read_text() for path in KERNELS)
+
+
+def test_good_is_good() -> None:
+    assert breaches(GOOD) == []
+    assert breaches(GOOD.replace("@wp.kernel", "@wp.kernel(enable_backward=False)")) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("    # model\n", "", "# model, # in, # out, in that order"),
+        ("    # in\n", "    # out\n", "light is under # out; call it light_out"),
+        ("    # out\n", "", "shade_out ends in _out; put it under # out"),
+        ("shade_out", "shade", "shade is under # out; call it shade_out"),
+        ('    """Fade one light."""\n', "", "docstring of one line"),
+        ("one light.", "one\n    light.", "docstring of one line"),
+        ("    pair[0] = light[i]\n", "    light[i] = 0.0\n", "writes light, which is not under # out"),
+        ("    pair[0] = light[i]\n", "    light[i] += 1.0\n", "writes light, which is not under # out"),
+        ("    pair[0] = light[i]\n", "    wp.atomic_add(light, i, 1.0)\n", "writes light, which is not under # out"),
+        ("    pair[0] = light[i]\n", "    light[i][0], i = 1.0, 2\n", "writes light, which is not under # out"),
+    ],
+)
+def test_breaches_are_found(old: str, new: str, says: str) -> None:
+    found = breaches(GOOD.replace(old, new))
+    assert any(says in breach for breach in found), found
+
+
+def test_functions_name_what_they_write() -> None:
+    source = "@wp.func\ndef set(a: wp.array(dtype=float), i: int):\n    a[i] = 1.0\n"
+    assert breaches(source) == ["<source>:3: set writes its argument a; call it a_out"]
+    assert breaches(source.replace("(a:", "(a_out:").replace("    a[", "    a_out[")) == []

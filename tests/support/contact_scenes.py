@@ -1,0 +1,141 @@
+"""Canes, a bunch, a gripper and a bar: built for our physics, and for the peer that has all in MuJoCo."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import Drive, RobotSpec
+
+DOWN = frames.aligned(np.array([0.0, 0.0, -1.0]))
+
+
+def cane(
+    at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0, pieces: int = 16
+) -> Tree:
+    """A cane of 1 m in pieces (16 if it has a bunch), level when drawn.
+
+    ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm.
+    """
+    tree = Tree(frames.pose(np.array(at, float), frames.yaw(heading)))
+    wood = Wood(5e9, 800.0, beta, shear=2.5e9)  # G = E/2 makes torsion as stiff as bending, as MuJoCo's ball wants
+    last = tree.rod(-1, 1.0, (radius, radius), wood, pieces)[-1]
+    if bunch:
+        mass, stiffness = 800.0 * np.pi * 0.002**2 * 0.04, 1e9 * np.pi * 0.002**4 / 4 / 0.04
+        across = mass * (0.04**2 / 12 + 0.002**2 / 4)
+        for i in range(2):
+            last = tree.add(
+                last, offset=(0.0625 if i == 0 else 0.04, 0, 0), rest=DOWN if i == 0 else frames.IDENTITY,
+                organ=int(Organ.PEDUNCLE), mass=mass, com=(0.02, 0, 0), length=0.04, radius=(0.002, 0.002),
+                inertia=(0.5 * mass * 0.002**2, across, across), stiffness=np.full(3, stiffness),
+                damping=np.full(3, 0.01 * stiffness + 1e-3),
+            )  # fmt: skip
+        last = tree.add(
+            last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=bunch, com=(0.085, 0, 0), length=0.17,
+            radius=(0.04, 0.04), inertia=(bunch * 0.00064, bunch * 0.00174, bunch * 0.00174),
+            stiffness=np.full(3, stiffness), damping=np.full(3, 0.01 * stiffness + 2e-3),
+        )  # fmt: skip
+        tree.bunches.append({"body": last, "length": 0.17, "radius": 0.045, "berries": 80})
+    tree.settle()
+    return tree
+
+
+def _inertial(mass: float) -> str:
+    i = 0.004 * mass
+    return (
+        f'<inertial><mass value="{mass}"/><inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+
+
+def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0") -> str:
+    return (
+        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{origin}"/>'
+        f'<axis xyz="{axis}"/><limit lower="-2" upper="2" effort="1000" velocity="5"/></joint>'
+    )
+
+
+GRIPPER = f"""<robot name="gripper"><link name="base_footprint">{_inertial(50)}</link>
+<link name="carriage">{_inertial(1)}</link><link name="hand">{_inertial(4)}</link>
+{_slide("shift", "base_footprint", "carriage", "0 1 0")}{_slide("lift", "carriage", "hand", "0 0 1")}
+<link name="left">{_inertial(0.1)}<collision><geometry><box size="0.04 0.02 0.07"/></geometry></collision></link>
+<link name="right">{_inertial(0.1)}<collision><geometry><box size="0.04 0.02 0.07"/></geometry></collision></link>
+{_slide("close_left", "hand", "left", "0 -1 0", "0 0.085 0")}
+{_slide("close_right", "hand", "right", "0 1 0", "0 -0.085 0")}
+</robot>"""
+
+
+def gripper(bunch: np.ndarray, name: str = "grip", effort: float = 40.0, mimic: bool = False) -> RobotSpec:
+    """Two box fingers, open about the point ``bunch`` [3]; drives: shift (y), lift (z), both fingers.
+
+    ``mimic``: the right finger is not driven, it copies the left one.
+    """
+    drives = (
+        Drive("shift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
+        Drive("lift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
+        Drive("close_left", 4000.0, 80.0, effort, 5.0, -1.0, 1.0),
+        Drive("close_right", 4000.0, 80.0, effort, 5.0, -1.0, 1.0),
+    )
+    urdf = GRIPPER
+    if mimic:
+        drives = drives[:3]
+        urdf = urdf.replace('<child link="right"/>', '<child link="right"/><mimic joint="close_left"/>')
+    return RobotSpec(name, 0, urdf, "base_footprint", frames.pose(bunch), drives, np.zeros(len(drives)))
+
+
+BAR = f"""<robot name="bar"><link name="base_footprint">{_inertial(50)}</link>
+<link name="bar">{_inertial(3)}
+<collision><geometry><cylinder radius="0.03" length="0.6"/></geometry></collision></link>
+{_slide("sweep", "base_footprint", "bar", "0 1 0")}</robot>"""
+
+
+def bar(at, name: str = "bar", stiffness: float = 0.0, damping: float = 0.0) -> RobotSpec:
+    """An upright bar of 3 kg that slides along y; without gains it coasts."""
+    drives = (Drive("sweep", stiffness, damping, 1000.0, 5.0, -5.0, 5.0),)
+    return RobotSpec(name, 1, BAR, "base_footprint", frames.pose(np.array(at, float)), drives, np.zeros(1))
+
+
+def probe(at, name: str = "probe", mass: float = 3.0, drives: tuple[Drive, ...] | None = None) -> RobotSpec:
+    """A level rod of 20 cm along y that moves along x (drive ``along``) and up and down (``press``).
+
+    Unless told otherwise ``along`` is held and ``press`` coasts.
+    """
+    urdf = f"""<robot name="probe"><link name="base_footprint">{_inertial(500)}</link>
+<link name="carriage">{_inertial(1)}</link><link name="rod">{_inertial(mass)}
+<collision><origin rpy="1.5707963267948966 0 0"/><geometry><cylinder radius="0.02" length="0.2"/></geometry></collision>
+</link>
+{_slide("along", "base_footprint", "carriage", "1 0 0")}{_slide("press", "carriage", "rod", "0 0 1")}</robot>"""
+    if drives is None:
+        drives = (
+            Drive("along", 5000.0, 300.0, 1000.0, 5.0, -5.0, 5.0),
+            Drive("press", 0.0, 2.0, 1000.0, 5.0, -5.0, 5.0),
+        )
+    return RobotSpec(name, 2, urdf, "base_footprint", frames.pose(np.array(at, float)), drives, np.zeros(2))
+
+
+def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:
+    """A model with one hanging bunch, the bunch's body, and its middle in the world."""
+    model = assemble([cane((0.0, 0.0, 2.0), bunch=mass)])
+    body = int(model.bunch_body[0])
+    pose = model.forward(model.joint_settled)[body]
+    return model, body, pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
+
+
+def grasp(t: float) -> tuple[np.ndarray, float]:
+    """What the gripper is asked at time t: targets of its drives, and an extra pull on the hand [N].
+
+    Close, lift 10 cm, move 20 cm aside, be pulled down, let go.
+    """
+
+    def ramp(a: float, b: float) -> float:
+        return float(np.clip((t - a) / (b - a), 0.0, 1.0))
+
+    def smooth(u: float) -> float:
+        return u * u * (3.0 - 2.0 * u)
+
+    fingers = 0.05 * ramp(0.3, 0.8) if t < 6.5 else 0.05 * (1.0 - ramp(6.5, 6.8))
+    pull = -15.0 * ramp(4.5, 4.8) * (t < 6.0)
+    return np.array([0.20 * smooth(ramp(3.0, 4.0)), 0.10 * smooth(ramp(1.5, 2.5)), fingers, fingers]), pull

@@ -1,0 +1,73 @@
+"""Light clients and a tree that bends: what several files of tests record."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.net.codec.messages import Hello
+from vinesim.net.replication.exchange import Exchange, Inbox
+from vinesim.net.transport.bus import Bus
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+from vinesim.scene.values import RobotUpdate, TreeUpdate
+
+TICK = 0.01
+
+
+@functools.cache
+def vineyard() -> Model:
+    """Three trees, a metre apart along x."""
+    trees = []
+    for number in range(3):
+        tree = Tree(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
+        tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)
+        trees.append(tree)
+    return assemble(trees)
+
+
+class Light:
+    """The least client: it stands somewhere, bends what it is told to, and takes over what it hears."""
+
+    def __init__(self, bus: Bus, x: float, **hello) -> None:
+        self.model, self.bus, self.name = vineyard(), bus, bus.name
+        hello = {"scene": "rows", "digest": self.model.digest(), "joints": 2, "seed": 5} | hello
+        self.exchange = Exchange(bus, Hello(bus.name, **hello), self.model)
+        self.state = State.at_rest(self.model)
+        joints = np.array([0.1, -0.2][: hello["joints"]])
+        self.robot = RobotUpdate(bus.name, 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), joints, np.zeros(len(joints)))
+        self.touched: set[int] = set()
+        self.moving: set[int] = set()
+        self.inbox = Inbox()
+        self.heard: list[TreeUpdate] = []
+        self.joined: list[str] = []
+
+    def tick(self, now: float) -> None:
+        self.inbox = self.exchange.receive(now)
+        self.joined += [hello.name for hello in self.inbox.joined]
+        self.heard += self.inbox.trees
+        for update in self.inbox.trees:
+            here = self.model.bodies_of(update.tree)
+            self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
+        for update in self.exchange.send(now, self.robot, touched=self.touched, moving=self.moving, read=self.read):
+            here = self.model.bodies_of(update.tree)
+            self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
+
+    def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
+        here = self.model.bodies_of(tree)
+        return self.state.joint_q[here], self.state.joint_qd[here]
+
+    def bend(self, tree: int, angle: float) -> None:
+        """Turn every joint of a tree by ``angle`` [rad] from where it hangs, and touch it."""
+        here = self.model.bodies_of(tree)
+        turn = frames.exp(np.array([0.0, angle, 0.0]))
+        self.state.joint_q[here] = frames.multiply(turn, self.model.joint_settled[here])
+        self.touched = {tree}
+
+    def environment(self) -> int:
+        """Bytes of plants that it sent."""
+        counters = self.exchange.counters
+        return counters.environment.bytes_out + counters.event.bytes_out

@@ -1,0 +1,1 @@
+"""People: bodies, hands, haptics, and a scripted person for tests and demonstrations."""

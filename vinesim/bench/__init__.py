@@ -1,0 +1,1 @@
+"""Benchmarks beside peers: ``vinesim bench``. Nothing here runs in the product."""

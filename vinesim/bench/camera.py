@@ -1,0 +1,137 @@
+"""``vinesim bench camera``: depth, labels and pictures beside Open3D's ray caster (Embree), in one process.
+
+Both see the same vineyard; Open3D gets it meshed (berries as icospheres of 80 triangles, canes as prisms, leaves as
+quads), about 0.9 million triangles. Cases alternate, medians of CPU time of the whole process are compared: it does not
+matter who uses how many cores.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from vinesim import frames
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.model import Model
+from vinesim.scene.spec import load
+from vinesim.scene.values import CameraInfo, Measurement
+from vinesim.sensors.camera.camera import Camera, CameraSpec, Visibility, pinhole
+from vinesim.sensors.export.images import looking
+from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID
+from vinesim.sensors.scene.primitives import Primitives
+
+_ROUNDS = 7
+
+
+def alternate(*cases: Callable[[], object]) -> list[float]:
+    """Median CPU milliseconds of each case, run in turn."""
+    spent: list[list[float]] = [[] for _ in cases]
+    for case in cases:
+        case()
+    for _ in range(_ROUNDS):
+        for case, times in zip(cases, spent, strict=True):
+            start = time.process_time()
+            case()
+            times.append((time.process_time() - start) * 1e3)
+    return [statistics.median(times) for times in spent]
+
+
+def meshed(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [n, 3] m and triangles [m, 3] of plants and posts, as finely as another simulator would draw them."""
+    kind = primitives.shapes.kind.numpy()
+    a, b, c = (getattr(primitives.shapes, name).numpy() for name in "abc")
+    vertices, faces, first = [], [], 0
+
+    def add(points: np.ndarray, triangles: np.ndarray) -> None:
+        """``points`` [thing, vertex, 3] and one list of triangles for all of them."""
+        nonlocal first
+        count, each = points.shape[:2]
+        vertices.append(points.reshape(-1, 3))
+        faces.append((triangles[None] + (first + each * np.arange(count))[:, None, None]).reshape(-1, 3))
+        first += count * each
+
+    ball = trimesh.creation.icosphere(1)
+    here = kind == SPHEROID
+    axis = b[here, None, :3]
+    points = ball.vertices[None] * np.ones((here.sum(), 1, 1))
+    points = points + axis * ((points * axis).sum(-1, keepdims=True) * (b[here, None, 3:] - 1.0))
+    add(a[here, None, :3] + points * a[here, None, 3:], np.asarray(ball.faces))
+    here = kind == CONE
+    along = b[here, :3] - a[here, :3]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    side = np.cross(along, np.where(np.abs(along[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(along, side)
+    angle = np.arange(6) * np.pi / 3.0
+    ring = side[:, None] * np.cos(angle)[:, None] + other[:, None] * np.sin(angle)[:, None]
+    ends = np.concatenate([p[here, None, :3] + ring * p[here, None, 3:] for p in (a, b)], 1)
+    k, n = np.arange(6), (np.arange(6) + 1) % 6
+    add(ends, np.concatenate([np.stack([k, n, k + 6], 1), np.stack([n, n + 6, k + 6], 1)]))
+    here = kind == LEAF
+    rib, up, size = b[here, :3], c[here, :3], a[here, 3:]
+    across = np.cross(rib, up)
+    corners = [
+        a[here, :3] + size * (u * across + v * rib) for u, v in ((-0.6, -0.3), (0.6, -0.3), (0.6, 0.9), (-0.6, 0.9))
+    ]
+    add(np.stack(corners, 1), np.array([[0, 1, 2], [0, 2, 3]]))
+    low, high = a[:, :2].min(0) - 50.0, a[:, :2].max(0) + 50.0
+    ground = np.array([[*low, 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
+    add(ground[None], np.array([[0, 1, 2], [0, 2, 3]]))
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
+
+
+def demo() -> tuple[Model, Primitives]:
+    """The vineyard of both benches, without grass."""
+    model = generate(load("demo"))
+    return model, Primitives(model, grass=0.0)
+
+
+def embree(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Open3D's ray caster over triangles."""
+    import open3d as o3d
+
+    rays = o3d.t.geometry.RaycastingScene()
+    rays.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+    return rays
+
+
+def camera() -> Iterator[Measurement]:
+    """Rasteriser and pictures; the peer is Open3D where it is installed."""
+    _, primitives = demo()
+    spec = CameraSpec.load("pinhole")
+    info = spec.info("optical")
+    pose = looking(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
+    seen, lens = Visibility(info.width, info.height), pinhole(info, pose)
+    eyes = {name: Camera(spec, info, quality=name) for name in ("fast", "full")}
+    cases: list[Callable[[], object]] = [lambda: seen.draw(primitives, lens)]
+    cases += [lambda eye=eye: eye.render(primitives, pose) for eye in eyes.values()]
+    name, peer = f"depth and labels 640x480, {primitives.count} primitives", ""
+    if find_spec("open3d") is not None:
+        import open3d as o3d
+
+        vertices, faces = meshed(primitives)
+        scene, rays = embree(vertices, faces), o3d.core.Tensor(_rays(info, pose))
+        cases.append(lambda: scene.cast_rays(rays))
+        peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
+    raster, *pictures = alternate(*cases)
+    if peer:
+        theirs = pictures.pop()
+        yield Measurement("camera", name, raster, "CPU ms", peer, theirs, theirs / raster)
+    else:
+        yield Measurement("camera", name, raster, "CPU ms")
+    for quality, spent in zip(eyes, pictures, strict=True):
+        yield Measurement("camera", f"picture 640x480, {quality}, cached shadows", spent, "CPU ms")
+
+
+def _rays(info: CameraInfo, pose: np.ndarray) -> np.ndarray:
+    """Origins and directions [height, width, 6] of all pixels in the world."""
+    u, v = np.meshgrid(np.arange(info.width), np.arange(info.height))
+    local = np.stack([(u - info.cx) / info.fx, (v - info.cy) / info.fy, np.ones(u.shape)], -1)
+    d = frames.rotate(pose[3:], local)
+    return np.concatenate([np.broadcast_to(pose[:3], d.shape), d], -1).astype(np.float32)

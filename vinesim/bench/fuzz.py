@@ -1,0 +1,176 @@
+"""``vinesim bench fuzz``: a hundred thousand broken messages from an actor that was let in, and what they did.
+
+Every message begins as a sound one of any kind and is then broken: bits turned over, cut off, extended, spliced with
+another, filled with extremes, sent again later, under the key of another kind, or replaced by noise or by a megabyte.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.bench.support.fake_client import Puppet, row, swung
+from vinesim.net.codec import messages
+from vinesim.net.codec.human import Push, encode_pose, encode_push
+from vinesim.net.codec.messages import Fact, Hello
+from vinesim.net.replication import interest
+from vinesim.net.replication.authority import Claim
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.scene.ids import Kind, thing
+from vinesim.scene.model import Model
+from vinesim.scene.values import Measurement
+
+EVIL = "evil"
+STORM = 100_000
+A_TICK = 50
+"""Messages in one tick: 5,000 a second, as much as eighty robots say."""
+
+_EXTREMES = (
+    b"\x00" * 8, b"\xff" * 8, struct.pack("<d", float("nan")), struct.pack("<d", float("inf")),
+    struct.pack("<d", 1e308), struct.pack("<d", -1.0), struct.pack("<f", float("nan")), b"\x7f\xff", b"\x80\x00",
+)  # fmt: skip
+
+
+def sound(model: Model, actor: Puppet, now: float, chance: random.Random) -> tuple[str, bytes]:
+    """A family of keys and a message as ``actor`` might send it."""
+    kind = chance.choice(("a", "c", "things", "own", "fact", "force", "hello"))
+    tree = chance.randrange(len(model.tree_first))
+    claim = Claim(chance.randrange(3), chance.randrange(1 << 16), EVIL)
+    if kind == "a":
+        return kind, encode_pose(actor.pose(now))
+    if kind == "force":
+        return kind, encode_push(Push(now, {"base_link": np.array([chance.uniform(-50.0, 50.0)] * 6)}))
+    if kind == "c":
+        q, qd = swung(model, tree, now)
+        flags = np.array([chance.choice((0, messages.TOUCHED, messages.RESTING))])
+        record = messages.Trees(
+            now, np.array([tree]), np.array([claim.ownership]), np.array([claim.authority]), flags,
+            np.array([len(q)]), q, qd,
+        )  # fmt: skip
+        return kind, messages.encode_trees(record)[0][0]
+    if kind == "things":
+        number = np.array([thing(Kind.BOX, tree)])
+        flags = np.array([messages.TOUCHED])
+        record = messages.Things(
+            now, number, np.array([claim.ownership]), np.array([claim.authority]), flags,
+            frames.pose(np.array([[0.5, 0.5, 1.0]])), np.zeros((1, 6)),
+        )  # fmt: skip
+        return "c", messages.encode_things(record, (0, 0))[0][0]
+    if kind == "own":
+        return kind, messages.encode_claims([(tree, claim, chance.random() < 0.5)])
+    if kind == "fact":
+        fact = Fact(thing(Kind.BUNCH, tree), claim.ownership, claim.authority, EVIL)
+        return kind, messages.encode_facts([fact])
+    return "own", messages.encode_hello(Hello(EVIL, scene="puppets", digest="puppets"))
+
+
+def broken(payload: bytes, other: bytes, chance: random.Random) -> bytes:
+    """The same, no longer sound; sometimes untouched."""
+    data = bytearray(payload)
+    how = chance.randrange(9)
+    if how == 0:
+        for _ in range(chance.randint(1, 8)):
+            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+    elif how == 1:
+        del data[chance.randrange(len(data)) :]
+    elif how == 2:
+        data += chance.randbytes(chance.randint(1, 40))
+    elif how == 3:
+        at = chance.randrange(len(data))
+        data[at:] = other[min(at, len(other)) :]
+    elif how == 4:
+        extreme = chance.choice(_EXTREMES)
+        at = chance.randrange(max(len(data) - len(extreme), 1))
+        data[at : at + len(extreme)] = extreme
+    elif how == 5:
+        data[4:] = chance.randbytes(len(data) - 4)
+    elif how == 6:
+        data = bytearray(chance.randbytes(chance.randint(0, 200)))
+    elif how == 7 and chance.random() < 0.002:
+        data = bytearray(b"VS\x01\x02") + bytes(messages.LARGEST + 1)
+    return bytes(data)
+
+
+def storm(model: Model, actor: Puppet, seed: int, now: float = 0.0) -> Iterator[tuple[str, bytes]]:
+    """Broken messages without end, each with the key it is sent under."""
+    chance = random.Random(seed)
+    cells = sorted({interest.cell(pose[:3]) for pose in model.tree_pose.astype(float)})
+    earlier = [encode_pose(actor.pose(now))]
+    while True:
+        family, payload = sound(model, actor, now, chance)
+        bad = broken(payload, chance.choice(earlier), chance)
+        if len(bad) < 1000:
+            earlier = [*earlier[-50:], bad]
+        if chance.random() < 0.1:
+            bad = chance.choice(earlier)
+        if chance.random() < 0.1:
+            family = chance.choice(("a", "c", "own", "fact", "force"))
+        x, y = chance.choice(cells)
+        if family == "a":
+            key = chance.choice((f"a/{EVIL}", f"a/{EVIL}/far"))
+        else:
+            key = f"force/ada/{EVIL}" if family == "force" else f"{family}/{x}/{y}/{EVIL}"
+        now += 0.001
+        yield key, bad
+
+
+def play(count: int, seed: int = 0) -> tuple[Puppet, Puppet, np.ndarray, int]:
+    """A storm against two honest puppets: both, the time of each tick of the first [s], and how many reached it."""
+    hub = MemoryHub(delay=0.005, seed=seed)
+    server = hub.bus("server")
+    server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+    model = row()
+    ada, bob, evil = (Puppet(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0), (EVIL, 3.0)))
+    cast = (ada, bob, evil)
+    for _ in range(100):
+        hub.advance(0.01)
+        for puppet in cast:
+            puppet.tick(hub.time)
+    before = heard(ada)
+    ada.touching = {1}
+    wild = storm(model, evil, seed, hub.time)
+    publishers = {}
+    spent = []
+    for _ in range(-(-count // A_TICK)):
+        for _ in range(A_TICK):
+            key, payload = next(wild)
+            publisher = publishers.setdefault(key, evil.bus.publisher(key, reliable=True))
+            publisher.put(payload)
+        hub.advance(0.01)
+        begin = time.thread_time()
+        ada.tick(hub.time)
+        spent.append(time.thread_time() - begin)
+        bob.tick(hub.time)
+    ada.touching = {1, 2}
+    for _ in range(300):  # and the world goes on
+        hub.advance(0.01)
+        for puppet in (ada, bob):
+            puppet.tick(hub.time)
+    return ada, bob, np.array(spent), heard(ada) - before
+
+
+def heard(puppet: Puppet) -> int:
+    """Messages that arrived."""
+    counters = puppet.exchange.counters
+    return counters.actor.messages_in + counters.environment.messages_in + counters.event.messages_in
+
+
+def fuzz() -> Iterator[Measurement]:
+    """What the storm did."""
+    ada, _, spent, arrived = play(STORM)
+    counters = ada.exchange.counters
+    for case, value, unit in (
+        ("broken messages sent", STORM, ""),
+        ("arrived where somebody listens, newest poses only", arrived, ""),
+        ("counted as malformed", counters.malformed, ""),
+        ("counted as sound and of no use", counters.dropped, ""),
+        ("a tick with 50 of them, p50", 1e3 * np.percentile(spent, 50), "ms"),
+        ("a tick with 50 of them, p99", 1e3 * np.percentile(spent, 99), "ms"),
+        ("a tick with 50 of them, max", 1e3 * spent.max(), "ms"),
+    ):
+        yield Measurement("fuzz", case, float(value), unit)

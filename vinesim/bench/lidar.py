@@ -1,0 +1,78 @@
+"""``vinesim bench lidar``: rays of a revolution beside Open3D's ray caster (Embree), standing and with moving plants.
+
+The scene and the way of measuring are those of ``vinesim bench camera``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+
+import numpy as np
+
+from vinesim.bench.camera import alternate, demo, embree, meshed
+from vinesim.scene.values import Measurement
+from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.lidar.lidar_rasterizer import Sweep
+from vinesim.sensors.scene.primitives import still_view
+from vinesim.sensors.scene.ray_caster import RayCaster
+
+_STAND = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
+"""Between two rows, level."""
+
+
+def _grid(spec: LidarSpec) -> Sweep:
+    """The rays of one revolution."""
+    turn = -2.0 * np.pi * spec.rate.value
+    lasers = np.arange(len(spec.elevation.value))
+    columns = round(1.0 / (spec.rate.value * spec.firing_period.value))
+    return Sweep(
+        np.radians(spec.elevation.value),
+        turn * spec.laser_period.value * lasers,
+        turn * spec.firing_period.value,
+        columns,
+    )
+
+
+def lidar() -> Iterator[Measurement]:
+    """Distances and primitives of all rays, the whole scan, and both while twenty trees move."""
+    model, primitives = demo()
+    spec = LidarSpec.load("vlp16")
+    head, caster = _grid(spec), RayCaster(primitives)
+    thin, wide = Lidar(spec.ideal()), Lidar(spec)
+    rays = head.direction.numpy()
+    reach = spec.farthest.value
+    trees = np.unique(model.body_tree[model.bunch_body])[:20]
+    awake = dataclasses.replace(still_view(model), moved=trees)
+
+    def follow() -> None:
+        primitives.update(awake)
+        head.hits(primitives, _STAND, reach=reach)
+
+    count = len(rays)
+    cases: dict[str, Callable[[], object]] = {
+        f"VLP-16, {count} rays, rasterised": lambda: head.hits(primitives, _STAND, reach=reach),
+        f"VLP-16, {count} rays, one by one": lambda: caster.cast(_STAND[:3], rays, reach),
+        f"VLP-16, {count} shots, scan of thin beams": lambda: thin.scan(primitives, _STAND),
+        f"VLP-16, {count} shots, scan of true beams": lambda: wide.scan(primitives, _STAND),
+        f"20 trees moved, {count} rays, rasterised": follow,
+    }
+    if find_spec("open3d") is None:
+        for case, spent in zip(cases, alternate(*cases.values()), strict=True):
+            yield Measurement("lidar", case, spent, "CPU ms")
+        return
+    import open3d as o3d
+
+    vertices, faces = meshed(primitives)
+    scene = embree(vertices, faces)
+    tensor = o3d.core.Tensor(np.concatenate([np.broadcast_to(_STAND[:3].astype(np.float32), rays.shape), rays], 1))
+    *ours, theirs = alternate(*cases.values(), lambda: scene.cast_rays(tensor))
+    start = time.process_time()
+    embree(vertices, faces).cast_rays(tensor)
+    rebuilt = (time.process_time() - start) * 1e3
+    peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
+    for case, spent in zip(cases, ours, strict=True):
+        name, value = (peer + ", rebuilt", rebuilt) if "moved" in case else (peer, theirs)
+        yield Measurement("lidar", case, spent, "CPU ms", name, value, value / spent)

@@ -1,0 +1,150 @@
+"""``vinesim bench link``: a touch seen from far away, by whole clients over Zenoh and emulated links, in real time.
+
+Server and clients are processes, each in a network namespace of its own. The picker pushes a bunch again and again,
+the visitor watches the same bunch in its own world; both note it by the host's clock.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim.bench.support.fake_client import Stage
+from vinesim.bench.support.network_emulator import Emulator, Line, Way
+from vinesim.client.recording.trace import Rows, remote_error
+from vinesim.client.tasks.start_poses import bunch_in_reach, spawn_pose
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
+from vinesim.scene.values import Measurement
+
+LINES = {
+    "LAN, 0.2 ms one way": Line(Way(0.0002)),
+    "20 +- 4 ms one way, 1 % lost": Line(Way(0.010, 0.002, 0.005)),
+    "50 +- 10 ms one way, 1 % lost": Line(Way(0.025, 0.005, 0.005)),
+}
+"""Of each client to the server: from client to client it is twice that."""
+
+SECONDS = 26.0
+"""How long the clients run: some four pushes."""
+
+START = 150.0
+"""How long a client may take to start and to write what it saw [s]."""
+
+SEEN = 0.002
+"""A bunch has visibly moved when its centre is so far from where it was at the touch [m]."""
+
+TOUCHES = 40
+"""Of light clients."""
+
+STILL = 0.001
+"""Only touches count of a bunch that moved by less than this in the 0.3 s before [m]: it swings from the last."""
+
+APART = 1.0
+"""Touches are new when nothing touched for so long [s]."""
+
+
+def touches(rows: Rows) -> list[int]:
+    """Rows in which a force begins after a pause, on a bunch that is still."""
+    pressed = np.flatnonzero(np.linalg.norm(rows.force, axis=1) > 0.0)
+    if not len(pressed):
+        return []
+    new = np.diff(rows.clock[pressed], prepend=-np.inf) > APART
+    return [row for row in pressed[new].tolist() if np.ptp(rows.displacement[max(row - 30, 0) : row], 0).max() < STILL]
+
+
+def moves(rows: Rows, since: float) -> float:
+    """How long after ``since`` [s, host's clock] the bunch visibly moves [s]; infinite if it does not in a second."""
+    first = int(np.searchsorted(rows.clock, since))
+    here = slice(first, int(np.searchsorted(rows.clock, since + 1.0)))
+    if first == 0 or here.stop <= first:
+        return np.inf
+    away = np.linalg.norm(rows.displacement[here] - rows.displacement[first - 1], axis=1)
+    return float(rows.clock[first + int(np.argmax(away > SEEN))] - since) if (away > SEEN).any() else np.inf
+
+
+def watched(line: Line) -> tuple[Rows, Rows]:
+    """What the picker and the visitor saw of the same bunch."""
+    scene = load("demo")
+    bunch = str(bunch_in_reach(generate(scene), spawn_pose(scene, 0)))
+    client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
+    roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
+    with tempfile.TemporaryDirectory() as folder, Emulator(dict.fromkeys(roles, line)) as net:
+        server = net.start(
+            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--status", "none"],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert server.stdout is not None
+        server.stdout.readline()
+        processes = []
+        for name, role in roles.items():
+            place = ["--connect", f"tcp/{net.hub(name)}:7447", "--name", name, "--out", f"{folder}/{name}"]
+            processes.append(net.start(name, [*client, *role, *place, "--seconds", str(SECONDS)]))
+        end = time.monotonic() + SECONDS + START
+        for process in processes:
+            if process.wait(max(end - time.monotonic(), 0.0)) != 0:
+                raise RuntimeError(f"a client ended with {process.returncode}")
+        picker, visitor = (Rows.load(pathlib.Path(folder) / name / "trace.npz") for name in roles)
+    return picker, visitor
+
+
+def told(line: Line, touches: int = TOUCHES) -> list[float]:
+    """From the tick of a touch to the tick in which another client is told of it [s]: light clients, see :mod:`puppet`.
+
+    Their ticks are kept even on a busy machine, so this is the network's share, and the waiting for two ticks.
+    """
+    with Emulator({"ada": line, "bob": line}) as net:
+        server = net.start(
+            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--status", "none"],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert server.stdout is not None
+        server.stdout.readline()
+
+        def stage(name: str, x: float) -> Stage:
+            cast = [{"name": name, "place": [x, 0.0]}]
+            return Stage(f"tcp/{net.hub(name)}:7447", cast, start=lambda *a, **k: net.start(name, *a, **k))
+
+        with stage("ada", 1.0) as ada, stage("bob", 2.0) as bob:
+            end = time.monotonic() + START
+            while not (bob.tell()["poses"] and ada.tell()["poses"]) and time.monotonic() < end:
+                time.sleep(0.05)
+            took = []
+            for number in range(touches):
+                tree = str(number % 3)
+                start = ada.tell(touch=[int(tree)])["now"]
+                while bob.tell()["heard"].get(tree, -np.inf) < start and time.monotonic() < end:
+                    time.sleep(0.01)
+                first = bob.tell()["first"].get(tree, np.inf)
+                took.append(first - start)
+                ada.tell(touch=[])
+                while bob.tell()["owner"].get(tree) is not None and time.monotonic() < end:
+                    time.sleep(0.01)
+                time.sleep(0.037)
+    return [one for one in took if 0.0 <= one < 2.0]
+
+
+def link() -> Iterator[Measurement]:
+    """Rows for each line."""
+    for case, line in LINES.items():
+        took = 1e3 * np.array(told(line))
+        for share in (50, 95):
+            yield Measurement("link", f"{case}: touch to told, p{share}", float(np.percentile(took, share)), "ms")
+    for case, line in LINES.items():
+        picker, visitor = watched(line)
+        known = [picker.clock[row] for row in touches(picker) if visitor.told.any()]
+        both = [(moves(picker, start), moves(visitor, start)) for start in known]
+        both = [(1e3 * here, 1e3 * there) for here, there in both if np.isfinite(here) and np.isfinite(there)]
+        yield Measurement("link", f"{case}: touches of a still bunch", float(len(both)), "")
+        if both:
+            here, there = np.median(both, axis=0)
+            case_ = f"{case}: touch to 2 mm of motion as another sees it, p50"
+            yield Measurement("link", case_, float(there), "ms", "as the one who touches sees it", float(here))
+        if (error := remote_error(picker, visitor)) is not None:
+            yield Measurement("link", f"{case}: copy of the pushed bunch, p50", error["p50"], "mm")
+            yield Measurement("link", f"{case}: copy of the pushed bunch, p95", error["p95"], "mm")

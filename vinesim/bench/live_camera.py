@@ -1,0 +1,85 @@
+"""``vinesim bench eyes``: the 100 Hz tick of a robot in real time, while its camera is looked through and while not."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+from vinesim.client.client import Client
+from vinesim.client.rate_loop import Pace
+from vinesim.client.recording.trace import Trace
+from vinesim.client.sensing.sensor_process import Senses
+from vinesim.client.tasks.start_poses import bunch_in_reach, spawn_pose, start_pose
+from vinesim.client.tasks.tasks import LookAt
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
+from vinesim.scene.values import Measurement
+
+SECONDS = 8.0
+"""Real time of one run [s]; each kind is run twice, in turn."""
+SETTLED = 100
+"""Ticks before the count begins."""
+
+
+@dataclasses.dataclass
+class _Run:
+    p50: float
+    p99: float
+    overruns: int
+    hz: float
+    frames: float
+    dropped: float
+
+
+def _run(pictures: bool) -> _Run:
+    """One robot pushes a bunch again and again, and its head follows with the camera."""
+    plan = load("demo")
+    model = generate(plan)
+    description = load_robot("vinebot")
+    with contextlib.ExitStack() as stack:
+        bus = stack.enter_context(MemoryHub().bus("robot"))
+        senses = stack.enter_context(Senses("robot", plan, model, description, ros=False, keep_pictures=pictures))
+        arrivals = stack.enter_context(ThreadPoolExecutor(1, "arrivals"))
+        client = Client(plan, model, description, bus, name="robot", pose=start_pose(plan, 0), executor=arrivals)
+        stack.callback(client.leave)
+        senses.attach(client)
+        bunch = bunch_in_reach(model, spawn_pose(plan, 0))
+        body = int(model.bunch_body[bunch])
+        client.trace = Trace(model, bunch, client.physics.state.body_q[body].copy(), 1 << 14)
+        reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
+        client.jobs += [reach.control, LookAt(client.robot, client.trace.centre)]
+        warm, pace = Pace(client.physics.dt), Pace(client.physics.dt)
+        camera = description.cameras[0].name
+        before = {"frames": 0, "frames_dropped": 0}
+        for beat, ticks in ((warm, SETTLED), (pace, round(SECONDS / client.physics.dt))):
+            if beat is pace:
+                before = {key: counts.get(camera, 0) for key, counts in senses.report().items() if key in before}
+            for _ in range(ticks):
+                beat.begin()
+                client.tick()
+                beat.end()
+        after = {key: counts.get(camera, 0) for key, counts in senses.report().items() if key in before}
+        span = pace.elapsed
+        p50, p99 = pace.work_ms(50, 99)
+    rate = {key: (after.get(key, 0) - before.get(key, 0)) / span for key in ("frames", "frames_dropped")}
+    return _Run(p50, p99, pace.overruns, pace.hz, rate["frames"], rate["frames_dropped"])
+
+
+def eyes() -> Iterator[Measurement]:
+    """Ticks and pictures a second; the peer is the same client whose camera nobody wants."""
+    runs = {False: [], True: []}
+    for pictures in (False, True, False, True):
+        runs[pictures].append(_run(pictures))
+    blind, seeing = (min(runs[k], key=lambda r: r.p99) for k in (False, True))
+    peer = "no pictures"
+    yield Measurement("eyes", "tick p50", seeing.p50, "ms", peer, blind.p50, blind.p50 / seeing.p50)
+    yield Measurement("eyes", "tick p99", seeing.p99, "ms", peer, blind.p99, blind.p99 / seeing.p99)
+    yield Measurement("eyes", "ticks a second", seeing.hz, "Hz", peer, blind.hz, seeing.hz / blind.hz)
+    yield Measurement("eyes", f"ticks over 10 ms in {SECONDS:g} s", seeing.overruns, "1", peer, blind.overruns, None)
+    yield Measurement("eyes", "pictures 640x480 a second, of 30 asked for", seeing.frames, "Hz")
+    yield Measurement("eyes", "pictures dropped a second", seeing.dropped, "Hz")

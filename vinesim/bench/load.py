@@ -1,0 +1,171 @@
+"""``vinesim bench load``: many clients on one router, and on two that are linked; processes over Zenoh on loopback.
+
+The clients are puppets: real sessions and exchanges at 60 Hz without physics, several to a process, on a plain so wide
+that each has the neighbours it would have in a vineyard. A probe, two bare sessions of another process, sends poses
+through the same routers meanwhile and tells delay and loss. Where the clients' processes need all of the machine, the
+figures say what this machine can play, not what the router can carry: both shares of its cores are told.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.bench.support.fake_client import ROBOT_JOINTS as JOINTS
+from vinesim.bench.support.fake_client import Stage
+from vinesim.net.codec.human import encode_pose
+from vinesim.scene.values import Measurement, RobotUpdate
+
+COUNTS = (10, 30, 100)
+PER_PROCESS = 10
+PER_CORE = 15
+"""A core plays so many puppets at 60 Hz; more would measure how they starve, not what a router carries."""
+
+SECONDS = 6.0
+MEETING = 30.0
+"""How long clients may take to meet [s]."""
+
+APART = 8.0
+"""Between neighbours on the plain [m]: each then hears four others at the full rate."""
+
+PROBE = """
+import json, struct, sys, threading, time
+from vinesim.net.transport.zenoh_bus import ZenohBus
+from vinesim.net.transport.bus import EVERY
+
+here, there, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])
+with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", connect=there, world="probe") as b:
+    b.subscribe("a/probe_a", EVERY)
+    publisher = a.publisher("a/probe_a")
+    end = time.monotonic() + 10.0
+    while not publisher.matching and time.monotonic() < end:
+        time.sleep(0.01)
+    ages, sent = [], 0
+
+    def listen():
+        while not over.is_set():
+            now = time.monotonic()
+            ages.extend(now - struct.unpack_from("d", payload)[0] for _, payload in b.drain())
+            time.sleep(0.0005)
+
+    over = threading.Event()
+    ear = threading.Thread(target=listen)
+    ear.start()
+    start = time.monotonic()
+    while time.monotonic() < start + seconds:
+        publisher.put(struct.pack("d", time.monotonic()) + bytes(200))
+        sent += 1
+        time.sleep(max(0.0, start + sent / 60.0 - time.monotonic()))
+    time.sleep(1.0)
+    over.set()
+    ear.join()
+    print(json.dumps([sent, ages]))
+"""
+
+
+@contextlib.contextmanager
+def router(*options: str) -> Iterator[tuple[str, subprocess.Popen]]:
+    """A server in a process of its own: its endpoint, and the process."""
+    command = [
+        sys.executable,
+        "-m",
+        "vinesim.cli",
+        "server",
+        "--status",
+        "none",
+        "--listen",
+        "tcp/127.0.0.1:0",
+        *options,
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        if not line.startswith("listening on "):
+            raise RuntimeError(f"the server did not start: {line!r}")
+        yield line.split()[2], process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def cpu(process: subprocess.Popen) -> float:
+    """Time a process and its threads have used [s]."""
+    with open(f"/proc/{process.pid}/stat") as file:
+        fields = file.read().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measurement]:
+    """``count`` clients, shared out among the routers."""
+    side = math.ceil(math.sqrt(count))
+    puppets = [{"name": f"p{i}", "place": [APART * (i % side), APART * (i // side)]} for i in range(count)]
+    groups = [puppets[i : i + PER_PROCESS] for i in range(0, count, PER_PROCESS)]
+    with contextlib.ExitStack() as stack:
+        stages = [
+            stack.enter_context(Stage(ends[i % len(ends)][0], group, trees=1, tick=1.0 / 60.0))
+            for i, group in enumerate(groups)
+        ]
+        start = time.monotonic()
+        while any(len(stage.tell()["others"]) < count - 1 for stage in stages):
+            if time.monotonic() > start + MEETING:
+                break
+            time.sleep(0.2)
+        met = min(len(stage.tell()["others"]) for stage in stages) + 1
+        took = time.monotonic() - start
+        before = [cpu(process) for _, process in ends], [stage.tell() for stage in stages], time.monotonic()
+        arguments = [ends[0][0], ends[-1][0], str(SECONDS)]
+        probe = subprocess.run([sys.executable, "-c", PROBE, *arguments], capture_output=True, text=True)
+        after = [cpu(process) for _, process in ends], [stage.tell() for stage in stages], time.monotonic()
+    wall = after[2] - before[2]
+    routers = sum(b - a for a, b in zip(before[0], after[0], strict=True)) / wall
+    clients = sum(b["cpu"] - a["cpu"] for a, b in zip(before[1], after[1], strict=True)) / wall
+    size = len(encode_pose(RobotUpdate("", 0.0, frames.pose([0.0, 0.0, 0.0]), *map(np.zeros, (6, JOINTS, JOINTS)))))
+    spans = [(a, b, b["now"] - a["now"]) for a, b in zip(before[1], after[1], strict=True)]
+    ticks = np.mean([(b["ticks"] - a["ticks"]) / seconds for a, b, seconds in spans])
+    # what arrived, not what a late tick still found: of poses only the newest wait
+    heard = np.mean([(b["bytes_in"] - a["bytes_in"]) / size / seconds for a, b, seconds in spans])
+    case = f"{count} clients, {len(ends)} router{'s' * (len(ends) > 1)}"
+
+    def line(what: str, value: float, unit: str) -> Measurement:
+        return Measurement("load", f"{case}: {what}", float(value), unit)
+
+    yield line("clients that all others met", met, "")
+    yield line("until all had met", took, "s")
+    yield line("routers' CPU", routers, "cores")
+    yield line("clients' CPU", clients, "cores")
+    yield line("cores of the machine", len(os.sched_getaffinity(0)), "")
+    yield line("rate of a client's tick, 60 wanted", ticks, "Hz")
+    yield line("poses that reach a client", heard, "1/s")
+    yield line("routers' CPU for a pose delivered", 1e6 * routers / (heard * count), "us")
+    if probe.returncode != 0:
+        raise RuntimeError(f"the probe failed: {probe.stderr[-300:]}")
+    sent, ages = json.loads(probe.stdout)
+    if ages:
+        yield line("pose under way, p50", 1e3 * np.percentile(ages, 50), "ms")
+        yield line("pose under way, p99", 1e3 * np.percentile(ages, 99), "ms")
+    yield line("poses lost", 100.0 * (1.0 - len(ages) / sent), "%")
+
+
+def load() -> Iterator[Measurement]:
+    """10, 30 and 100 clients on one router, then shared out between two that are linked, as far as there are cores."""
+    most = PER_CORE * len(os.sched_getaffinity(0))
+    yield Measurement("load", "clients that the cores of this machine can play", float(most), "")
+    with router() as first:
+        for count in COUNTS:
+            if count <= most:
+                yield from run(count, [first])
+    with router() as first, router("--connect", first[0]) as second:
+        for count in COUNTS:
+            if count <= most:
+                yield from run(count, [first, second])

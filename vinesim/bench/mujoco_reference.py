@@ -1,0 +1,136 @@
+"""The same plants, or the whole scene, in MuJoCo: the peer that tests and benchmarks hold our solver against.
+
+MuJoCo's ball joint has one stiffness for all axes, so each joint takes its first bending stiffness; for an exact
+comparison build trees whose springs are isotropic.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.contact.contact_solver import shapes_of
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.robot_body import RobotBody
+from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, furnished
+from vinesim.scene.builder import GRAVITY
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+from vinesim.scene.values import RobotSpec
+
+
+def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None = None) -> mujoco.MjModel:
+    """All trees of ``model`` as ball-joint chains under ``integrator="discrete"``, contacts off.
+
+    ``damping`` [body] N m s/rad replaces the model's: our solver takes off what its scheme adds, MuJoCo does not.
+    """
+    spec = mujoco.MjSpec()
+    spec.option.timestep = dt
+    spec.option.gravity = GRAVITY
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
+    spec.memory = 1 << 28
+    _grow(spec, model, model.joint_damping[:, 1] if damping is None else damping)
+    return spec.compile()
+
+
+def _grow(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[mujoco.MjsBody]:
+    """Add all trees to a world; ``damping`` [body] N m s/rad. Returns MuJoCo's bodies, without geoms."""
+    made: list[mujoco.MjsBody] = []
+    for body in range(len(model.body_mass)):
+        parent = int(model.body_parent[body])
+        pose = frames.pose(model.body_offset[body], model.body_rest[body])
+        if parent < 0:
+            pose = frames.compose(model.tree_pose[model.body_tree[body]].astype(float), pose)
+        child = (spec.worldbody if parent < 0 else made[parent]).add_body(
+            name=f"plant/{body}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[body]),
+            ipos=model.body_com[body], inertia=model.body_inertia[body], explicitinertial=True,
+        )  # fmt: skip
+        child.add_joint(
+            name=f"plant/{body}", type=mujoco.mjtJoint.mjJNT_BALL, stiffness=float(model.joint_stiffness[body, 1]),
+            damping=float(damping[body]),
+        )  # fmt: skip
+        made.append(child)
+    return made
+
+
+class Whole:
+    """A scene of plants and robots wholly in MuJoCo: one world, ball joints, a capsule or spheres for every body.
+
+    Robots meet plants; plants do not meet each other (they may in ours: that is work the peer is spared). ``rigid``
+    takes commands as ever. The scheme of ``discrete`` adds dt K of damping, which is taken off, down to nothing.
+
+    ``give`` [s] is the time constant of every contact; the default of MuJoCo, 0.02, is soft: at 3 m/s it lets things
+    overlap by centimetres.
+    """
+
+    def __init__(self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01, give: float | None = None) -> None:
+        self.rigid = mine = Rigid(model, dt=dt)
+        for robot in robots:
+            mine.add_robot(robot)
+        spec = furnished(model, dt)
+        spec.memory = 1 << 29
+        spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        for bit, robot in enumerate(robots, FIRST_ACTOR):
+            RobotBody(robot, bit).attach(spec)
+        made = _grow(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
+        shapes = shapes_of(model)
+        for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
+            kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
+            if (start != end).any():
+                kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
+            made[body].add_geom(
+                type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
+                friction=ROUGH, solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
+            )  # fmt: skip
+        world = spec.compile()
+        if give is not None:
+            world.geom_solref[:] = give, 1.0
+            world.geom_solimp[:] = 0.99, 0.999, 0.001, 0.5, 2.0
+        data = mujoco.MjData(world)
+        for j in range(mine.world.njnt):
+            joint = mine.world.joint(j)
+            if joint.name.split("/")[0].split(":")[0] in mine.robots:
+                data.joint(joint.name).qpos[:] = mine.data.joint(j).qpos
+        for body, q in enumerate(model.joint_settled):
+            data.joint(f"plant/{body}").qpos[:] = frames.to_wxyz(q)
+        mine.inhabit(world, data)
+        self.world, self.data = world, data
+
+    def step(self) -> None:
+        """One tick of everything."""
+        self.rigid.drive()
+        mujoco.mj_step(self.world, self.data)
+        self.rigid.stale()
+
+    def body_q(self, body: int) -> np.ndarray:
+        """Pose [7] of a plant's body after the last step."""
+        self.rigid.refresh()
+        there = self.data.body(f"plant/{body}")
+        return np.concatenate([there.xpos, frames.from_wxyz(there.xquat)])
+
+    def force_on(self, link: str) -> np.ndarray:
+        """[3] N of all contacts on the robot link of this name in the last step."""
+        total, wrench = np.zeros(3), np.zeros(6)
+        for number in range(self.data.ncon):
+            contact = self.data.contact[number]
+            mujoco.mj_contactForce(self.world, self.data, number, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3]
+            one, other = (
+                self.world.body(self.world.geom_bodyid[geom]).name.endswith("/" + link) for geom in contact.geom
+            )
+            total += (float(other) - float(one)) * force
+        return total
+
+    def touching(self) -> int:
+        """Contacts of the last tick between plants and robots."""
+        bodies = self.world.geom_bodyid[self.data.contact.geom]
+        is_plant = np.array([self.world.body(i).name.startswith("plant/") for i in range(self.world.nbody)])
+        return int((is_plant[bodies].sum(1) == 1).sum())
+
+
+def copy_state(state: State, data: mujoco.MjData) -> None:
+    """Our joints into MuJoCo, whose ball rates are in the moved body's axes."""
+    data.qpos[:] = frames.to_wxyz(state.joint_q).ravel()
+    data.qvel[:] = frames.rotate(frames.conjugate(state.joint_q), state.joint_qd).ravel()

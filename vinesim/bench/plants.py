@@ -1,0 +1,85 @@
+"""Plants beside MuJoCo C on the same scene, in the same process, taking turns: medians of interleaved runs.
+
+The scene: canes of 16 bodies (1 m, 8 mm, 5 GPa, 800 kg/m^3), each with a bunch of 0.5 kg on its tip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from threading import Thread
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.bench.mujoco_reference import compile_plants
+from vinesim.bench.scenes import interleaved
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+from vinesim.scene.values import Measurement
+
+CANES = 64
+
+
+def cane(side: float) -> Tree:
+    """A horizontal cane with a bunch hanging from its tip."""
+    tree = Tree(frames.pose(np.array([0.0, side, 2.0])))
+    last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.006), 16)[-1]
+    tree.add(
+        last, offset=(1 / 16, 0, 0), rest=frames.aligned(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH), mass=0.5,
+        com=(0.1, 0, 0), inertia=(5e-4, 5e-4, 5e-4), length=0.15, radius=(0.05, 0.05), damping=(0.002, 0.002, 0.002),
+    )  # fmt: skip
+    return tree
+
+
+def vineyard(count: int) -> Model:
+    """Canes half a metre apart."""
+    return assemble([cane(0.5 * i) for i in range(count)])
+
+
+def ready(model: Model, awake: int) -> Plants:
+    """Plants with their first trees awake and every kernel warm."""
+    plants = Plants(model, State.at_rest(model))
+    plants.wake(np.arange(awake))
+    steps(plants, 5)
+    return plants
+
+
+def steps(plants: Plants, count: int) -> None:
+    """Whole ticks without contacts."""
+    for _ in range(count):
+        plants.free()
+        plants.commit()
+
+
+def plants() -> Iterator[Measurement]:
+    """64 canes awake, touched by nobody, on one thread and on two."""
+    ticks = 40
+    model = vineyard(CANES)
+    whole = ready(model, CANES)
+    halves = [ready(vineyard(CANES // 2), CANES // 2) for _ in range(2)]
+    peer = compile_plants(model)
+    data = mujoco.MjData(peer)
+    for _ in range(5):
+        mujoco.mj_step(peer, data)
+
+    def together() -> None:
+        threads = [Thread(target=steps, args=(half, ticks)) for half in halves]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+    def mujoco_steps() -> None:
+        for _ in range(ticks):
+            mujoco.mj_step(peer, data)
+
+    one, two, theirs = (
+        1e3 * seconds / ticks for seconds in interleaved(lambda: steps(whole, ticks), together, mujoco_steps)
+    )
+    name = f"MuJoCo {mujoco.mj_versionString()} discrete"
+    yield Measurement("plants", f"{CANES} canes awake, one thread", one, "ms/tick", name, theirs, theirs / one)
+    yield Measurement("plants", f"{CANES} canes awake, two threads", two, "ms/tick", name, theirs, theirs / two)

@@ -1,0 +1,122 @@
+"""What the benches of physics step: rows of canes with bunches, hands that hold some, a bar that lifts others.
+
+A cane is a metre of wood, 12 mm thick (5 GPa, 800 kg/m^3) in 16 bodies, level at rest, and on its tip hangs a bunch of
+0.5 kg on a peduncle of 8 cm in two bodies.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.step import Physics
+from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import Drive, RobotSpec
+
+SPACING = 0.15
+"""Between canes [m]."""
+HEIGHT = 2.0
+REACH = 0.085
+"""From the bunch's stalk to its middle [m]."""
+
+
+def cane(side: float) -> Tree:
+    """A level cane along x with a bunch hanging from its tip."""
+    tree = Tree(frames.pose(np.array([0.0, side, HEIGHT])))
+    last = tree.rod(-1, 1.0, (0.006, 0.006), Wood(5e9, 800.0, 0.01, shear=2.5e9), 16)[-1]
+    down = frames.aligned(np.array([0.0, 0.0, -1.0]))
+    stalk = Wood(1e9, 800.0, 0.02, shear=0.5e9)
+    last = tree.rod(last, 0.08, (0.002, 0.002), stalk, 2, organ=Organ.PEDUNCLE, rest=down)[-1]
+    spring = np.asarray(tree.bodies[last]["stiffness"])
+    bunch = tree.add(
+        last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=0.5, com=(REACH, 0, 0), length=0.17,
+        radius=(0.04, 0.04), inertia=(3.2e-4, 8.7e-4, 8.7e-4), stiffness=spring, damping=0.01 * spring + 2e-3,
+    )  # fmt: skip
+    tree.bunches.append({"body": bunch, "length": 0.17, "radius": 0.045, "berries": 80, "pull": 500.0, "bend": 50.0})
+    tree.settle()
+    return tree
+
+
+def row(count: int) -> Model:
+    """Canes side by side, the first at y = 0. Copies of one: ten thousand grow in seconds."""
+    one = cane(0.0)
+    trees = []
+    for i in range(count):
+        tree = Tree(frames.pose(np.array([0.0, SPACING * i, HEIGHT])))
+        tree.bodies, tree.bunches = one.bodies, one.bunches
+        trees.append(tree)
+    return assemble(trees)
+
+
+def bunch_at(cane: int) -> np.ndarray:
+    """Middle of a resting bunch [3] m."""
+    return np.array([1.0, SPACING * cane, HEIGHT - 0.08 - REACH])
+
+
+def _inertial(mass: float) -> str:
+    i = 0.004 * mass
+    return (
+        f'<inertial><mass value="{mass}"/><inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+
+
+def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0") -> str:
+    return (
+        f'<joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{origin}"/><axis xyz="{axis}"/><limit lower="-2" upper="2" effort="1000" velocity="5"/></joint>'
+    )
+
+
+def hand(name: str, at: np.ndarray) -> RobotSpec:
+    """Two flat fingers open by 17 cm about a point; drives: lift, and one for each finger (0.05 is a firm grasp)."""
+    finger = "<collision><geometry><box size='0.02 0.04 0.07'/></geometry></collision>"
+    urdf = (
+        f'<robot name="hand"><link name="base_footprint">{_inertial(50.0)}</link>'
+        f'<link name="palm">{_inertial(4.0)}</link>'
+        f'<link name="left">{_inertial(0.1)}{finger}</link><link name="right">{_inertial(0.1)}{finger}</link>'
+        f"{_slide('lift', 'base_footprint', 'palm', '0 0 1')}"
+        f"{_slide('close_left', 'palm', 'left', '-1 0 0', '0.085 0 0')}"
+        f"{_slide('close_right', 'palm', 'right', '1 0 0', '-0.085 0 0')}</robot>"
+    )
+    drives = (
+        Drive("lift", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0),
+        Drive("close_left", 4000.0, 80.0, 40.0, 5.0, -1.0, 1.0),
+        Drive("close_right", 4000.0, 80.0, 40.0, 5.0, -1.0, 1.0),
+    )
+    return RobotSpec(name, 0, urdf, "base_footprint", frames.pose(at), drives, np.zeros(3))
+
+
+def bar(name: str, first: int, count: int) -> RobotSpec:
+    """A bar across so many canes, 3 cm below them and 0.6 m from their clamps; its drive lifts it."""
+    length = SPACING * count
+    urdf = (
+        f'<robot name="bar"><link name="base_footprint">{_inertial(50.0)}</link><link name="bar">{_inertial(6.0)}'
+        f'<collision><origin rpy="1.5707963 0 0"/><geometry><cylinder radius="0.02" length="{length}"/></geometry>'
+        f"</collision></link>{_slide('lift', 'base_footprint', 'bar', '0 0 1')}</robot>"
+    )
+    drives = (Drive("lift", 2e4, 2000.0, 1000.0, 5.0, -1.0, 1.0),)
+    middle = np.array([0.6, SPACING * (first + 0.5 * (count - 1)), HEIGHT - 0.006 - 0.02 - 0.03])
+    return RobotSpec(name, 1, urdf, "base_footprint", frames.pose(middle), drives, np.zeros(1))
+
+
+def sleepless(physics: Physics, trees: np.ndarray) -> Physics:
+    """Wake some trees and let nothing fall asleep again."""
+    physics.sleep.quiet = -1.0
+    physics.plants.wake(trees)
+    return physics
+
+
+def interleaved(*works: Callable[[], None], rounds: int = 9) -> list[float]:
+    """Median seconds of each work, all taking turns so that the machine's moods hit all alike."""
+    seconds = np.zeros((rounds, len(works)))
+    for row in seconds:
+        for i, work in enumerate(works):
+            start = time.perf_counter()
+            work()
+            row[i] = time.perf_counter() - start
+    return np.median(seconds, axis=0).tolist()

@@ -1,0 +1,323 @@
+"""Links of a wide network on one machine: delay, jitter, loss and cuts between network namespaces, every byte counted.
+
+    with Emulator({"ada": Line(Way(0.05, 0.02, 0.01)), "bob": Line()}) as net:
+        server = net.start("hub", ["vinesim", "server", "--listen", "tcp/0.0.0.0:7447"])
+        client = net.start("ada", ["vinesim", "client", "--connect", f"tcp/{net.hub('ada')}:7447"])
+        sent, received = net.counts("ada")
+
+Each end of the star is a namespace of its own, joined to the hub's by a pair of TUN devices, and a process between
+them carries the packets: not every kernel has tc-netem, all have TUN. It needs Linux and root, see :func:`unusable`.
+
+The namespaces carry the process id of their maker. That process may die in whatever way: the carrier notices and
+takes them away, and should it be killed too, the next emulator does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import heapq
+import json
+import os
+import random
+import re
+import select
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from typing import IO, Any, Self
+
+HUB = "hub"
+"""The end that all lines lead to."""
+
+_PREFIX = "vinesim-link"
+_TUNSETIFF, _TUN, _NO_PACKET_INFO = 0x400454CA, 0x0001, 0x1000
+_LARGEST = 2048
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Way:
+    """How packets travel in one direction: uniformly between ``delay`` - ``jitter`` and ``delay`` + ``jitter`` [s].
+
+    They stay in order, as in the queue of a router; ``loss`` is the chance that one vanishes.
+    """
+
+    delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.delay < 0.0 or self.jitter < 0.0 or not 0.0 <= self.loss <= 1.0:
+            raise ValueError(f"{self}: delay and jitter must not be negative, loss from 0 to 1")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Line:
+    """One end's connection with the hub; what comes back travels as what goes there, unless said otherwise."""
+
+    there: Way = Way()
+    back: Way | None = None
+
+    def ways(self) -> tuple[Way, Way]:
+        """From the end to the hub, and from the hub to the end."""
+        return self.there, self.there if self.back is None else self.back
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Count:
+    """What was put on a line in one direction, IP headers and all."""
+
+    packets: int = 0
+    bytes: int = 0
+    lost: int = 0
+    """How many of the packets did not arrive."""
+
+    def __sub__(self, earlier: Count) -> Count:
+        return Count(self.packets - earlier.packets, self.bytes - earlier.bytes, self.lost - earlier.lost)
+
+
+def unusable() -> str:
+    """Empty, or why links cannot be emulated here."""
+    if not sys.platform.startswith("linux"):
+        return "network namespaces are Linux's"
+    if os.geteuid() != 0:
+        return "network namespaces need root"
+    if not os.path.exists("/dev/net/tun"):
+        return "there is no /dev/net/tun"
+    if shutil.which("ip") is None:
+        return "there is no ip command (package iproute2)"
+    probe = f"{_PREFIX}-{os.getpid()}-probe"
+    made = subprocess.run(["ip", "netns", "add", probe], capture_output=True, text=True)
+    if made.returncode != 0:
+        return f"namespaces cannot be made: {made.stderr.strip()}"
+    _ip("netns", "del", probe)
+    return ""
+
+
+class Emulator:
+    """A star of namespaces around :data:`HUB`; see the module. A context manager."""
+
+    def __init__(self, lines: dict[str, Line], *, seed: int = 0) -> None:
+        if reason := unusable():
+            raise RuntimeError(f"links cannot be emulated here: {reason}")
+        for end in lines:
+            if end == HUB or not re.fullmatch(r"[a-z0-9]{1,12}", end):
+                raise ValueError(f"end {end!r}: use 1 to 12 small letters and digits, not {HUB!r}")
+        _sweep()
+        self._ends = {end: i + 1 for i, end in enumerate(lines)}
+        self._started: list[subprocess.Popen] = []
+        made = {end: self._space(end) for end in (HUB, *lines)}
+        self._carrier = subprocess.Popen(
+            [sys.executable, "-m", "vinesim.bench.support.network_emulator"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        shapes = {end: _plain(line) for end, line in lines.items()}
+        try:
+            self._tell({"spaces": made, "lines": shapes, "seed": seed})
+        except BaseException:
+            self.close()
+            raise
+
+    def _space(self, end: str) -> str:
+        return f"{_PREFIX}-{os.getpid()}-{id(self):x}-{end}"
+
+    def _tell(self, what: dict[str, Any]) -> Any:
+        carrier = self._carrier
+        assert carrier.stdin is not None
+        assert carrier.stdout is not None
+        carrier.stdin.write(json.dumps(what) + "\n")
+        carrier.stdin.flush()
+        answer = carrier.stdout.readline()
+        if not answer:
+            raise RuntimeError(f"the process that carries packets ended with {carrier.wait()}")
+        return json.loads(answer)
+
+    def hub(self, end: str) -> str:
+        """The hub's address as ``end`` reaches it."""
+        return _addresses(self._ends[end])[0]
+
+    def address(self, end: str) -> str:
+        """The address of ``end`` as the hub reaches it."""
+        return _addresses(self._ends[end])[1]
+
+    def start(self, end: str, command: list[str], **options: Any) -> subprocess.Popen:
+        """Run a command in the namespace of an end or of the hub; it ends with the emulator at the latest."""
+        process = subprocess.Popen(["ip", "netns", "exec", self._space(end), *command], **options)
+        self._started.append(process)
+        return process
+
+    def shape(self, end: str, line: Line) -> None:
+        """Let the line of ``end`` behave otherwise from now on."""
+        self._tell({"shape": end, "line": _plain(line)})
+
+    def cut(self, end: str) -> None:
+        """Nothing passes any more, until :meth:`shape`."""
+        self.shape(end, Line(Way(loss=1.0)))
+
+    def counts(self, end: str) -> tuple[Count, Count]:
+        """What ``end`` put on its line so far, and what the hub put on it."""
+        there, back = self._tell({"counts": end})
+        return Count(*there), Count(*back)
+
+    def close(self) -> None:
+        """End what was started and take the namespaces away; the second time nothing happens."""
+        for process in self._started:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout, process.stderr):
+                if pipe is not None:
+                    with contextlib.suppress(OSError):
+                        pipe.close()
+        self._started.clear()
+        for pipe in (self._carrier.stdin, self._carrier.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+        self._carrier.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _plain(line: Line) -> list[tuple]:
+    return [dataclasses.astuple(way) for way in line.ways()]
+
+
+def _addresses(number: int) -> tuple[str, str]:
+    """Of the hub and of the end of line ``number``, in a private network of their own."""
+    return f"10.77.{number}.1", f"10.77.{number}.2"
+
+
+def _ip(*words: str) -> None:
+    done = subprocess.run(["ip", *words], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(f"ip {' '.join(words)}: {done.stderr.strip()}")
+
+
+def _spaces() -> list[str]:
+    listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True).stdout
+    return [line.split()[0] for line in listed.splitlines() if line.startswith(f"{_PREFIX}-")]
+
+
+def _sweep() -> None:
+    """Take away the namespaces of processes that are no more."""
+    for space in _spaces():
+        maker = space.split("-")[2]
+        if not os.path.exists(f"/proc/{maker}"):
+            subprocess.run(["ip", "netns", "del", space], capture_output=True)
+
+
+# ---------------------------------------------------------------- the process between
+
+
+class _Direction:
+    """Packets on their way from one device to another."""
+
+    def __init__(self, source: int, target: int, way: Way) -> None:
+        self.source, self.target, self.way = source, target, way
+        self.packets = self.bytes = self.lost = 0
+        self.last = 0.0
+
+
+def _device(space: str, name: str, mine: str, other: str) -> int:
+    """A TUN device inside a namespace with address ``mine``, which leads to ``other``; ``%d`` in its name counts."""
+    device = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
+    made = fcntl.ioctl(device, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _TUN | _NO_PACKET_INFO))
+    name = made[:16].rstrip(b"\0").decode()
+    _ip("link", "set", name, "netns", space)
+    _ip("-n", space, "addr", "add", mine, "peer", other, "dev", name)
+    _ip("-n", space, "link", "set", name, "mtu", "1400", "up")
+    return device
+
+
+def _carry(answers: IO[str]) -> None:
+    """Make what the first request names, carry packets, answer requests; until nobody asks any more."""
+    asking = b""
+    while not asking.endswith(b"\n"):  # by the byte: nothing of what select is to see may wait in a buffer
+        if not (more := os.read(0, 1)):
+            return
+        asking += more
+    first = json.loads(asking)
+    chance = random.Random(first["seed"])
+    spaces: dict[str, str] = first["spaces"]
+    try:
+        for space in spaces.values():
+            _ip("netns", "add", space)
+            _ip("-n", space, "link", "set", "lo", "up")
+        lines: dict[str, tuple[_Direction, _Direction]] = {}
+        for number, (end, shape) in enumerate(first["lines"].items(), 1):
+            at_hub, at_end = _addresses(number)
+            hub = _device(spaces[HUB], f"vslink{number}h%d", at_hub, at_end)
+            leaf = _device(spaces[end], f"vslink{number}e%d", at_end, at_hub)
+            there, back = (Way(*way) for way in shape)
+            lines[end] = _Direction(leaf, hub, there), _Direction(hub, leaf, back)
+        print(json.dumps(True), file=answers, flush=True)
+        _loop(answers, lines, chance)
+    finally:
+        for space in spaces.values():
+            subprocess.run(["ip", "netns", "del", space], capture_output=True)
+
+
+def _loop(answers: IO[str], lines: dict[str, tuple[_Direction, _Direction]], chance: random.Random) -> None:
+    by_source = {way.source: way for pair in lines.values() for way in pair}
+    asked = 0
+    pending: list[tuple[float, int, int, bytes]] = []
+    order = 0
+    unread = b""
+    while True:
+        wait = max(0.0, pending[0][0] - time.monotonic()) if pending else None
+        ready, _, _ = select.select([asked, *by_source], [], [], wait)
+        now = time.monotonic()
+        for source in ready:
+            if source == asked:
+                more = os.read(asked, 65536)
+                if not more:
+                    return
+                *whole, unread = (unread + more).split(b"\n")
+                for request in whole:
+                    print(json.dumps(_answer(json.loads(request), lines)), file=answers, flush=True)
+                continue
+            direction = by_source[source]
+            way = direction.way
+            while True:
+                try:
+                    packet = os.read(source, _LARGEST)
+                except BlockingIOError:
+                    break
+                if packet[0] >> 4 != 4:  # IPv6 looks for neighbours on every new device; nobody asked it to
+                    continue
+                direction.packets += 1
+                direction.bytes += len(packet)
+                if chance.random() < way.loss:
+                    direction.lost += 1
+                    continue
+                at = max(direction.last, now + way.delay + chance.uniform(-way.jitter, way.jitter))
+                direction.last = at
+                order += 1
+                heapq.heappush(pending, (at, order, direction.target, packet))
+        now = time.monotonic()
+        while pending and pending[0][0] <= now:
+            _, _, target, packet = heapq.heappop(pending)
+            with contextlib.suppress(OSError):  # a full device drops packets, as any does
+                os.write(target, packet)
+
+
+def _answer(request: dict[str, Any], lines: dict[str, tuple[_Direction, _Direction]]) -> Any:
+    if "counts" in request:
+        return [(way.packets, way.bytes, way.lost) for way in lines[request["counts"]]]
+    for direction, way in zip(lines[request["shape"]], request["line"], strict=True):
+        direction.way = Way(*way)
+    return True
+
+
+if __name__ == "__main__":
+    _carry(sys.stdout)

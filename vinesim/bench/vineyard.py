@@ -1,0 +1,60 @@
+"""What sleepers cost, and a whole tick of a vineyard of ten thousand bunches: twenty trees awake, one robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim.bench import scenes as scenes
+from vinesim.physics.step import Physics
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load
+from vinesim.scene.values import Measurement, RobotSpec
+
+AWAKE = 20
+ASLEEP = (1_000, 10_000)
+TICKS = 1000
+
+
+def asleep(robot: RobotSpec) -> Iterator[Measurement]:
+    """Twenty canes with none, a thousand and ten thousand asleep beside them; then the budget of ``robot``'s client."""
+    worlds = []
+    for sleepers in (0, *ASLEEP):
+        physics = Physics(scenes.row(AWAKE + sleepers))
+        physics.add_robot(scenes.hand("hand", scenes.bunch_at(0)))
+        worlds.append(scenes.sleepless(physics, np.arange(AWAKE)))
+
+    def steps(physics: Physics) -> None:
+        for _ in range(20):
+            physics.rigid.command("hand", np.array([0.0, 0.05, 0.05]))
+            physics.step()
+
+    for physics in worlds:
+        steps(physics)
+    alone, *among = (1e3 * s / 20 for s in scenes.interleaved(*(lambda p=p: steps(p) for p in worlds), rounds=25))
+    for sleepers, value in zip(ASLEEP, among, strict=True):
+        case = f"{AWAKE} canes awake, 1 hand, {sleepers} bunches asleep: whole tick"
+        yield Measurement("asleep", case, value, "ms/tick", f"none asleep, {AWAKE} awake", alone, alone / value)
+    del worlds
+    yield from _budget(robot)
+
+
+def _budget(robot: RobotSpec) -> Iterator[Measurement]:
+    """The shipped tendone, one tick at a time: median and 99th percentile on one core."""
+    model = generate(load("tendone"))
+    physics = Physics(model)
+    physics.add_robot(robot)
+    distance = np.linalg.norm(model.tree_pose[:, :2] - robot.pose[:2], axis=1)
+    scenes.sleepless(physics, np.sort(np.argsort(distance, kind="stable")[:AWAKE]))
+    seconds = np.zeros(TICKS)
+    for i in range(-100, TICKS):
+        start = time.perf_counter()
+        physics.step()
+        if i >= 0:
+            seconds[i] = time.perf_counter() - start
+    awake = len(physics.plants.awake)
+    case = f"tendone, {len(model.bunch_body)} bunches, {awake} of {len(model.tree_first)} trees awake, 1 robot"
+    yield Measurement("asleep", f"{case}: median tick", 1e3 * float(np.median(seconds)), "ms")
+    yield Measurement("asleep", f"{case}: p99", 1e3 * float(np.percentile(seconds, 99)), "ms")

@@ -1,0 +1,66 @@
+"""``vinesim server``."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import signal
+import threading
+from typing import Any
+
+from vinesim.net.server.admission import Plan
+from vinesim.net.server.retained_store import Quota
+from vinesim.net.server.server import Server
+from vinesim.net.transport.endpoints import everywhere
+
+STATUS_PERIOD = 1.0
+"""Between two status lines [s]."""
+
+
+class WrongUse(ValueError):
+    """Options that cannot be meant; the text says which."""
+
+
+def run(
+    *, listen: list[str] | None, connect: list[str] | None, keep: pathlib.Path | None, scene: str | None,
+    seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, status: str,
+) -> int:  # fmt: skip
+    """Carry messages until SIGINT or SIGTERM."""
+    if status not in ("text", "json", "none"):
+        raise WrongUse(f"--status {status!r}: give text, json or none")
+    if min(quota) <= 0.0:
+        raise WrongUse(f"--quota {quota[0]:g} {quota[1]:g}: both must be above zero, or nothing is ever kept")
+    if seed is not None and scene is None:
+        raise WrongUse(f"--seed {seed} without a scene: give --scene as well")
+    plan = None if scene is None else _plan(scene, seed)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    with Server(
+        listen or everywhere(secured=tls is not None), connect=connect or (), keep=keep, plan=plan, most=max_clients,
+        quota=Quota(*quota), certificates=tls,
+    ) as server:  # fmt: skip
+        if status != "json":
+            print(f"listening on {', '.join(map(str, server.endpoints))}", flush=True)
+        try:
+            while not stop.wait(STATUS_PERIOD if status != "none" else None):
+                figures = server.figures()
+                print(json.dumps(figures) if status == "json" else _line(figures), flush=True)
+        except BrokenPipeError:  # whoever listened is gone: that ends the run, not the log
+            pass
+    return 0
+
+
+def _plan(scene: str, seed: int | None) -> Plan:
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.scene.spec import load, reseeded
+
+    plan = reseeded(load(scene), seed)
+    return Plan(plan.name, generate(plan).digest())
+
+
+def _line(figures: dict[str, Any]) -> str:
+    company = ", ".join(figures["actors"]) or "nobody"
+    counts = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in figures.items() if isinstance(value, int))
+    trouble = f"; {figures['trouble']}" if figures.get("trouble") else ""
+    return f"{company}: {counts}{trouble}"

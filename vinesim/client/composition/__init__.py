@@ -1,0 +1,1 @@
+"""Scenes composed for pictures: robots, people and crates placed in a vineyard."""

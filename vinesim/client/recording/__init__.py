@@ -1,0 +1,1 @@
+"""Recorders, replay, and traces of what a client saw."""

@@ -1,0 +1,34 @@
+"""The picture of a touch: force and displacement of one bunch on two clients."""
+
+from __future__ import annotations
+
+import pathlib
+
+import numpy as np
+
+from vinesim.client.recording.trace import Rows
+
+
+def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:
+    """Draw force [N] above and displacement [mm] below against the host's clock; one line a client. Writes a PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (force, shift) = pyplot.subplots(2, 1, sharex=True, figsize=(9.0, 5.6), layout="constrained")
+    start = min(rows.clock[0] for rows in traces.values() if len(rows.clock))
+    for (name, rows), style in zip(traces.items(), ("-", "--", ":"), strict=False):
+        t = rows.clock - start
+        force.plot(t, np.linalg.norm(rows.force, axis=1), style, label=name, linewidth=1.1)
+        shift.plot(t, 1e3 * np.linalg.norm(rows.displacement, axis=1), style, label=name, linewidth=1.4)
+    force.set_ylabel("contact force [N]")
+    shift.set_ylabel("bunch moved from rest [mm]")
+    shift.set_xlabel("time [s]")
+    force.set_title(title, fontsize=10)
+    force.legend(frameon=False)
+    for axes in (force, shift):
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

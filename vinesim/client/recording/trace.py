@@ -1,0 +1,135 @@
+"""What one client saw of one bunch, tick by tick: the evidence of a touch."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import time
+
+import numpy as np
+
+from vinesim.scene.model import Model
+
+
+class Trace:
+    """Force on, and displacement of, one bunch. Rows are written into memory set aside beforehand."""
+
+    def __init__(self, model: Model, bunch: int, rest_q: np.ndarray, capacity: int) -> None:
+        """``rest_q`` [7]: pose of the bunch's body before anybody touched it."""
+        self.bunch = bunch
+        self.body = int(model.bunch_body[bunch])
+        clusters = int(model.bunch_cluster[bunch]) + np.arange(model.bunch_clusters[bunch])
+        self.bodies = frozenset([self.body, *clusters.tolist()])
+        """Its own body, and its berry clusters, which are what a hand meets."""
+        self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
+        self._rest = self._centre(rest_q)
+        self._clock = np.zeros(capacity)
+        self._time = np.zeros(capacity)
+        self._force = np.zeros((capacity, 3))
+        self._position = np.zeros((capacity, 3))
+        self._told = np.zeros(capacity, bool)
+        self.length = 0
+
+    def _centre(self, pose: np.ndarray) -> np.ndarray:
+        x, y, z, w = pose[3:]
+        # the body's x axis, third of a rotation matrix: cheaper in the tick than a general rotation
+        axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+        return pose[:3] + axis * self._com[0]
+
+    def add(self, sim_time: float, pose: np.ndarray, force: np.ndarray, told: bool = False) -> None:
+        """Note the pose [7] after a tick, the force [3] N that acted on the bunch during it, and whether another
+        client owned it and told of it.
+        """
+        if self.length == len(self._clock):
+            return
+        row = self.length
+        self._clock[row] = time.monotonic()
+        self._time[row] = sim_time
+        self._position[row] = self._centre(pose)
+        self._force[row] = force
+        self._told[row] = told
+        self.length += 1
+
+    def centre(self) -> np.ndarray:
+        """Where the bunch's centre was at the end of the newest row, or at rest [3] m."""
+        return self._position[self.length - 1].copy() if self.length else self._rest.copy()
+
+    @property
+    def displacement(self) -> float:
+        """Of the newest row, from rest [m]."""
+        return float(np.linalg.norm(self._position[self.length - 1] - self._rest)) if self.length else 0.0
+
+    def rows(self) -> Rows:
+        """Everything noted so far."""
+        n = self.length
+        return Rows(self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._told[:n])
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """A trace as arrays, one row a tick."""
+
+    clock: np.ndarray
+    """[tick] s, the host's monotonic clock: comparable between processes of one host."""
+    time: np.ndarray
+    """[tick] s, simulation time of the client."""
+    displacement: np.ndarray
+    """[tick, 3] m from rest, of the bunch's centre."""
+    force: np.ndarray
+    """[tick, 3] N on the bunch."""
+    told: np.ndarray
+    """[tick] bool: another client owned the bunch and told of it."""
+
+    def save(self, path: pathlib.Path) -> None:
+        """Write as .npz."""
+        np.savez_compressed(path, **dataclasses.asdict(self))
+
+    @classmethod
+    def load(cls, path: pathlib.Path) -> Rows:
+        """Read what :meth:`save` wrote."""
+        with np.load(path) as data:
+            return cls(**{field.name: data[field.name] for field in dataclasses.fields(cls)})
+
+
+MOVED = 1e-6
+"""A bunch has moved when its centre is this far from where it was before the touch [m]."""
+
+
+def touch_to_motion(rows: Rows) -> int | None:
+    """Ticks from the first tick with a force to the first in which the bunch moved; 0 is the same tick.
+
+    None if nobody touched it, or it never moved (D6.4 section 2.1 asks for a direct response; F03).
+    """
+    touched = np.flatnonzero(np.linalg.norm(rows.force, axis=1) > 0.0)
+    if not len(touched):
+        return None
+    first = int(touched[0])
+    before = rows.displacement[max(first - 1, 0)]
+    moved = np.flatnonzero(np.linalg.norm(rows.displacement[first:] - before, axis=1) > MOVED)
+    return int(moved[0]) if len(moved) else None
+
+
+def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[str, float] | None:
+    """How far the remote copy of the bunch was from the owner's, at the same instant of the host's clock [mm].
+
+    Judged while the owner's bunch was displaced by more than ``threshold`` [m] and the other client was told of it.
+    The network's delay is in it. None if there is no such time.
+    """
+    if len(remote.clock) < 2:
+        return None
+    after = np.clip(np.searchsorted(remote.clock, local.clock), 1, len(remote.clock) - 1)
+    common = (local.clock >= remote.clock[0]) & (local.clock <= remote.clock[-1])
+    common &= remote.told[after] & remote.told[after - 1]
+    common &= np.linalg.norm(local.displacement, axis=1) > threshold
+    if not common.any():
+        return None
+    at = local.clock[common]
+    seen = np.stack([np.interp(at, remote.clock, remote.displacement[:, k]) for k in range(3)], -1)
+    error = 1e3 * np.linalg.norm(seen - local.displacement[common], axis=1)
+    return {
+        "p50": float(np.percentile(error, 50)),
+        "p95": float(np.percentile(error, 95)),
+        "max": float(error.max()),
+        "seconds": float(common.sum() * np.median(np.diff(local.clock))),
+        "peak_displacement": 1e3 * float(np.linalg.norm(local.displacement[common], axis=1).max()),
+    }

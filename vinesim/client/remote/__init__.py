@@ -1,0 +1,1 @@
+"""Actors and objects of other clients in this client's world."""

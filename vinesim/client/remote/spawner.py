@@ -1,0 +1,107 @@
+"""Robots and people of other clients on their way in: a thread reads and compiles them, and no tick waits for it."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import logging
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from vinesim.client.humans import RemotePerson, spec_of
+from vinesim.net.codec.messages import Hello, valid_name
+from vinesim.physics.rigid.rigid_world import Draft, Rigid
+from vinesim.robot.description import description as descriptions
+from vinesim.robot.description.description import Description, DescriptionError
+from vinesim.robot.drives import RemoteRobot
+from vinesim.scene.values import HumanUpdate, RobotUpdate
+
+log = logging.getLogger(__name__)
+
+Prepared = tuple[Description | None, Draft]
+"""A robot's description, or None for a person, and the world with it."""
+
+
+class Arrivals:
+    """Who is expected, and how far that is."""
+
+    def __init__(
+        self, rigid: Rigid, own: Description | None, executor: concurrent.futures.Executor | None = None
+    ) -> None:
+        """``own``: a description that needs not be read again, if any; without ``executor`` all is done at once."""
+        self.rigid, self.own = rigid, own
+        self._executor = executor
+        self._expected: dict[str, Hello] = {}
+        self._coming: dict[str, concurrent.futures.Future[Prepared]] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._expected
+
+    def expect(self, hello: Hello) -> None:
+        """Somebody has introduced itself; where it is will be known with its first pose."""
+        self._expected[hello.name] = hello
+
+    def forget(self, name: str) -> None:
+        """It has gone again."""
+        self._expected.pop(name, None)
+        self._coming.pop(name, None)
+
+    def embody(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemotePerson | None:
+        """The copy of whoever is expected, standing where ``update`` says; None as long as it is not ready.
+
+        Who cannot be shown is named in the log and no more expected.
+        """
+        hello = self._expected[name]
+        if name not in self._coming:
+            self._coming[name] = self._start(lambda: self._prepare(hello, update))
+        if not self._coming[name].done():
+            return None
+        try:
+            description, draft = self._coming.pop(name).result()
+        except ValueError as error:
+            log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
+            self.forget(name)
+            return None
+        if not self.rigid.admit(draft):
+            return None  # somebody else came or went meanwhile: once more, from the next tick on
+        self.forget(name)
+        if description is None or not isinstance(update, RobotUpdate):
+            return RemotePerson(self.rigid, name)
+        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, here=True)
+        self.rigid.place(name, update.base_q, update.position)
+        return other
+
+    def _start(self, work: Callable[[], Prepared]) -> concurrent.futures.Future[Prepared]:
+        if self._executor is not None:
+            return self._executor.submit(work)
+        done: concurrent.futures.Future[Prepared] = concurrent.futures.Future()
+        try:
+            done.set_result(work())
+        except ValueError as error:
+            done.set_exception(error)
+        return done
+
+    def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
+        if isinstance(update, HumanUpdate):
+            return None, self.rigid.prepare(spec_of(hello, update), copy=True)
+        description = described(hello, self.own)
+        if hello.joints not in (-1, len(description.drives)):
+            raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
+        return description, self.rigid.prepare(description.spec(hello.name, hello.index, update.base_q))
+
+
+def described(hello: Hello, own: Description | None) -> Description:
+    """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
+    if own is not None and hello.urdf == own.urdf:
+        return own
+    name = hello.robot if valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
+    try:
+        known = descriptions.load(name)
+        if known.urdf == hello.urdf:
+            return known
+    except DescriptionError:
+        pass
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"{name}.urdf"
+        file.write_text(hello.urdf)
+        return descriptions.load(file)

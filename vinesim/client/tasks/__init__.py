@@ -1,0 +1,1 @@
+"""What a robot of a client does: tasks, their planning, start poses."""

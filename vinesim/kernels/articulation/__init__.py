@@ -1,0 +1,1 @@
+"""Articulated trees with implicit joint springs: kinematics, free motion, impulse response, integration."""

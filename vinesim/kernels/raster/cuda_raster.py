@@ -1,0 +1,308 @@
+"""The rasteriser for GPUs: primitives are cut into pieces of a few pixels, and every piece is drawn by some threads.
+
+One leaf may fill the picture and a thousand berries a single pixel each. One thread a primitive would let the whole
+GPU wait for that leaf, so a first kernel only bounds primitives and lists pieces of at most SIDE x SIDE pixels of
+their bounds, and a second one draws the pieces, all of about the same work. It intersects as the ray caster does.
+No kernel asks the host how long the lists have become: a frame is two launches.
+"""
+
+import warp as wp
+
+from vinesim.kernels.raster.camera_raster import CLOSE, SMOOTH_SIZE, UNBOUND, Pinhole, ball_bound, keep, pixels, ray_of
+from vinesim.kernels.raster.primitives import (
+    BOX,
+    CONE,
+    CYLINDER,
+    ELLIPSOID,
+    FAR,
+    LEAF,
+    SPHEROID,
+    TRIANGLE,
+    Clusters,
+    Shapes,
+    as_quat,
+    hit,
+    leaf_heights,
+    xyz,
+)
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+SIDE = wp.constant(16)
+"""Of a piece [pixel]; twice that for what is larger than LARGE, since one thread lists all pieces of a primitive."""
+LARGE = wp.constant(256)
+LISTS = wp.constant(64)
+"""Pieces are kept in so many lists: threads that append to one must take turns."""
+NOTHING = wp.constant(wp.vec4(1.0e6, -1.0e6, 1.0e6, -1.0e6))
+"""Bound of what is not in the picture [pixel]."""
+ANYWHERE = wp.constant(wp.vec3(0.0, -1.0e6, 1.0e6))
+"""A strip that holds every pixel: slope, low, high."""
+
+
+@wp.struct
+class Outline:
+    """Where in the picture one primitive can be: inside a box and inside two strips ``low <= x - slope y <= high``."""
+
+    box: wp.vec4i
+    """First and last + 1 column, first and last + 1 row."""
+    rising: wp.vec3
+    """Slope, low, high [pixel]."""
+    falling: wp.vec3
+    depth: float
+    """No point of it is nearer [m]."""
+
+
+@wp.func
+def holding(lens: Pinhole, bound: wp.vec4, p: wp.vec3) -> wp.vec4:
+    """Lowest and highest x and y [pixel], widened to hold the picture of a point in front of the camera."""
+    x = p[0] / p[2] * lens.fx + lens.cx
+    y = p[1] / p[2] * lens.fy + lens.cy
+    return wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
+
+
+@wp.func
+def outline(lens: Pinhole, bound: wp.vec4, depth: float, rising: wp.vec3, falling: wp.vec3) -> Outline:
+    o = Outline()
+    o.box = pixels(lens, bound)
+    o.rising = rising
+    o.falling = falling
+    o.depth = wp.clamp(depth, 0.0, lens.reach)
+    return o
+
+
+@wp.func
+def leaf_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
+    a4 = s.a[i]
+    b4 = s.b[i]
+    size = a4[3]
+    p = lens.turn * (xyz(a4) - lens.eye)
+    rib = lens.turn * xyz(b4)
+    up = lens.turn * xyz(s.c[i])
+    side = wp.cross(rib, up)
+    heights = leaf_heights(s.d[i])
+    depth = float(FAR)
+    bound = NOTHING
+    turned = bound  # of x - y and x + y
+    for n in range(16):
+        corner = s.hull[int(b4[3]), n >> 1]
+        q = p + (side * corner[0] + rib * corner[1] + up * heights[n & 1]) * size
+        depth = wp.min(depth, q[2])
+        x = q[0] / wp.max(q[2], 0.01) * lens.fx + lens.cx
+        y = q[1] / wp.max(q[2], 0.01) * lens.fy + lens.cy
+        bound = wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
+        turned = wp.vec4(
+            wp.min(turned[0], x - y), wp.max(turned[1], x - y), wp.min(turned[2], x + y), wp.max(turned[3], x + y)
+        )
+    if depth < CLOSE:
+        turned = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
+        bound = ball_bound(lens, p + rib * (0.25 * size), 1.45 * size)
+        if p[2] < -1.6 * size:
+            bound = NOTHING
+    return outline(lens, bound, depth, wp.vec3(1.0, turned[0], turned[1]), wp.vec3(-1.0, turned[2], turned[3]))
+
+
+@wp.func
+def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
+    a4 = s.a[i]
+    b4 = s.b[i]
+    a = lens.turn * (xyz(a4) - lens.eye)
+    b = lens.turn * (xyz(b4) - lens.eye)
+    r = wp.max(a4[3], b4[3])
+    bound = NOTHING
+    strip = ANYWHERE
+    if wp.max(a[2], b[2]) > -r:
+        # What reaches no farther than CLOSE is in view only within a small ball around the eye. An axis that
+        # stays clear of that ball may be cut there: a wire that passes the camera keeps a narrow bound.
+        axis = b - a
+        cut = CLOSE - r
+        start = a
+        end = b
+        clear = True
+        if wp.min(a[2], b[2]) < cut:
+            h = wp.clamp(-wp.dot(a, axis) / wp.dot(axis, axis), 0.0, 1.0)
+            clear = wp.length(a + axis * h) - r > lens.close
+            if a[2] < cut and b[2] > cut:
+                start = a + axis * ((cut - a[2]) / axis[2])
+            if b[2] < cut and a[2] > cut:
+                end = a + axis * ((cut - a[2]) / axis[2])
+        f = ball_bound(lens, start, r)
+        g = ball_bound(lens, end, r)
+        bound = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
+        if clear:
+            bound = wp.vec4(wp.min(f[0], g[0]), wp.max(f[1], g[1]), wp.min(f[2], g[2]), wp.max(f[3], g[3]))
+            rise = 0.5 * (g[2] + g[3] - f[2] - f[3])
+            if wp.min(start[2], end[2]) - r > 0.01 and wp.abs(rise) > 2.0:  # a slanted one covers only a strip
+                slope = 0.5 * (g[0] + g[1] - f[0] - f[1]) / rise
+                middle = 0.5 * (f[0] + f[1] - slope * (f[2] + f[3]))
+                half = 0.5 * (wp.max(f[1] - f[0], g[1] - g[0]) + wp.abs(slope) * wp.max(f[3] - f[2], g[3] - g[2]))
+                strip = wp.vec3(slope, middle - half, middle + half)
+    return outline(lens, bound, wp.min(a[2], b[2]) - r, strip, ANYWHERE)
+
+
+@wp.func
+def triangle_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
+    a = lens.turn * (xyz(s.a[i]) - lens.eye)
+    b = lens.turn * (xyz(s.b[i]) - lens.eye)
+    c = lens.turn * (xyz(s.c[i]) - lens.eye)
+    depth = wp.min(wp.min(a[2], b[2]), c[2])
+    bound = NOTHING
+    if wp.dot(a, wp.cross(b - a, c - a)) < 0.0 and wp.max(wp.max(a[2], b[2]), c[2]) > 0.0:
+        if depth > CLOSE:
+            bound = holding(lens, holding(lens, holding(lens, bound, a), b), c)
+        else:
+            middle = (a + b + c) / 3.0
+            away = wp.max(wp.max(wp.length(a - middle), wp.length(b - middle)), wp.length(c - middle))
+            bound = ball_bound(lens, middle, away * 1.001)
+    return outline(lens, bound, depth, ANYWHERE, ANYWHERE)
+
+
+@wp.func
+def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
+    a4 = s.a[i]
+    b4 = s.b[i]
+    c4 = s.c[i]
+    centre = lens.turn * (xyz(a4) - lens.eye)
+    half = wp.vec3(a4[3], c4[0], c4[1])
+    reach = wp.length(half)
+    if kind == SPHEROID:
+        reach = a4[3] * wp.max(b4[3], 1.0)
+    elif kind == ELLIPSOID:
+        reach = wp.max(wp.max(half[0], half[1]), half[2])
+    elif kind == CYLINDER:
+        end = lens.turn * (xyz(b4) - lens.eye)
+        reach = wp.length(wp.vec2(wp.length(end - centre) * 0.5, a4[3]))
+        centre = (centre + end) * 0.5
+    depth = centre[2] - reach
+    bound = NOTHING
+    if centre[2] > -reach:
+        if kind == BOX and depth > CLOSE:
+            for n in range(8):
+                corner = wp.vec3(float(n & 1) * 2.0 - 1.0, float(n & 2) - 1.0, float(n & 4) * 0.5 - 1.0)
+                away = wp.quat_rotate(as_quat(b4), wp.cw_mul(half, corner))
+                bound = holding(lens, bound, centre + lens.turn * away)
+        else:
+            bound = ball_bound(lens, centre, reach)
+    return outline(lens, bound, depth, ANYWHERE, ANYWHERE)
+
+
+@wp.func
+def outline_of(s: Shapes, i: int, lens: Pinhole) -> Outline:
+    """Where primitive ``i`` can be; its box is empty if it lies behind the camera or beside the picture."""
+    kind = s.kind[i]
+    o = Outline()
+    if kind == LEAF:
+        o = leaf_outline(s, i, lens)
+    elif kind == CONE:
+        o = cone_outline(s, i, lens)
+    elif kind == TRIANGLE:
+        o = triangle_outline(s, i, lens)
+    else:
+        o = solid_outline(s, i, kind, lens)
+    return o
+
+
+@wp.func
+def columns(o: Outline, top: int, bottom: int) -> wp.vec2i:
+    """First and last + 1 column of an outline within the rows from ``top`` up to ``bottom``, not included."""
+    first = float(o.box[0])
+    last = float(o.box[1])
+    y = float(top)
+    z = float(bottom - 1)
+    first = wp.max(first, o.rising[1] + wp.min(o.rising[0] * y, o.rising[0] * z) - 0.02)
+    first = wp.max(first, o.falling[1] + wp.min(o.falling[0] * y, o.falling[0] * z) - 0.02)
+    last = wp.min(last, o.rising[2] + wp.max(o.rising[0] * y, o.rising[0] * z) + 1.02)
+    last = wp.min(last, o.falling[2] + wp.max(o.falling[0] * y, o.falling[0] * z) + 1.02)
+    return wp.vec2i(int(first), int(wp.max(last, 0.0)))
+
+
+@wp.func
+def draw_piece(s: Shapes, lens: Pinhole, piece: wp.vec4i, lane: int, lanes: int, keys_out: wp.array(dtype=wp.int64)):
+    """Every ``lanes``-th pixel of one piece: primitive, corner and size (x + 65536 y), least depth [um]."""
+    i = piece[0]
+    left = piece[1] & 0xFFFF
+    top = piece[1] >> 16
+    wide = piece[2] & 0xFFFF
+    nearest = wp.int64(piece[3]) << wp.int64(32)
+    back = wp.transpose(lens.turn)
+    smooth = wp.int32(0)
+    if s.kind[i] == LEAF:
+        a4 = s.a[i]
+        if a4[3] * lens.fx > wp.dot(lens.turn[2], xyz(a4) - lens.eye) * SMOOTH_SIZE:
+            smooth = 1
+    for n in range(lane, wide * (piece[2] >> 16), lanes):
+        x = left + n % wide
+        y = top + n // wide
+        pixel = y * lens.width + x
+        if keys_out[pixel] > nearest:
+            keep(pixel, hit(s, i, lens.eye, back * ray_of(lens, x, y), smooth), i, lens.reach, keys_out)
+
+
+@wp.kernel
+def list_pieces(
+    # model
+    shapes: Shapes,
+    clusters: Clusters,
+    # in
+    ball: wp.array(dtype=wp.vec4),
+    which: wp.array(dtype=wp.int32),
+    lens: Pinhole,
+    lanes: int,
+    # out
+    count_out: wp.array(dtype=wp.int32),
+    pieces_out: wp.array2d(dtype=wp.vec4i),
+    keys_out: wp.array(dtype=wp.int64),
+):
+    """One thread lists the pieces of every ``lanes``-th primitive of one cluster; what finds no room it draws itself."""
+    k, lane = wp.tid()
+    cluster = which[k]
+    r = ball[cluster][3]
+    p = lens.turn * (xyz(ball[cluster]) - lens.eye)
+    seen = pixels(lens, ball_bound(lens, p, r))
+    if r > 0.0 and p[2] > -r and p[2] - r < lens.reach and seen[0] < seen[1] and seen[2] < seen[3]:
+        mine = k % LISTS
+        first = clusters.first[cluster]
+        for i in range(first + lane, first + clusters.size[cluster], lanes):
+            o = outline_of(shapes, i, lens)
+            side = wp.where(wp.max(o.box[1] - o.box[0], o.box[3] - o.box[2]) > LARGE, 2 * SIDE, SIDE)
+            needed = wp.int32(0)
+            for top in range(o.box[2], o.box[3], side):
+                span = columns(o, top, wp.min(top + side, o.box[3]))
+                needed += wp.max(span[1] - span[0] + side - 1, 0) // side
+            if needed > 0:
+                slot = wp.atomic_add(count_out, mine, needed)
+                for top in range(o.box[2], o.box[3], side):
+                    bottom = wp.min(top + side, o.box[3])
+                    span = columns(o, top, bottom)
+                    for left in range(span[0], span[1], side):
+                        piece = wp.vec4i(
+                            i,
+                            left | (top << 16),
+                            wp.min(side, span[1] - left) | ((bottom - top) << 16),
+                            int(o.depth * 1.0e6),
+                        )
+                        if slot < pieces_out.shape[1]:
+                            pieces_out[mine, slot] = piece
+                        else:
+                            draw_piece(shapes, lens, piece, 0, 1, keys_out)
+                        slot += 1
+
+
+@wp.kernel
+def draw_pieces(
+    # model
+    shapes: Shapes,
+    # in
+    count: wp.array(dtype=wp.int32),
+    pieces: wp.array2d(dtype=wp.vec4i),
+    lens: Pinhole,
+    groups: int,
+    lanes: int,
+    # out
+    keys_out: wp.array(dtype=wp.int64),
+):
+    """One of ``lanes`` threads draws its share of the pixels of every ``groups``-th piece of one list."""
+    group = wp.tid() // lanes
+    lane = wp.tid() % lanes
+    mine = group % LISTS
+    for slot in range(group // LISTS, wp.min(count[mine], pieces.shape[1]), groups):
+        draw_piece(shapes, lens, pieces[mine, slot], lane, lanes, keys_out)

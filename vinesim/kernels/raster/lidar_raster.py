@@ -1,0 +1,317 @@
+"""What the rays of a spinning head meet first: primitives rasterised into its grid of azimuths and elevations.
+
+A primitive is bound by balls: one, or several along a cone or cylinder. A ball reaches over a range of elevations, which
+picks rows, and over a range of azimuths, which picks columns; the rays found are tested eight at a time and kept as a
+camera's pixels are (:mod:`vinesim.kernels.raster.camera_raster`).
+"""
+
+import warp as wp
+
+from vinesim.kernels.raster.camera_raster import EMPTY, LOW, RUN, Depths, Pixels, keep, tangents
+from vinesim.kernels.raster.primitives import (
+    BOX,
+    CONE,
+    CYLINDER,
+    ELLIPSOID,
+    FAR,
+    LEAF,
+    SPHEROID,
+    TRIANGLE,
+    Clusters,
+    Shapes,
+    hit,
+    hit_cone,
+    hit_leaf,
+    hit_sheet,
+    hit_sphere,
+    inside_outline,
+    leaf_extent,
+    leaf_heights,
+    squeeze,
+    xyz,
+)
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+SLOTS = wp.constant(1024)
+"""Into so many parts the way from straight down to straight up is cut to find rows."""
+PIECE = wp.constant(0.02)
+"""A slender thing is bound by balls about this far apart [rad]."""
+
+
+@wp.struct
+class Head:
+    """Where the head is, its rows in the order of elevation, and which columns are fired."""
+
+    eye: wp.vec3
+    turn: wp.mat33
+    """Rows: forward, left, up, in the world."""
+    tangent: wp.array(dtype=wp.float32)
+    """Of the elevation [row]."""
+    azimuth: wp.array(dtype=wp.float32)
+    """Of the ray in column 0 [row] rad."""
+    number: wp.array(dtype=wp.int32)
+    """Place within a column [row]."""
+    slots: wp.array(dtype=wp.int32)
+    """First row in each slot or above it [slot]."""
+    direction: wp.array2d(dtype=wp.float32)
+    """Unit vectors in the head's frame [column * row, 3]."""
+    step: float
+    """From column to column [rad]."""
+    middle: wp.vec2
+    """Forward and left component of the middle of the azimuths that are fired."""
+    within: wp.vec2
+    """Cosine and sine of how far they reach to either side; cosine -1 for all around."""
+    first: int
+    end: int
+    reach: float
+
+
+@wp.func
+def fired(head: Head, at: int) -> wp.vec3:
+    """One ray; read number by number, for LLVM makes nothing of eight vectors."""
+    return wp.vec3(head.direction[at, 0], head.direction[at, 1], head.direction[at, 2])
+
+
+@wp.func
+def slot_of(tangent: float) -> int:
+    """Where an elevation lies between straight down and straight up."""
+    return int((tangent / (1.0 + wp.abs(tangent)) + 1.0) * (0.5 * float(SLOTS) - 0.01))
+
+
+@wp.func
+def first_row(head: Head, tangent: float) -> int:
+    """First row that is not below an elevation."""
+    row = head.slots[slot_of(tangent)]
+    while row < head.tangent.shape[0] and head.tangent[row] < tangent:
+        row += 1
+    return row
+
+
+@wp.func
+def half_angle(r: float, away: float) -> float:
+    """An upper bound of asin(r / away), pi where the circle goes round the origin."""
+    s = r / wp.max(away, r)
+    return wp.where(s < 0.9999, s + 0.5708 * s * s * s, 3.1416)
+
+
+@wp.func
+def meets(head: Head, p: wp.vec3, r: float) -> int:
+    """1 if a ray that is fired may meet a ball, 0 if surely none does. Without a branch."""
+    flat2 = p[0] * p[0] + p[1] * p[1]
+    flat = wp.sqrt(flat2)
+    span = tangents(p[2], flat, r)
+    rows = head.slots[slot_of(span[1]) + 2] - head.slots[slot_of(span[0])]
+    free = flat2 - r * r
+    ahead = p[0] * head.middle[0] + p[1] * head.middle[1]
+    inside = free <= 0.0 or ahead >= head.within[0] * wp.sqrt(wp.max(free, 0.0)) - head.within[1] * r
+    return wp.where(rows > 0 and (inside or head.within[0] <= -1.0), 1, 0)
+
+
+@wp.kernel
+def cull(
+    # in
+    ball: wp.array(dtype=wp.vec4),
+    head: Head,
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+):
+    """One thread tells how near one cluster may come to the head, or FAR if no ray can meet it."""
+    i = wp.tid()
+    r = ball[i][3]
+    p = head.turn * (xyz(ball[i]) - head.eye)
+    away = wp.length(p) - r
+    seen = r > 0.0 and away < head.reach and meets(head, p, r) == 1
+    distance_out[i] = wp.where(seen, wp.max(away, 0.0), FAR)
+
+
+@wp.kernel
+def raster(
+    # model
+    shapes: Shapes,
+    clusters: Clusters,
+    lower: wp.array2d(dtype=wp.float32),
+    upper: wp.array2d(dtype=wp.float32),
+    # in
+    visible: wp.array(dtype=wp.int32),
+    head: Head,
+    lanes: int,
+    # out
+    keys_out: wp.array(dtype=wp.int64),
+):
+    """One thread enters every ``lanes``-th primitive of one cluster."""
+    k, lane = wp.tid()
+    cluster = visible[k]
+    kind = clusters.kind[cluster]
+    first = clusters.first[cluster]
+    rows = head.tangent.shape[0]
+    period = 6.2831853 / wp.abs(head.step)
+    spots = Pixels()
+    depths = Depths()
+    size = clusters.size[cluster]
+    # most primitives of far clusters lie between two rows
+    found = Pixels()
+    n = wp.int32(0)
+    while n < (size + 7) // 8 * 8:
+        i = first + wp.min(n, size - 1)
+        lo = wp.vec3(lower[i, 0], lower[i, 1], lower[i, 2])
+        hi = wp.vec3(upper[i, 0], upper[i, 1], upper[i, 2])
+        found[n] = meets(head, head.turn * ((lo + hi) * 0.5 - head.eye), wp.length(hi - lo) * 0.5)
+        n += 1
+    for member in range(lane, size, lanes):
+        if found[member] == 0:
+            continue
+        i = first + member
+        a4 = shapes.a[i]
+        b4 = shapes.b[i]
+        a = head.turn * (xyz(a4) - head.eye)
+        b = a
+        r = a4[3]
+        pieces = wp.int32(1)
+        if kind == SPHEROID:
+            r *= wp.max(b4[3], 1.0)
+        elif kind == LEAF:
+            rib = head.turn * xyz(b4)
+            up = head.turn * xyz(shapes.c[i])
+            heights = leaf_heights(shapes.d[i])
+            extent = leaf_extent(shapes.hull, int(b4[3]))
+            middle = 0.5 * (extent[1] + extent[2])
+            high = 0.5 * (heights[1] - heights[0])
+            flat = float(0.0)
+            for n in range(8):
+                flat = wp.max(flat, wp.length(shapes.hull[int(b4[3]), n] - wp.vec2(0.0, middle)))
+            a += (rib * middle + up * (0.5 * (heights[0] + heights[1]))) * r
+            b = a
+            r *= wp.sqrt(flat * flat + high * high)
+        elif kind == CONE or kind == CYLINDER:
+            b = head.turn * (xyz(b4) - head.eye)
+            r = wp.max(r, wp.where(kind == CONE, b4[3], 0.0))
+            long = wp.length(b - a)
+            along = wp.clamp(-wp.dot(a, b - a) / wp.max(long * long, 1.0e-12), 0.0, 1.0)
+            away = wp.length(a + (b - a) * along)
+            pieces = wp.clamp(int(long / wp.max(3.0 * r, PIECE * away)) + 1, 1, 1000)
+            r += 0.5 * long / float(pieces)
+        elif kind == TRIANGLE:
+            q = head.turn * (xyz(b4) - head.eye)
+            s = head.turn * (xyz(shapes.c[i]) - head.eye)
+            middle_of = (a + q + s) / 3.0
+            r = wp.max(wp.max(wp.length(a - middle_of), wp.length(q - middle_of)), wp.length(s - middle_of)) * 1.001
+            a = middle_of
+            b = a
+        elif kind == BOX:
+            r = wp.length(wp.vec3(r, shapes.c[i][0], shapes.c[i][1]))
+        elif kind == ELLIPSOID:
+            r = wp.max(wp.max(r, shapes.c[i][0]), shapes.c[i][1])
+        for piece in range(pieces):
+            p = a + (b - a) * ((float(piece) + 0.5) / float(pieces))
+            around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+            span = tangents(p[2], around, r)
+            row = first_row(head, span[0]) - 1
+            more = row + 1 < rows
+            if more:
+                more = head.tangent[row + 1] <= span[1]
+            if more:
+                azimuth = wp.atan2(p[1], p[0])
+                half = wp.min((half_angle(r, around) + 1.0e-5) / wp.abs(head.step), 0.5 * period)
+                nearest = wp.int64(int(wp.max(wp.length(p) - r, 0.0) * 1.0e6)) << wp.int64(32)
+                column = wp.int32(0)
+                last = wp.int32(0)
+                begin = float(head.end)
+                while more:
+                    n = wp.int32(0)
+                    while n < RUN and more:
+                        if column < last:
+                            at = column * rows + head.number[row]
+                            if keys_out[at] > nearest:
+                                spots[n] = at
+                                n += 1
+                            column += 1
+                        else:
+                            # the same row one turn further, or the next row
+                            begin += period
+                            if begin >= float(head.end):
+                                row += 1
+                                more = row < rows
+                                if more:
+                                    more = head.tangent[row] <= span[1]
+                                if more:
+                                    begin = (azimuth - head.azimuth[row]) / head.step - half
+                                    begin += wp.ceil((float(head.first) - begin - 2.0 * half) / period) * period
+                            if more:
+                                column = wp.max(int(wp.ceil(begin)), head.first)
+                                last = wp.min(int(wp.floor(begin + 2.0 * half)) + 1, head.end)
+                    whole = (n + 7) // 8 * 8
+                    m = wp.int32(0)
+                    if kind == SPHEROID:
+                        axis = head.turn * xyz(b4)
+                        stretch = 1.0 / b4[3] - 1.0
+                        centre = squeeze(p, axis, stretch)
+                        while m < whole:
+                            depths[m] = hit_sphere(centre, a4[3], squeeze(fired(head, spots[m]), axis, stretch))
+                            m += 1
+                    elif kind == CONE:
+                        while m < whole:
+                            depths[m] = hit_cone(a, a4[3], b, b4[3], fired(head, spots[m]))
+                            m += 1
+                    elif kind == LEAF:
+                        bend = shapes.d[i]
+                        number = int(b4[3])
+                        base = head.turn * (xyz(a4) - head.eye)
+                        rib = head.turn * xyz(b4)
+                        up = head.turn * xyz(shapes.c[i])
+                        side = wp.cross(rib, up)
+                        per = 1.0 / a4[3]
+                        eye = wp.vec3(-wp.dot(base, side), -wp.dot(base, rib), -wp.dot(base, up)) * per
+                        extent = leaf_extent(shapes.hull, number)
+                        while m < whole:
+                            d = fired(head, spots[m]) * per
+                            ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
+                            depths[m] = hit_sheet(bend, extent, eye, ray)
+                            m += 1
+                        for m in range(n):
+                            t = depths[m]
+                            d = fired(head, spots[m]) * per
+                            ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
+                            if t < 0.0:
+                                depths[m] = hit_leaf(shapes.outline, number, bend, eye, ray, 0)
+                            elif t < head.reach:
+                                u = eye[0] + t * ray[0]
+                                v = eye[1] + t * ray[1]
+                                if not inside_outline(shapes.outline, number, u, v, 0):
+                                    depths[m] = FAR
+                    else:
+                        back = wp.transpose(head.turn)
+                        for m in range(n):
+                            depths[m] = hit(shapes, i, head.eye, back * fired(head, spots[m]), 0)
+                    for m in range(n):
+                        keep(spots[m], depths[m], i, head.reach, keys_out)
+
+
+@wp.kernel
+def resolve(
+    # in
+    keys: wp.array(dtype=wp.int64),
+    head: Head,
+    run: int,
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+    primitive_out: wp.array(dtype=wp.int32),
+):
+    """One thread reads the keys of ``run`` rays into distance [m] and primitive (-1 nothing, -2 the ground)."""
+    up = wp.vec3(head.turn[0, 2], head.turn[1, 2], head.turn[2, 2])
+    first = head.first * head.tangent.shape[0] + wp.tid() * run
+    for at in range(first, first + run):
+        t = head.reach
+        i = wp.int32(-1)
+        fall = wp.dot(up, fired(head, at))
+        if fall < -1.0e-6 and head.eye[2] > 0.0 and -head.eye[2] / fall < t:
+            t = -head.eye[2] / fall
+            i = -2
+        key = keys[at]
+        if key < EMPTY:
+            z = float(key >> wp.int64(32)) * 1.0e-6
+            if z < t:
+                t = z
+                i = int(key & LOW)
+        distance_out[at] = wp.where(i == -1, FAR, t)
+        primitive_out[at] = i

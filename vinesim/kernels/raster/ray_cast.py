@@ -1,0 +1,115 @@
+"""Rays against the primitives through a bounding volume hierarchy: lidars, and the oracle of the rasteriser.
+
+Plants and links have one hierarchy each, asked one after the other: plants only sway, so theirs stays good for ever
+under refits, and a robot that drives through the rows does not stretch it.
+"""
+
+import warp as wp
+
+from vinesim.kernels.raster.camera_raster import SMOOTH_SIZE, Pinhole, ray_of
+from vinesim.kernels.raster.primitives import (
+    FAR,
+    LEAF,
+    Shapes,
+    hit,
+    xyz,
+)
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+@wp.struct
+class Hierarchies:
+    """Bounding volumes of plants (primitives from 0) and of links (primitives from ``first_rigid``)."""
+
+    plants: wp.uint64
+    rigid: wp.uint64
+    first_rigid: int
+    """Negative where there are no links."""
+
+
+@wp.struct
+class Hit:
+    t: float
+    primitive: int
+    """-2 the ground, -1 nothing."""
+
+
+@wp.func
+def smooth_from(s: Shapes, i: int, depth_scale: float, forward: wp.vec3, eye: wp.vec3) -> int:
+    """Whether a leaf's outline is interpolated, by the rasteriser's rule; never without a focal length."""
+    a4 = s.a[i]
+    smooth = wp.int32(0)
+    if s.kind[i] == LEAF and depth_scale > 0.0:
+        if a4[3] * depth_scale > wp.dot(xyz(a4) - eye, forward) * SMOOTH_SIZE:
+            smooth = 1
+    return smooth
+
+
+@wp.func
+def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, focal: float, forward: wp.vec3) -> Hit:
+    """Nearest primitive or ground along a ray; ``t`` in lengths of ``d``."""
+    best = Hit()
+    best.t = reach
+    best.primitive = -1
+    if d[2] < -1.0e-6 and o[2] > 0.0:
+        t = -o[2] / d[2]
+        if t < best.t:
+            best.t = t
+            best.primitive = -2
+    i = wp.int32(0)
+    query = wp.bvh_query_ray(h.plants, o, d)
+    while wp.bvh_query_next(query, i, best.t):
+        t = hit(s, i, o, d, smooth_from(s, i, focal, forward, o))
+        if t < best.t:
+            best.t = t
+            best.primitive = i
+    if h.first_rigid >= 0:
+        j = wp.int32(0)
+        other = wp.bvh_query_ray(h.rigid, o, d)
+        while wp.bvh_query_next(other, j, best.t):
+            t = hit(s, h.first_rigid + j, o, d, 0)
+            if t < best.t:
+                best.t = t
+                best.primitive = h.first_rigid + j
+    return best
+
+
+@wp.kernel
+def cast(
+    # model
+    shapes: Shapes,
+    # in
+    hierarchies: Hierarchies,
+    origin: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    reach: float,
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+    primitive_out: wp.array(dtype=wp.int32),
+):
+    """One thread follows one ray to what it meets first (-2 ground, -1 nothing)."""
+    i = wp.tid()
+    best = first_hit(hierarchies, shapes, origin[i], direction[i], reach, 0.0, direction[i])
+    distance_out[i] = wp.where(best.primitive == -1, FAR, best.t)
+    primitive_out[i] = best.primitive
+
+
+@wp.kernel
+def cast_camera(
+    # model
+    shapes: Shapes,
+    # in
+    hierarchies: Hierarchies,
+    lens: Pinhole,
+    # out
+    depth_out: wp.array(dtype=wp.float32),
+    primitive_out: wp.array(dtype=wp.int32),
+):
+    """One thread follows the ray of one pixel: what the rasteriser must find too."""
+    pixel = wp.tid()
+    back = wp.transpose(lens.turn)
+    d = back * ray_of(lens, pixel % lens.width, pixel // lens.width)
+    best = first_hit(hierarchies, shapes, lens.eye, d, lens.reach, lens.fx, back * wp.vec3(0.0, 0.0, 1.0))
+    depth_out[pixel] = wp.where(best.primitive == -1, FAR, best.t)
+    primitive_out[pixel] = best.primitive

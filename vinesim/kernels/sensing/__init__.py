@@ -1,0 +1,1 @@
+"""What a sensor measures of exact depth: stereo matching, lidar echoes."""

@@ -1,0 +1,150 @@
+"""What comes back of a laser shot, and what a lidar makes of it."""
+
+import warp as wp
+
+from vinesim.kernels.raster.primitives import Shapes, normal_at
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+Beam = wp.types.vector(length=8, dtype=wp.float32)
+"""One number for each ray of a shot; an echo is (signal, range, brightness, which ray shows most of it)."""
+
+
+@wp.struct
+class Receiver:
+    """What a lidar makes of what comes back."""
+
+    rays: int
+    """Of one shot, the first one in its middle."""
+    reflectance: wp.array(dtype=wp.float32)
+    """[organ]"""
+    nearest: float
+    farthest: float
+    merge: float
+    separation: float
+    returns: int
+    """0 the strongest, 1 the last, 2 both."""
+    noise: float
+    weak_noise: float
+    step: float
+    weakest: float
+    flicker: float
+
+
+@wp.func
+def measured(r: Receiver, echo: wp.vec4, luck: float) -> float:
+    """Range of an echo [m]: noise grows as the signal comes near the weakest that is noticed."""
+    sigma = r.noise
+    if r.weakest > 0.0:
+        sigma = wp.max(sigma, r.weak_noise * wp.sqrt(r.weakest / echo[0]))
+    range = echo[1] + sigma * luck
+    if r.step > 0.0:
+        range = wp.round(range / r.step) * r.step
+    return range
+
+
+@wp.func
+def name_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) -> int:
+    """Label of what a ray has met."""
+    if primitive < 0:
+        return ground_label
+    return label[primitive]
+
+
+@wp.kernel
+def receive(
+    # model
+    shapes: Shapes,
+    label: wp.array(dtype=wp.int32),
+    organ: wp.array(dtype=wp.int32),
+    receiver: Receiver,
+    # in
+    first: int,
+    pose: wp.transform,
+    direction: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=wp.float32),
+    primitive: wp.array(dtype=wp.int32),
+    ground_label: int,
+    ground_organ: int,
+    luck: wp.array2d(dtype=wp.float32),
+    # out
+    xyz_out: wp.array2d(dtype=wp.vec3),
+    intensity_out: wp.array2d(dtype=wp.float32),
+    label_out: wp.array2d(dtype=wp.int32),
+):
+    """One thread makes one or two returns of one shot's rays; label -1 where there is none."""
+    shot = first + wp.tid()
+    rays = receiver.rays
+    t = Beam()
+    bright = Beam()
+    name = Beam()  # which ray, sorted with the others
+    count = wp.int32(0)
+    for k in range(rays):
+        ray = shot * rays + k
+        it = primitive[ray]
+        r = distance[ray]
+        if it != -1 and r >= receiver.nearest and r <= receiver.farthest:
+            n = wp.vec3(0.0, 0.0, 1.0)
+            matter = ground_organ
+            if it >= 0:
+                n = normal_at(shapes, it, wp.transform_point(pose, direction[ray] * r))
+                matter = organ[it]
+            slant = wp.abs(wp.dot(n, wp.transform_vector(pose, direction[ray])))
+            light = receiver.reflectance[matter] * slant / float(rays)
+            # insert by range
+            j = count
+            while j > 0 and t[j - 1] > r:
+                t[j] = t[j - 1]
+                bright[j] = bright[j - 1]
+                name[j] = name[j - 1]
+                j -= 1
+            t[j] = r
+            bright[j] = light
+            name[j] = float(ray)
+            count += 1
+    # echoes: what lies closer together along the beam than the pulse is long comes back as one
+    strongest = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    second = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    last = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    k = wp.int32(0)
+    while k < count:
+        signal = wp.float32(0.0)
+        moment = wp.float32(0.0)
+        sum_light = wp.float32(0.0)
+        most = wp.float32(-1.0)
+        shown = wp.float32(0.0)
+        end = t[k]
+        while k < count and t[k] <= end + receiver.merge:
+            part = bright[k] / (t[k] * t[k])
+            signal += part
+            moment += part * t[k]
+            sum_light += bright[k]
+            if part > most:
+                most = part
+                shown = name[k]
+            end = t[k]
+            k += 1
+        if signal > 0.0 and signal * wp.exp(receiver.flicker * luck[shot, 2]) > receiver.weakest:
+            last = wp.vec4(signal, moment / signal, sum_light, shown)
+            if signal > strongest[0]:
+                second = strongest
+                strongest = last
+            elif signal > second[0]:
+                second = last
+    d = direction[shot * rays]
+    echo = strongest
+    if receiver.returns == 1:
+        echo = last
+    label_out[shot, 0] = -1
+    if echo[0] > 0.0:
+        label_out[shot, 0] = name_of(primitive[int(echo[3])], label, ground_label)
+        xyz_out[shot, 0] = d * measured(receiver, echo, luck[shot, 0])
+        intensity_out[shot, 0] = wp.clamp(100.0 * echo[2], 0.0, 255.0)
+    if receiver.returns == 2:
+        if last[1] == strongest[1]:
+            last = second
+        label_out[shot, 1] = -1
+        if last[0] > 0.0 and wp.abs(last[1] - strongest[1]) >= receiver.separation:
+            label_out[shot, 1] = name_of(primitive[int(last[3])], label, ground_label)
+            xyz_out[shot, 1] = d * measured(receiver, last, luck[shot, 1])
+            intensity_out[shot, 1] = wp.clamp(100.0 * last[2], 0.0, 255.0)

@@ -1,0 +1,1 @@
+"""Colour of visible surfaces: materials, light, shadows, exposure."""

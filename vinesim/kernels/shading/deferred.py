@@ -1,0 +1,334 @@
+"""Deferred shading of the seen primitives: sun, sky, canopy and ground light, then exposure and tone.
+
+Linear light, RGB. Ambient light has three parts: sky through the gaps of the canopy (baked leaf area, Beer-Lambert),
+green light through leaves, and the bounce of the ground. A leaf shows the sun through its blade; a berry carries
+bloom, lets light through when it is pale, and darkens where it touches its neighbours.
+"""
+
+import warp as wp
+
+from vinesim.kernels.raster.camera_raster import Pinhole
+from vinesim.kernels.raster.primitives import LEAF, SPHEROID, Shapes
+from vinesim.kernels.shading.materials import (
+    BERRY,
+    Looks,
+    Surface,
+    berry_surface,
+    ground_surface,
+    leaf_surface,
+    mix,
+    smooth,
+    smoothstep,
+    solid_surface,
+)
+from vinesim.kernels.shading.shadow_maps import ShadowMap, lit_share
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+WHITE = wp.constant(3.0)
+"""Light, after exposure, that the tone curve shows as nearly white."""
+DARKEST = wp.constant(0.02)
+BRIGHTEST = wp.constant(2.0)
+"""What is darker or brighter counts as this when light is metered."""
+
+
+@wp.struct
+class Light:
+    """Sun, sky and exposure."""
+
+    sun: wp.vec3
+    sun_colour: wp.vec3
+    sky_colour: wp.vec3
+    bounce: wp.vec3
+    """From the ground."""
+    leaves: wp.vec3
+    """Through the canopy."""
+    haze: wp.vec3
+    taps: int
+    """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""
+    spiral: wp.array(dtype=wp.vec2)
+    """[taps] Vogel's spiral in the unit disc."""
+    turns: wp.array(dtype=wp.vec2)
+    """[64] cosine and sine of 64 angles."""
+    table: wp.array2d(dtype=wp.vec3)
+
+
+@wp.func
+def arctangent(y: float, x: float) -> float:
+    """atan2 to 1e-4 rad."""
+    ax = wp.abs(x)
+    ay = wp.abs(y)
+    a = wp.min(ax, ay) / wp.max(wp.max(ax, ay), 1.0e-9)
+    q = a * a
+    r = ((-0.0464964749 * q + 0.15931422) * q - 0.327622764) * q * a + a
+    if ay > ax:
+        r = 1.57079637 - r
+    if x < 0.0:
+        r = 3.14159274 - r
+    return wp.where(y < 0.0, -r, r)
+
+
+@wp.func
+def sky_light(light: Light, d: wp.vec3) -> wp.vec3:
+    rows = light.table.shape[0]
+    columns = light.table.shape[1]
+    x = (arctangent(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
+    y = wp.sqrt(wp.max(d[2], 0.0)) * float(rows - 1)
+    i = wp.clamp(int(x), 0, columns - 2)
+    j = wp.clamp(int(y), 0, rows - 2)
+    fx = x - float(i)
+    fy = y - float(j)
+    low = light.table[j, i] * (1.0 - fx) + light.table[j, i + 1] * fx
+    high = light.table[j + 1, i] * (1.0 - fx) + light.table[j + 1, i + 1] * fx
+    return low * (1.0 - fy) + high * fy
+
+
+@wp.func
+def ambient(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
+    """Cool sky through the gaps, green light through leaves, warm bounce from the ground."""
+    up = 0.5 + 0.5 * n[2]
+    above = light.sky_colour * (sky * sky) + light.leaves * (1.0 - sky)
+    return above * (0.25 + 0.75 * up) + light.bounce * ((1.0 - up) * (0.35 + 0.65 * sky))
+
+
+@wp.func
+def mirrored(looks: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
+    """What a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
+    t = smooth(looks.noise, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
+    hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, t[1])
+    above = mix(light.leaves * 0.4, light.sky_colour * 1.3, hole)
+    return mix(light.bounce * 0.8, above, smoothstep(-0.25, 0.25, r[2]))
+
+
+@wp.func
+def shine(
+    looks: Looks,
+    light: Light,
+    near: ShadowMap,
+    far: ShadowMap,
+    s: Surface,
+    kind: int,
+    p: wp.vec3,
+    d: wp.vec3,
+    t: float,
+    turn: wp.vec2,
+) -> wp.vec3:
+    """Light that leaves a surface at ``p`` against the unit ray ``d``."""
+    n = s.normal
+    plain = s.plain
+    if kind == LEAF and wp.dot(plain, d) > 0.0:
+        n = -n
+        plain = -plain
+    ndl = wp.dot(n, light.sun)
+    lit = float(0.0)
+    if ndl > 0.0 or s.through[0] > 0.0 or s.wrap[0] > 0.0:
+        away = plain
+        if wp.dot(plain, light.sun) < 0.0:
+            away = -plain
+        lit = lit_share(near, p, away, turn, light.spiral, light.taps)
+        if lit < 0.0:
+            lit = lit_share(far, p, away, turn, light.spiral, light.taps)
+            if lit < 0.0:
+                lit = wp.where(s.sky > 0.7, 1.0, s.sky)
+    direct = wp.vec3(
+        wp.max((ndl + s.wrap[0]) / (1.0 + s.wrap[0]), 0.0),
+        wp.max((ndl + s.wrap[1]) / (1.0 + s.wrap[1]), 0.0),
+        wp.max((ndl + s.wrap[2]) / (1.0 + s.wrap[2]), 0.0),
+    )
+    colour = wp.cw_mul(
+        s.albedo,
+        wp.cw_mul(direct, light.sun_colour) * (lit * (0.35 + 0.65 * s.occlusion))
+        + ambient(light, n, s.sky) * s.occlusion,
+    )
+    if s.through[0] > 0.0:
+        if kind == SPHEROID:  # a long way through the berry: saturated, brightest at the rim
+            rim = wp.clamp(0.55 - 0.75 * ndl, 0.0, 1.0)
+            sunny = rim * rim * 0.30 * (0.15 + 0.85 * lit) * s.occlusion * (0.25 + 0.75 * s.sky)
+            colour += wp.cw_mul(s.through, light.sun_colour * sunny + ambient(light, -n, s.sky) * (0.35 * s.occlusion))
+        else:
+            colour += wp.cw_mul(
+                s.through,
+                light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55) + ambient(light, -n, s.sky) * (0.30 * s.occlusion),
+            )
+    if s.gloss > 0.0:
+        grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
+        g2 = grazing * grazing
+        fresnel = s.gloss + (1.0 - s.gloss) * g2 * g2 * grazing * wp.min(s.gloss * 14.0, 1.0) * 0.8
+        if lit > 0.0 and ndl > -0.05:
+            half = wp.normalize(light.sun - d)
+            peak = 1.0 - wp.max(wp.dot(n, half), 0.0)
+            if s.polish * peak < 8.0:
+                colour += light.sun_colour * (
+                    fresnel * wp.exp(-s.polish * peak) * (s.polish * 0.14 + 0.4) * lit * (ndl + 0.05)
+                )
+        if s.mirror * fresnel > 0.006:
+            r = d - n * (2.0 * wp.dot(n, d))
+            if kind == LEAF:
+                above = mix(light.leaves * 0.45, light.sky_colour, s.sky * s.sky)
+                colour += mix(light.bounce, above, 0.5 + 0.5 * r[2]) * (wp.min(fresnel, 0.16) * s.mirror * s.occlusion)
+            else:
+                colour += mirrored(looks, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)
+    colour += s.albedo * s.glow
+    return mix(colour, light.haze, 0.6 * (1.0 - wp.exp(-t * 0.006)))
+
+
+@wp.kernel
+def shade(
+    # model
+    shapes: Shapes,
+    looks: Looks,
+    # in
+    light: Light,
+    near: ShadowMap,
+    far: ShadowMap,
+    lens: Pinhole,
+    primitive: wp.array(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int64),
+    block: int,
+    run: int,
+    # out
+    radiance_out: wp.array(dtype=wp.vec3),
+):
+    """One thread lights ``run`` neighbouring blocks, 1 or 2 pixels wide; there each primitive is lit once, at its middle."""
+    half = block - 1  # corners are told apart by bits: divisions would cost as much as the light
+    across = (lens.width + half) >> half
+    first = wp.tid() * run
+    corners = block * block
+    back = wp.transpose(lens.turn)
+    for n in range(first, first + run):
+        down = n // across
+        left = (n - down * across) * block
+        top = down * block
+        for c in range(corners):
+            i = wp.int32(-3)
+            x = left + (c & half)
+            y = top + (c >> half)
+            if x < lens.width and y < lens.height:
+                i = primitive[y * lens.width + x]
+                for k in range(c):  # whoever comes first speaks for all that see the same
+                    if primitive[(top + (k >> half)) * lens.width + left + (k & half)] == i:
+                        i = -3
+            if i != -3:
+                u = float(0.0)
+                v = float(0.0)
+                depth = float(0.0)
+                share = float(0.0)
+                for k in range(c, corners):
+                    x = left + (k & half)
+                    y = top + (k >> half)
+                    if x < lens.width and y < lens.height:
+                        pixel = y * lens.width + x
+                        if primitive[pixel] == i:
+                            u += float(x)
+                            v += float(y)
+                            depth += float(keys[pixel] >> wp.int64(32))
+                            share += 1.0
+                per = 1.0 / share
+                ray = back * wp.vec3((u * per - lens.cx) / lens.fx, (v * per - lens.cy) / lens.fy, 1.0)
+                z = depth * per * 1.0e-6
+                if i == -2:
+                    z = -lens.eye[2] / ray[2]
+                scale = wp.length(ray)
+                d = ray / scale
+                colour = wp.vec3(0.0, 0.0, 0.0)
+                if i == -1:
+                    colour = sky_light(light, d)
+                else:
+                    p = lens.eye + ray * z
+                    footprint = z * float(block) / lens.fx
+                    # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
+                    f = 0.06711056 * float(left) + 0.00583715 * float(top)
+                    f = 52.9829189 * (f - wp.floor(f))
+                    turn = light.turns[int((f - wp.floor(f)) * 64.0) & 63]
+                    kind = wp.int32(-1)
+                    s = Surface()
+                    if i >= 0:
+                        kind = shapes.kind[i]
+                        if kind == LEAF:
+                            s = leaf_surface(shapes, looks, i, p, d, footprint)
+                        elif kind == SPHEROID and looks.material[i] == BERRY:
+                            s = berry_surface(shapes, looks, i, p, footprint)
+                        else:
+                            s = solid_surface(shapes, looks, i, p, footprint)
+                    else:
+                        s = ground_surface(looks, p, footprint, footprint * z * scale / lens.eye[2])
+                    colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
+                for k in range(c, corners):
+                    x = left + (k & half)
+                    y = top + (k >> half)
+                    if x < lens.width and y < lens.height:
+                        if primitive[y * lens.width + x] == i:
+                            radiance_out[y * lens.width + x] = colour
+
+
+@wp.kernel
+def meter(
+    # in
+    radiance: wp.array(dtype=wp.vec3),
+    width: int,
+    height: int,
+    step: int,
+    # out
+    sum_out: wp.array(dtype=wp.int64),
+):
+    """One thread adds log2 luminance of one pixel in ``step`` squared to a sum of millionths, the same in any order."""
+    i = wp.tid()
+    across = width // step
+    x = (i % across) * step + step / 2
+    y = (i // across) * step + step / 2
+    if y < height:
+        c = radiance[y * width + x]
+        light = wp.clamp(0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2], DARKEST, BRIGHTEST)
+        wp.atomic_add(sum_out, 0, wp.int64(int(wp.log2(light) * 65536.0)))
+        wp.atomic_add(sum_out, 1, wp.int64(1))
+
+
+@wp.kernel
+def expose(
+    # in
+    usual: float,
+    key: float,
+    share: float,
+    least: float,
+    most: float,
+    keep: float,
+    # out
+    sum_out: wp.array(dtype=wp.int64),
+    exposure_out: wp.array(dtype=wp.float32),
+):
+    """One thread goes a ``share`` of the stops from the usual exposure to the key's, and keeps some of the old one."""
+    mean = float(sum_out[0]) / (65536.0 * float(wp.max(sum_out[1], wp.int64(1))))
+    wanted = wp.clamp(usual * wp.pow(key * wp.pow(2.0, -mean) / usual, share), least, most)
+    old = exposure_out[0]
+    exposure_out[0] = wp.where(old > 0.0, wanted * wp.pow(wp.max(old, 1.0e-6) / wanted, keep), wanted)
+    sum_out[0] = wp.int64(0)
+    sum_out[1] = wp.int64(0)
+
+
+@wp.kernel
+def develop(
+    # in
+    radiance: wp.array(dtype=wp.vec3),
+    width: int,
+    samples: int,
+    balance: wp.vec3,
+    exposure: wp.array(dtype=wp.float32),
+    tone: wp.array(dtype=wp.uint8),
+    run: int,
+    # out
+    rgb_out: wp.array2d(dtype=wp.uint8),
+):
+    """One thread turns the light of ``run`` neighbouring pixels, each of ``samples`` squared samples, into 8-bit sRGB."""
+    first = wp.tid() * run
+    per = 1.0 / float(samples * samples)
+    gain = balance * exposure[0]
+    for pixel in range(first, first + run):
+        left = (pixel % width) * samples
+        top = (pixel // width) * samples
+        colour = wp.vec3(0.0, 0.0, 0.0)
+        for k in range(samples * samples):
+            c = wp.cw_mul(gain, radiance[(top + k // samples) * width * samples + left + k % samples])
+            # what is brighter than white counts as white: edges against the sky stay smooth
+            colour += wp.min(c, wp.vec3(WHITE, WHITE, WHITE))
+        for k in range(3):
+            rgb_out[pixel, k] = tone[wp.clamp(int(wp.sqrt(wp.max(colour[k] * per, 0.0)) * 1024.0), 0, 4095)]

@@ -1,0 +1,470 @@
+"""What each primitive is made of: albedo, relief, gloss and the light that passes, at one point of its surface.
+
+Linear RGB.
+"""
+
+import warp as wp
+
+from vinesim.kernels.raster.primitives import (
+    BOX,
+    CONE,
+    CYLINDER,
+    SPHEROID,
+    TRIANGLE,
+    Shapes,
+    as_quat,
+    squeeze,
+    xyz,
+)
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+FOLIAGE = wp.constant(0)
+BERRY = wp.constant(1)
+CANE = wp.constant(2)
+BARK = wp.constant(3)
+POST = wp.constant(4)
+WIRE = wp.constant(5)
+STEM = wp.constant(6)
+PLASTIC = wp.constant(7)
+CLOTH = wp.constant(8)
+SKIN = wp.constant(9)
+PAINT = wp.constant(10)
+GRASS = wp.constant(11)
+LAMP = wp.constant(12)
+RUBBER = wp.constant(13)
+METAL = wp.constant(14)
+STRAW = wp.constant(15)
+REFLEX = wp.constant(16)
+GLASS = wp.constant(17)
+
+
+@wp.struct
+class Looks:
+    """Materials of all primitives and the tables they draw on."""
+
+    material: wp.array(dtype=wp.int32)
+    tint: wp.array(dtype=wp.vec3)
+    sky: wp.array(dtype=wp.float32)
+    """Share of the sky each primitive sees through the canopy."""
+    blade: wp.array3d(dtype=wp.vec4)
+    noise: wp.array2d(dtype=wp.vec4)
+    soil: wp.array2d(dtype=wp.vec4)
+    rows: wp.vec2
+    """Where the first row of vines stands, and their spacing [m], along y."""
+    ground_sky: wp.array2d(dtype=wp.float32)
+    ground_x: float
+    ground_y: float
+    ground_cell: float
+
+
+@wp.func
+def smoothstep(a: float, b: float, x: float) -> float:
+    t = wp.clamp((x - a) / (b - a), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@wp.func
+def mix(a: wp.vec3, b: wp.vec3, t: float) -> wp.vec3:
+    return a * (1.0 - t) + b * t
+
+
+@wp.func
+def smooth(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
+    """Bilinear sample of a 256 x 256 table of period 1."""
+    fx = (x - wp.floor(x)) * 256.0
+    fy = (y - wp.floor(y)) * 256.0
+    i = int(fx) & 255
+    j = int(fy) & 255
+    ax = fx - float(i)
+    ay = fy - float(j)
+    k = (i + 1) & 255
+    below = (j + 1) & 255
+    return (table[j, i] * (1.0 - ax) + table[j, k] * ax) * (1.0 - ay) + (
+        table[below, i] * (1.0 - ax) + table[below, k] * ax
+    ) * ay
+
+
+@wp.func
+def texel_of(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
+    """Nearest sample of a 256 x 256 table of period 1."""
+    return table[int((y - wp.floor(y)) * 256.0) & 255, int((x - wp.floor(x)) * 256.0) & 255]
+
+
+@wp.struct
+class Surface:
+    """What one point reflects."""
+
+    normal: wp.vec3
+    plain: wp.vec3
+    """Normal of the shape, without relief."""
+    albedo: wp.vec3
+    through: wp.vec3
+    """Colour of the light that passes."""
+    wrap: wp.vec3
+    """How far light creeps round the terminator, by colour."""
+    sky: float
+    occlusion: float
+    gloss: float
+    """Fresnel reflectance at normal incidence."""
+    polish: float
+    """Sharpness of the highlight."""
+    mirror: float
+    glow: float
+
+
+@wp.func
+def matte(n: wp.vec3, albedo: wp.vec3, sky: float) -> Surface:
+    s = Surface()
+    s.normal = n
+    s.plain = n
+    s.albedo = albedo
+    s.through = wp.vec3(0.0, 0.0, 0.0)
+    s.wrap = wp.vec3(0.0, 0.0, 0.0)
+    s.sky = sky
+    s.occlusion = 1.0
+    s.gloss = 0.03
+    s.polish = 12.0
+    s.mirror = 0.0
+    s.glow = 0.0
+    return s
+
+
+@wp.func
+def ground_surface(looks: Looks, p: wp.vec3, pixel: float, slant: float) -> Surface:
+    """Soil and sod at ``p``; ``slant`` is the length that one pixel covers along the line of sight [m]."""
+    # seen at a grazing angle, spots would be drawn out into bands: far away only their mean is left
+    blur = 1.0 / (1.0 + slant * slant * 1.5)
+    mean = wp.vec4(0.5, 0.5, 0.5, 0.5)
+    coarse = mean
+    if blur > 0.01:
+        coarse = (smooth(looks.noise, p[0] * 0.21, p[1] * 0.21) - mean) * blur + mean
+    detail = 1.0 / (1.0 + pixel * pixel * 20000.0)
+    tone = float(0.5)
+    sod = float(0.5)
+    n = wp.vec3(0.0, 0.0, 1.0)
+    if detail > 0.08:
+        t = smooth(looks.soil, p[0] * 0.8, p[1] * 0.8)
+        tone = 0.5 + (t[0] - 0.5) * detail
+        sod = 0.5 + (t[1] - 0.5) * detail
+        n = wp.normalize(wp.vec3(t[2] * detail, t[3] * detail, 1.0))
+    s = matte(n, wp.vec3(0.0, 0.0, 0.0), 0.75)
+    inside = float(0.0)
+    x = (p[0] - looks.ground_x) / looks.ground_cell
+    y = (p[1] - looks.ground_y) / looks.ground_cell
+    wide = float(looks.ground_sky.shape[1] - 1)
+    high = float(looks.ground_sky.shape[0] - 1)
+    if x > 0.0 and y > 0.0 and x < wide and y < high:
+        i = int(x)
+        j = int(y)
+        fx = x - float(i)
+        fy = y - float(j)
+        low = looks.ground_sky[j, i] * (1.0 - fx) + looks.ground_sky[j, i + 1] * fx
+        above = looks.ground_sky[j + 1, i] * (1.0 - fx) + looks.ground_sky[j + 1, i + 1] * fx
+        s.sky = low * (1.0 - fy) + above * fy
+        edge = wp.min(wp.min(x, wide - x), wp.min(y, high - y)) * looks.ground_cell
+        inside = smoothstep(0.0, 3.0, edge)
+    green = smoothstep(
+        0.38, 0.60, 0.55 * coarse[0] + 0.2 * coarse[2] + 0.25 * sod + sown(looks.rows, p[1]) * inside * blur
+    )
+    green = green * 0.85
+    earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
+    turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
+    if inside < 1.0:
+        fields = smooth(looks.noise, p[0] * 0.011, p[1] * 0.011 + 0.37)
+        green = wp.min(green + (0.22 + 0.45 * smoothstep(0.35, 0.65, fields[1])) * (1.0 - inside), 0.92)
+        turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
+    s.albedo = mix(earth, turf, green) * (0.8 + 0.4 * coarse[1])
+    s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
+    s.gloss = 0.0
+    return s
+
+
+@wp.func
+def sown(rows: wp.vec2, y: float) -> float:
+    """How much greener than elsewhere the ground is across rows (first row [m], spacing [m]): bare under the vines and
+    in the tracks of wheels, green between.
+    """
+    lane = (y - rows[0]) / rows[1]
+    away = wp.abs(lane - wp.floor(lane + 0.5)) * rows[1]
+    track = wp.abs(away - 0.5 * rows[1] + 0.7)
+    return 0.16 - 0.26 * smoothstep(0.65, 0.25, away) - 0.14 * smoothstep(0.22, 0.08, track)
+
+
+@wp.func
+def berry_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
+    a4 = g.a[i]
+    b4 = g.b[i]
+    c4 = g.c[i]
+    block = g.d[i]
+    axis = xyz(b4)
+    stretch = 1.0 / b4[3] - 1.0
+    e = squeeze(p - xyz(a4), axis, stretch)
+    n = wp.normalize(squeeze(e, axis, stretch))
+    tint = looks.tint[i]
+    s = matte(n, tint, looks.sky[i])
+    # neighbours: a baked cosine lobe of what stands around
+    s.occlusion = wp.clamp(1.0 - block[3] - wp.dot(xyz(block), n), 0.12, 1.0) * (0.4 + 0.6 * c4[1])
+    light = tint[1] * 2.2  # pale berries let light through, dark ones carry the bloom
+    pale = wp.clamp(light, 0.0, 1.0)
+    red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
+    s.wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
+    s.through = wp.vec3(0.95, 0.76, 0.12) * pale + wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
+    bloom = 0.46 - 0.32 * pale - 0.10 * red
+    s.gloss = 0.045
+    bm = bloom * 0.6
+    if pixel < a4[3] * 0.35:
+        w = wp.normalize(e)
+        seed = c4[0]
+        wide = smooth(looks.noise, w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3)
+        fine = smooth(looks.noise, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
+        s.albedo = tint * (0.86 + 0.28 * wide[1])
+        s.albedo = mix(s.albedo, wp.vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide[0] + 0.15 * n[2]))
+        s.albedo = s.albedo * (1.0 + pale * (0.14 * fine[2] - 0.07) + red * wp.where(fine[3] > 0.82, 0.22, 0.0))
+        along = wp.dot(w, axis)
+        bm = bloom * smoothstep(0.30, 0.62, wide[0] * 0.55 + wide[1] * 0.45 + 0.12 * n[2]) * (0.75 + 0.5 * fine[1])
+        scar = smoothstep(0.986, 0.994, along)
+        s.albedo = mix(s.albedo, wp.vec3(0.07, 0.045, 0.025), scar)
+        s.albedo = mix(s.albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
+    s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60), wp.clamp(bm, 0.0, 0.8))
+    s.polish = 260.0 - 300.0 * wp.min(bm, 0.75)
+    s.mirror = 1.0 - wp.min(bm * 1.6, 0.85)
+    return s
+
+
+@wp.func
+def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: float) -> Surface:
+    a4 = g.a[i]
+    b4 = g.b[i]
+    c4 = g.c[i]
+    bend = g.d[i]
+    size = a4[3]
+    rib = xyz(b4)
+    up = xyz(c4)
+    side = wp.cross(rib, up)
+    q = (p - xyz(a4)) / size
+    u = wp.dot(q, side)
+    v = wp.dot(q, rib)
+    slope_u = -2.0 * bend[0] * u - wp.where(u > 0.0, bend[2], -bend[2])
+    slope_v = -2.0 * bend[1] * v
+    plain = wp.normalize(side * slope_u + rib * slope_v + up)
+    s = matte(plain, looks.tint[i], looks.sky[i])
+    grass = looks.material[i] == GRASS
+    if grass:
+        s.albedo = s.albedo * (0.35 + 0.75 * (0.5 + 0.5 * v))
+        s.through = s.albedo * 0.7
+        s.gloss = 0.012
+        s.normal = wp.normalize(plain * 0.5 + wp.vec3(0.0, 0.0, 0.8))
+        s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, v)
+    else:
+        vein = float(0.0)
+        age = wp.max(bend[3] - 0.42, 0.0) * 1.7  # a leaf turns late
+        near = size > pixel * 10.0
+        number = int(b4[3])
+        if near:
+            x = wp.clamp((u + 1.0) * 64.0 - 0.5, 0.0, 126.0)
+            y = wp.clamp((v + 0.75) * 64.0 - 0.5, 0.0, 126.0)
+            m = int(x)
+            n = int(y)
+            fx = x - float(m)
+            fy = y - float(n)
+            low = looks.blade[number, n, m] * (1.0 - fx) + looks.blade[number, n, m + 1] * fx
+            high = looks.blade[number, n + 1, m] * (1.0 - fx) + looks.blade[number, n + 1, m + 1] * fx
+            t = low * (1.0 - fy) + high * fy
+            clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
+            vein = t[0] * clear
+            relief = 0.6 * clear
+            s.normal = wp.normalize(side * (slope_u - t[1] * relief) + rib * (slope_v - t[2] * relief) + up)
+            s.albedo = s.albedo * (0.72 + 0.5 * t[3])
+        if age > 0.02:
+            spot = texel_of(looks.noise, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
+            edge = (
+                float(
+                    g.outline[
+                        number, wp.clamp(int((v + 0.75) * 128.0), 0, 255), wp.clamp(int((u + 1.0) * 128.0), 0, 255)
+                    ]
+                )
+                * 0.0025
+            )
+            yellow = (
+                age * smoothstep(0.16 + 0.1 * age, 0.0, edge - 0.10 * spot[1])
+                + 0.7 * smoothstep(0.62, 0.9, age) * spot[0]
+            )
+            s.albedo = mix(s.albedo, wp.vec3(0.40, 0.34, 0.05), wp.clamp(yellow, 0.0, 1.0))
+            brown = smoothstep(0.03, 0.0, edge - 0.05 * spot[2] * age) * smoothstep(0.35, 0.6, age)
+            s.albedo = mix(s.albedo, wp.vec3(0.16, 0.085, 0.03), brown)
+        s.through = wp.cw_mul(s.albedo, wp.vec3(2.3, 2.0, 0.75)) * (1.0 - 0.7 * vein)
+        if wp.dot(plain, d) > 0.0:  # from below: paler, felted, veins stand out
+            s.albedo = mix(s.albedo * 1.05, wp.vec3(0.22, 0.27, 0.16), 0.42)
+            s.albedo = mix(s.albedo, wp.vec3(0.34, 0.38, 0.20), vein * 0.7)
+            s.gloss = 0.012
+            s.polish = 6.0
+        else:
+            s.albedo = mix(s.albedo, wp.vec3(0.20, 0.28, 0.08), vein * 0.40)
+            s.gloss = 0.05
+            s.polish = 22.0
+            s.mirror = 0.55
+    return s
+
+
+@wp.func
+def unpacked(code: float) -> wp.vec3:
+    """A unit vector from one float: octahedral, two times eleven bits, plus one."""
+    k = int(code) - 1
+    x = float(k % 2047) * (2.0 / 2046.0) - 1.0
+    y = float(k / 2047) * (2.0 / 2046.0) - 1.0
+    z = 1.0 - wp.abs(x) - wp.abs(y)
+    fold = wp.max(-z, 0.0)
+    return wp.normalize(wp.vec3(x - wp.where(x >= 0.0, fold, -fold), y - wp.where(y >= 0.0, fold, -fold), z))
+
+
+@wp.func
+def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
+    """Normal at ``p`` of the smooth surface that a triangle stands for, mixed from those of its corners."""
+    a4 = g.a[i]
+    b4 = g.b[i]
+    c4 = g.c[i]
+    ab = xyz(b4) - xyz(a4)
+    ac = xyz(c4) - xyz(a4)
+    ap = p - xyz(a4)
+    n = wp.cross(ab, ac)
+    if a4[3] > 0.0:
+        whole = wp.dot(n, n)
+        v = wp.clamp(wp.dot(wp.cross(ap, ac), n) / whole, 0.0, 1.0)
+        w = wp.clamp(wp.dot(wp.cross(ab, ap), n) / whole, 0.0, 1.0)
+        mixed = unpacked(a4[3]) * (1.0 - v - w) + unpacked(b4[3]) * v + unpacked(c4[3]) * w
+        n = wp.quat_rotate(as_quat(g.d[i]), mixed)
+    return wp.normalize(n)
+
+
+@wp.func
+def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
+    kind = g.kind[i]
+    a4 = g.a[i]
+    b4 = g.b[i]
+    c4 = g.c[i]
+    a = xyz(a4)
+    n = wp.vec3(0.0, 0.0, 1.0)
+    grain = p  # position along and across the grain
+    sky = looks.sky[i]
+    if kind == CONE or kind == CYLINDER:
+        ba = xyz(b4) - a
+        h = wp.clamp(wp.dot(p - a, ba) / wp.dot(ba, ba), 0.0, 1.0)
+        out = p - a - ba * h
+        length = wp.length(ba)
+        along = ba / length
+        if c4[3] > 0.0:
+            sky = sky * (1.0 - h) + c4[2] * h
+        if kind == CYLINDER:
+            n = wp.normalize(out)
+            if h <= 1.0e-4:
+                n = -along
+            if h >= 0.9999:
+                n = along
+        else:
+            n = wp.normalize(wp.normalize(out) + along * ((a4[3] - b4[3]) / length))
+        if wp.abs(along[2]) < 0.7:
+            grain = wp.vec3(out[2], wp.dot(out, wp.vec3(-along[1], along[0], 0.0)), c4[0] + h * length)
+        else:
+            grain = wp.vec3(0.8 * out[0] + 0.6 * out[1], 0.8 * out[1] - 0.6 * out[0], c4[0] + h * length)
+    elif kind == SPHEROID:
+        n = wp.normalize(p - a)
+    elif kind == TRIANGLE:
+        n = smooth_normal(g, i, p)
+        grain = wp.quat_rotate_inv(as_quat(g.d[i]), p)
+    else:
+        q = as_quat(b4)
+        grain = wp.quat_rotate_inv(q, p - a)
+        half = wp.vec3(a4[3], c4[0], c4[1])
+        if kind == BOX:  # edges rounded by 4 mm
+            e = wp.vec3(wp.abs(grain[0]) - half[0], wp.abs(grain[1]) - half[1], wp.abs(grain[2]) - half[2])
+            n = wp.vec3(
+                wp.max(e[0] + 0.004, 0.0) * wp.sign(grain[0]),
+                wp.max(e[1] + 0.004, 0.0) * wp.sign(grain[1]),
+                wp.max(e[2] + 0.004, 0.0) * wp.sign(grain[2]),
+            )
+            n = wp.quat_rotate(q, wp.normalize(n))
+        else:
+            n = wp.normalize(wp.quat_rotate(q, wp.cw_div(grain, wp.cw_mul(half, half))))
+    material = looks.material[i]
+    tint = looks.tint[i]
+    s = matte(n, tint, sky)
+    seed = c4[1]
+    near = pixel < 0.004
+    if material == CANE:
+        if near:
+            t = smooth(looks.noise, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 1.6 + seed * 3.1)
+            s.albedo = mix(tint * (0.55 + 0.9 * t[2]), wp.vec3(0.20, 0.10, 0.045), 0.5 * smoothstep(0.45, 0.7, t[0]))
+            s.normal = wp.normalize(n + wp.vec3(t[1] - 0.5, t[2] - 0.5, t[3] - 0.5) * (0.7 / (1.0 + pixel * 500.0)))
+        s.polish = 14.0
+    elif material == BARK:
+        wide = smooth(
+            looks.noise, grain[0] * 2.6 + grain[2] * 0.24 + seed, grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4
+        )
+        fine = texel_of(looks.noise, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed)
+        height = wide[2] * 0.6 + fine[1] * 0.4
+        s.albedo = mix(wp.vec3(0.085, 0.063, 0.045), wp.vec3(0.23, 0.175, 0.125), smoothstep(0.25, 0.80, height))
+        s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, height)
+        s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.0)
+        s.gloss = 0.01
+    elif material == POST:
+        wide = smooth(looks.noise, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
+        fine = texel_of(looks.noise, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)
+        s.albedo = (
+            tint * (0.55 + 0.55 * wide[1] + 0.35 * fine[2]) * (1.0 - 0.45 * smoothstep(0.35, 0.0, p[2]) * wide[0])
+        )
+        s.normal = wp.normalize(n + wp.vec3(fine[1] - 0.5, fine[2] - 0.5, 0.0) * 0.5)
+        s.gloss = 0.02
+    elif material == WIRE:
+        s.gloss = 0.35
+        s.polish = 30.0
+        s.mirror = 0.5
+    elif material == PLASTIC:
+        t = texel_of(looks.noise, grain[0] * 2.0 + grain[2], grain[1] * 2.0 + grain[2])
+        s.albedo = tint * (0.85 + 0.3 * t[1])
+        s.gloss = 0.045
+        s.polish = 45.0
+        s.mirror = 0.6
+    elif material == CLOTH:
+        wide = smooth(looks.noise, grain[0] * 1.4 + seed, grain[2] * 1.1 + grain[1] * 0.9)
+        s.albedo = tint * (0.78 + 0.45 * wide[0])
+        s.normal = wp.normalize(n + wp.vec3(wide[0] - 0.5, wide[1] - 0.5, (wide[2] - 0.5) * 0.7) * 0.9)
+        s.gloss = 0.008
+        s.wrap = wp.vec3(0.15, 0.15, 0.15)
+    elif material == SKIN:
+        s.wrap = wp.vec3(0.35, 0.15, 0.10)
+        s.polish = 14.0
+    elif material == PAINT:
+        s.gloss = 0.05
+        s.polish = 80.0
+        s.mirror = 0.4
+    elif material == LAMP:
+        s.glow = 3.0
+    elif material == RUBBER:
+        s.gloss = 0.03
+        s.polish = 8.0
+    elif material == METAL:
+        s.albedo = tint * 0.55
+        s.gloss = 0.45
+        s.polish = 40.0
+        s.mirror = 0.7
+    elif material == STRAW:
+        if near:
+            t = texel_of(looks.noise, grain[0] * 9.0 + grain[2] * 5.0, grain[1] * 9.0 - grain[2] * 5.0)
+            s.albedo = tint * (0.70 + 0.5 * t[3])
+            s.normal = wp.normalize(n + wp.vec3(t[3] - 0.5, t[2] - 0.5, 0.0) * 0.5)
+        s.through = tint * 0.25
+        s.gloss = 0.02
+    elif material == REFLEX:
+        s.gloss = 0.12
+        s.polish = 20.0
+        s.mirror = 0.5
+    elif material == GLASS:
+        s.gloss = 0.05
+        s.polish = 250.0
+        s.mirror = 1.0
+    elif material == STEM:
+        s.through = tint * 0.3
+    if material != WIRE:
+        s.occlusion = s.occlusion * (0.55 + 0.45 * smoothstep(0.0, 0.35, p[2] + wp.max(n[2], 0.0) * 0.35))
+    return s

@@ -1,0 +1,319 @@
+"""What sun and sky reach: depths seen from the sun, and the share of the sky that comes through the leaves."""
+
+import warp as wp
+
+from vinesim.kernels.raster.camera_raster import RUN, Depths, Pixels
+from vinesim.kernels.raster.primitives import (
+    BOX,
+    CONE,
+    CYLINDER,
+    FAR,
+    LEAF,
+    SPHEROID,
+    TRIANGLE,
+    Clusters,
+    Shapes,
+    as_quat,
+    hit_box,
+    hit_sphere,
+    hit_triangle,
+    leaf_bulge,
+    leaf_height,
+    xyz,
+)
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+SUN_HEIGHT = wp.constant(100.0)
+"""Depths of a shadow map count from this far towards the sun of its corner [m]."""
+SUN_RADIUS = wp.constant(0.0047)
+"""Half of the sun's angle [rad]."""
+
+
+@wp.struct
+class ShadowMap:
+    """Depth seen from the sun over a square."""
+
+    depth: wp.array(dtype=wp.float32)
+    corner: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    sun: wp.vec3
+    texel: float
+    side: int
+
+
+@wp.kernel
+def see_sky(
+    # model
+    density: wp.array3d(dtype=wp.float32),
+    corner: wp.vec3,
+    cell: float,
+    # in
+    position: wp.array(dtype=wp.vec3),
+    # out
+    sky_out: wp.array(dtype=wp.float32),
+):
+    """One thread finds the share of sky light that reaches one point through leaf area density [1/m] (13 directions)."""
+    i = wp.tid()
+    total = float(0.0)
+    weight = float(0.0)
+    for k in range(13):
+        angle = 1.0472 * float(k)
+        tilt = wp.where(k < 6, 0.6, 0.9)
+        d = wp.vec3(tilt * wp.cos(angle), tilt * wp.sin(angle), wp.sqrt(1.0 - tilt * tilt))
+        if k == 12:
+            d = wp.vec3(0.0, 0.0, 1.0)
+        depth = float(0.0)
+        for n in range(14):
+            p = (position[i] + d * (0.12 + 0.17 * float(n)) - corner) / cell
+            x = int(wp.floor(p[0]))
+            y = int(wp.floor(p[1]))
+            z = int(wp.floor(p[2]))
+            if x >= 0 and y >= 0 and z >= 0 and x < density.shape[0] and y < density.shape[1] and z < density.shape[2]:
+                depth += density[x, y, z] * (0.17 * 0.5)
+        total += wp.exp(-depth) * d[2]
+        weight += d[2]
+    sky_out[i] = total / weight
+
+
+@wp.func
+def darken(m: ShadowMap, x: int, y: int, z: float, depth_out: wp.array(dtype=wp.float32)):
+    wp.atomic_min(depth_out, y * m.side + x, z)
+
+
+@wp.kernel
+def cast_shadows(
+    # model
+    shapes: Shapes,
+    clusters: Clusters,
+    ball: wp.array(dtype=wp.vec4),
+    # in
+    which: wp.array(dtype=wp.int32),
+    m: ShadowMap,
+    smallest: float,
+    lanes: int,
+    slices: int,
+    # out
+    depth_out: wp.array(dtype=wp.float32),
+):
+    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it."""
+    k, lane, part = wp.tid()
+    texels = Pixels()
+    depths = Depths()
+    cluster = which[k]
+    kind = clusters.kind[cluster]
+    bound = ball[cluster]
+    e = xyz(bound) - m.corner
+    reach = bound[3] / m.texel
+    bx = wp.dot(e, m.right) / m.texel
+    by = wp.dot(e, m.up) / m.texel
+    side = float(m.side)
+    if bound[3] > 0.0 and bx > -reach and by > -reach and bx < side + reach and by < side + reach:
+        first = clusters.first[cluster]
+        for i in range(first + lane, first + clusters.size[cluster], lanes):
+            a4 = shapes.a[i]
+            b4 = shapes.b[i]
+            c4 = shapes.c[i]
+            p = xyz(a4) - m.corner
+            x = wp.dot(p, m.right) / m.texel
+            y = wp.dot(p, m.up) / m.texel
+            z = SUN_HEIGHT - wp.dot(p, m.sun)
+            r = a4[3]
+            if kind == SPHEROID:
+                rt = r / m.texel
+                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
+                    for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
+                        dx = float(px) - x
+                        dy = float(py) - y
+                        h = rt * rt - dx * dx - dy * dy
+                        if h > 0.0:
+                            darken(m, px, py, z - wp.sqrt(h) * m.texel, depth_out)
+            elif kind == CONE or kind == CYLINDER:
+                rb = wp.where(kind == CONE, b4[3], r)
+                if wp.max(r, rb) > smallest * m.texel:
+                    q = xyz(b4) - m.corner
+                    ex = wp.dot(q, m.right) / m.texel - x
+                    ey = wp.dot(q, m.up) / m.texel - y
+                    ez = SUN_HEIGHT - wp.dot(q, m.sun) - z
+                    wide = wp.max(wp.max(r, rb) / m.texel, 0.55)
+                    per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
+                    y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
+                    y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, m.side)
+                    for py in range(y0 + part, y1, slices):
+                        x0 = wp.min(x, x + ex) - wide
+                        x1 = wp.max(x, x + ex) + wide
+                        if wp.abs(ey) > 4.0:
+                            s = wp.clamp((float(py) - wide - y) / ey, 0.0, 1.0)
+                            t = wp.clamp((float(py) + wide - y) / ey, 0.0, 1.0)
+                            x0 = x + wp.min(ex * s, ex * t) - wide
+                            x1 = x + wp.max(ex * s, ex * t) + wide
+                        for px in range(wp.max(int(x0), 0), wp.min(int(x1) + 2, m.side)):
+                            fx = float(px) - x
+                            fy = float(py) - y
+                            s = wp.clamp((fx * ex + fy * ey) * per, 0.0, 1.0)
+                            fx -= s * ex
+                            fy -= s * ey
+                            rr = wp.max((r + (rb - r) * s) / m.texel, 0.55)
+                            h = rr * rr - fx * fx - fy * fy
+                            if h > 0.0:
+                                darken(m, px, py, z + ez * s - wp.sqrt(h) * m.texel, depth_out)
+            elif kind == LEAF:
+                rib = xyz(b4)
+                up = xyz(c4)
+                across = wp.cross(rib, up)
+                slant = wp.dot(m.sun, up)
+                if wp.abs(slant) > 0.1:
+                    # sun rays are parallel: leaf coordinates are affine in the texel, then one step for the curvature
+                    bend = shapes.d[i]
+                    number = int(b4[3])
+                    per_leaf = m.texel / r
+                    tu = wp.dot(m.sun, across) / slant
+                    tv = wp.dot(m.sun, rib) / slant
+                    rn = wp.dot(m.right, up)
+                    un = wp.dot(m.up, up)
+                    ux = (wp.dot(m.right, across) - rn * tu) * per_leaf
+                    uy = (wp.dot(m.up, across) - un * tu) * per_leaf
+                    vx = (wp.dot(m.right, rib) - rn * tv) * per_leaf
+                    vy = (wp.dot(m.up, rib) - un * tv) * per_leaf
+                    # octagon around the blade as the sun sees it: bounds of x, y, x + y, x - y
+                    bulge = leaf_bulge(shapes.hull, number, bend)
+                    lx = float(1.0e9)
+                    hx = float(-1.0e9)
+                    ly = float(1.0e9)
+                    hy = float(-1.0e9)
+                    ls = float(1.0e9)
+                    hs = float(-1.0e9)
+                    ld = float(1.0e9)
+                    hd = float(-1.0e9)
+                    for n in range(8):
+                        corner = shapes.hull[number, n]
+                        flat = across * corner[0] + rib * corner[1]
+                        height = leaf_height(bend, corner[0], corner[1]) - bulge[1]
+                        for level in range(2):
+                            q = (flat + up * (height + float(level) * (bulge[0] + bulge[1]))) / per_leaf
+                            qx = x + wp.dot(m.right, q)
+                            qy = y + wp.dot(m.up, q)
+                            lx = wp.min(lx, qx)
+                            hx = wp.max(hx, qx)
+                            ly = wp.min(ly, qy)
+                            hy = wp.max(hy, qy)
+                            ls = wp.min(ls, qx + qy)
+                            hs = wp.max(hs, qx + qy)
+                            ld = wp.min(ld, qx - qy)
+                            hd = wp.max(hd, qx - qy)
+                    su = wp.dot(m.sun, across)
+                    sv = wp.dot(m.sun, rib)
+                    for py in range(wp.max(int(ly), 0) + part, wp.min(int(hy) + 2, m.side), slices):
+                        row = float(py)
+                        first_x = wp.max(int(wp.max(wp.max(lx, wp.max(ls - row, ld + row)), 0.0)), 0)
+                        last_x = wp.min(int(wp.max(wp.min(hx, wp.min(hs - row, hd + row)) + 2.0, 0.0)), m.side)
+                        for start in range(first_x, last_x, RUN):
+                            run = wp.min(last_x - start, RUN)
+                            whole = (run + 7) // 8 * 8
+                            lot = wp.int32(0)
+                            while lot < whole:  # without a branch: eight texels at once
+                                fx = float(start + lot) - x
+                                u0 = ux * fx + uy * (row - y)
+                                v0 = vx * fx + vy * (row - y)
+                                w = leaf_height(bend, u0, v0)
+                                u = u0 + tu * w
+                                v = v0 + tv * w
+                                over = u > -0.99 and u < 0.99 and v > -0.74 and v < 1.24
+                                over = over and u0 > -1.2 and u0 < 1.2 and v0 > -1.0 and v0 < 1.5
+                                texel = int((v + 0.75) * 128.0) * 256 + int((u + 1.0) * 128.0)
+                                texels[lot] = wp.where(over, texel, 0)  # no blade has its corner
+                                depths[lot] = z - (su * u + sv * v + slant * leaf_height(bend, u, v)) * r
+                                lot += 1
+                            for lot in range(run):
+                                texel = texels[lot]
+                                inside = int(shapes.outline[number, texel >> 8, texel & 255]) > 0
+                                darken(m, start + lot, py, wp.where(inside, depths[lot], FAR), depth_out)
+            else:
+                o = xyz(a4)
+                reach_i = r
+                half = wp.vec3(r, c4[0], c4[1])
+                ray = wp.quat_rotate_inv(as_quat(b4), -m.sun)
+                if kind == TRIANGLE:
+                    o = (xyz(a4) + xyz(b4) + xyz(c4)) / 3.0
+                    reach_i = wp.max(wp.max(wp.length(xyz(a4) - o), wp.length(xyz(b4) - o)), wp.length(xyz(c4) - o))
+                else:
+                    reach_i = wp.length(half)
+                p = o - m.corner
+                x = wp.dot(p, m.right) / m.texel
+                y = wp.dot(p, m.up) / m.texel
+                rt = reach_i / m.texel
+                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
+                    for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
+                        from_sun = (
+                            m.corner
+                            + m.right * (float(px) * m.texel)
+                            + m.up * (float(py) * m.texel)
+                            + m.sun * SUN_HEIGHT
+                        )
+                        t = FAR
+                        if kind == TRIANGLE:
+                            t = hit_triangle(xyz(a4) - from_sun, xyz(b4) - from_sun, xyz(c4) - from_sun, -m.sun)
+                        else:
+                            eye = wp.quat_rotate_inv(as_quat(b4), from_sun - xyz(a4))
+                            if kind == BOX:
+                                t = hit_box(eye, ray, half)
+                            else:
+                                t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
+                        if t < FAR:
+                            darken(m, px, py, t, depth_out)
+
+
+@wp.func
+def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.array(dtype=wp.vec2), taps: int) -> float:
+    """Share of the sun's disc seen from ``p``; -1 outside the map. Soft by the distance of what stands between."""
+    facing = wp.abs(wp.dot(n, m.sun))
+    e = p + n * (m.texel * (1.0 + 1.6 * (1.0 - facing))) - m.corner
+    x = wp.dot(e, m.right) / m.texel + 0.5
+    y = wp.dot(e, m.up) / m.texel + 0.5
+    lit = float(-1.0)
+    if x > 8.0 and y > 8.0 and x < float(m.side) - 9.0 and y < float(m.side) - 9.0:
+        z = (
+            SUN_HEIGHT
+            - wp.dot(e, m.sun)
+            - m.texel * (0.4 + 0.7 * wp.sqrt(1.0 - facing * facing) / wp.max(facing, 0.12))
+        )
+        gap = z - m.depth[int(y) * m.side + int(x)]
+        spread = float(1.6)
+        if gap > 0.0:
+            spread = wp.clamp(SUN_RADIUS * gap / m.texel, 1.0, 6.0)
+        z -= spread * m.texel * 0.3
+        if taps <= 0:  # a box of two texels, or of four where what casts the shadow is far; smooth without noise
+            i = int(x)
+            j = int(y)
+            a = x - float(i)
+            b = y - float(j)
+            half = wp.int32(1)
+            if taps == 0:
+                for k in range(4):
+                    at = (j + (k & 1) * 4 - 2) * m.side + i + (k & 2) * 2 - 2
+                    gap = wp.max(gap, z - m.depth[at])
+                if SUN_RADIUS * gap > 1.5 * m.texel:
+                    half = 2
+            lit = float(0.0)
+            for row in range(-half, half + 1):
+                at = (j + row) * m.side + i
+                line = float(0.0)
+                if m.depth[at - half] > z:
+                    line += 1.0 - a
+                if m.depth[at + half] > z:
+                    line += a
+                for column in range(1 - half, half):
+                    if m.depth[at + column] > z:
+                        line += 1.0
+                lit += line * wp.where(row == -half, 1.0 - b, wp.where(row == half, b, 1.0))
+            lit = lit * 0.25 / float(half * half)
+        else:
+            lit = wp.where(gap > 0.0, 0.0, 1.0)
+            for k in range(taps):
+                v = spiral[k] * spread
+                row = int(y + v[0] * turn[1] + v[1] * turn[0])
+                if m.depth[row * m.side + int(x + v[0] * turn[0] - v[1] * turn[1])] > z:
+                    lit += 1.0
+            lit = lit / (float(taps) + 1.0)
+    return lit

@@ -1,0 +1,1 @@
+"""What crosses the network, byte by byte."""

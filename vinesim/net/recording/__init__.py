@@ -1,0 +1,1 @@
+"""Recordings of what crossed the network, as MCAP files."""

@@ -1,0 +1,124 @@
+"""Another actor between two of its messages: dead reckoning of its pose, and the hiding of corrections."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.net.codec.messages import Hello, MessageError
+from vinesim.net.replication import dead_reckoning
+from vinesim.net.replication.jitter_buffer import Buffer
+from vinesim.net.transport.bus import Subscription
+from vinesim.scene.values import POINTS, HumanUpdate, RobotUpdate
+
+ELSEWHERE = 1.0
+"""Who is this far [m] from where he was taken to be has been put there: it is shown at once, not blended."""
+
+FAR_SHOWN = 0.1
+"""Of who is far away nothing is heard for 200 ms: what is shown of him is computed anew only so often [s]."""
+
+_BASE = np.arange(3, 7)[None]
+_HIPS = slice(7 * POINTS.index("hips"), 7 * POINTS.index("hips") + 3)
+_TURNS = 7 * np.arange(len(POINTS))[:, None] + _BASE
+
+
+class Actor:
+    """Another actor and the last that is known of its pose."""
+
+    def __init__(self, hello: Hello, buffer: float = 0.0) -> None:
+        """``buffer`` [s]: its poses are shown so much later, see :class:`Buffer`; 0 extrapolates them to now."""
+        self.hello = hello
+        self._buffer = Buffer(buffer)
+        self.joints = hello.joints
+        self.update: RobotUpdate | HumanUpdate | None = None
+        self.near: Subscription | None = None
+        self.moved_at = -1e9
+        self._turns = _TURNS if hello.kind == "human" else _BASE
+        """Where in the numbers of a pose its quaternions are [k, 4]."""
+        self._place = _HIPS if hello.kind == "human" else slice(3)
+        """Where the place is by which one sees that it was put elsewhere."""
+        self._state = self._rate = self._off = np.zeros(0)
+        self._seen: RobotUpdate | HumanUpdate | None = None
+
+    def hear(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
+        """Take a newer pose at network ``time``; False if it is not newer."""
+        if (self.hello.kind == "human") != isinstance(update, HumanUpdate):
+            raise MessageError(f"pose of a {type(update).__name__} by {update.actor!r}, which is a {self.hello.kind}")
+        if update.time > time + dead_reckoning.FUTURE:
+            update = dataclasses.replace(update, time=time + dead_reckoning.FUTURE)
+        if self.update is not None and update.time <= self.update.time:
+            return False
+        if isinstance(update, RobotUpdate):
+            if self.joints < 0:
+                self.joints = len(update.position)
+            if len(update.position) != self.joints:
+                raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
+        shown = None if self.update is None else self._shown(time)
+        self.update, self._seen = update, None
+        self._state, self._rate = _numbers(update)
+        self._off = np.zeros(0)
+        if self._buffer.delay > 0.0:
+            self._keep(update.time)
+        elif shown is not None:
+            here = self._shown(time)
+            turn = shown[self._turns]
+            shown[self._turns] = np.copysign(1.0, (turn * here[self._turns]).sum(1, keepdims=True)) * turn
+            if float(np.linalg.norm((shown - here)[self._place])) < ELSEWHERE:
+                self._off = shown - here
+            self.moved_at = time
+        return True
+
+    def at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
+        """The pose at network ``time``, to be shown ``now``; of an actor that is not near, at most 100 ms old."""
+        if self._seen is None or self.near is not None or not 0.0 <= now - self._seen.time < FAR_SHOWN:
+            self._seen = self._at(time, now)
+        return self._seen
+
+    def _at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
+        heard, shown = self.update, self._shown(time)
+        assert heard is not None
+        going = 1.0 if time - heard.time <= dead_reckoning.EXTRAPOLATION else 0.0
+        turn = shown[self._turns]
+        shown[self._turns] = turn / np.sqrt((turn * turn).sum(1, keepdims=True))
+        if self._buffer.delay > 0.0 and isinstance(heard, RobotUpdate):
+            rate = self._buffer.rate(time)
+            twist = np.concatenate([rate[:3], heard.base_qd[3:]])
+            return RobotUpdate(heard.actor, now, shown[:7], twist, shown[7:], rate[7:])
+        if isinstance(heard, HumanUpdate):
+            return HumanUpdate(heard.actor, now, heard.pose.at(shown.reshape(-1, 7)), heard.velocity * going)
+        return dataclasses.replace(
+            heard, time=now, base_q=shown[:7], base_qd=heard.base_qd * going, position=shown[7:],
+            velocity=heard.velocity * going,
+        )  # fmt: skip
+
+    def _keep(self, time: float) -> None:
+        """One more sample for the buffer, its quaternions on the side of those before."""
+        if self._buffer.states:
+            before, turns = self._buffer.states[-1], self._turns
+            side = np.copysign(1.0, (before[turns] * self._state[turns]).sum(1, keepdims=True))
+            self._state[turns] *= side
+            self._rate[turns] *= side
+        self._buffer = self._buffer.heard(time, self._state, self._rate)
+
+    def _shown(self, time: float) -> np.ndarray:
+        assert self.update is not None
+        if self._buffer.delay > 0.0:
+            return self._buffer.shown(time).copy()
+        shown = self._state + self._rate * dead_reckoning.horizon(time - self.update.time)
+        if len(self._off):
+            shown += self._off * dead_reckoning.remaining(time - self.moved_at)
+        return shown
+
+
+def _numbers(update: RobotUpdate | HumanUpdate) -> tuple[np.ndarray, np.ndarray]:
+    """A pose as flat numbers, and their rates."""
+    if isinstance(update, HumanUpdate):
+        points = update.pose.points
+        rate = np.concatenate([update.velocity[:, :3], dead_reckoning.spin(points[:, 3:], update.velocity[:, 3:])], 1)
+        return points.ravel(), rate.ravel()
+    spin = dead_reckoning.spin(update.base_q[3:], update.base_qd[3:])
+    return (
+        np.concatenate([update.base_q, update.position]),
+        np.concatenate([update.base_qd[:3], spin, update.velocity]),
+    )

@@ -1,0 +1,1 @@
+"""The server: admission, retained state on disk, clock. It simulates nothing."""

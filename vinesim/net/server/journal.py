@@ -1,0 +1,220 @@
+"""Facts on disk: one journal a world, to which every fact is appended when it is heard.
+
+A journal starts with ``vsfacts`` and a version, then come records: length, CRC-32, bytes. The first record is the
+world's head (msgpack: its name, its scene), every other one a cell and a FACTS message. What holds no more is left out
+when the journal is written anew, beside the old one, which is then replaced at once. So a process may die at any byte:
+what was appended before is there, and at most the last record is torn.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pathlib
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import BinaryIO, Self
+
+import msgspec
+
+from vinesim.net.codec import messages
+from vinesim.net.codec.messages import Fact, MessageError
+from vinesim.net.replication.interest import Cell
+from vinesim.net.replication.retained import Facts
+from vinesim.net.server.admission import Plan
+from vinesim.net.transport.bus import BusError
+
+log = logging.getLogger(__name__)
+
+MAGIC = b"vsfacts"
+VERSION = 1
+SUFFIX = ".facts"
+
+SLACK = 1000
+"""So many records, and three for each fact that holds, may be outdated before a journal is written anew."""
+
+_RECORD = struct.Struct("<II")  # length, CRC-32
+_CELL = struct.Struct("<ii")
+
+
+class NotKept(BusError):
+    """What is on disk cannot be used, or nothing can be written there; the text says which file and what to do."""
+
+
+class _Head(msgspec.Struct, frozen=True):
+    world: str
+    scene: str
+    digest: str
+    protocol: int = messages.PROTOCOL
+
+
+class Journal:
+    """The facts of one world, in memory and on disk. A context manager; used by one thread."""
+
+    def __init__(self, path: pathlib.Path, world: str, plan: Plan, facts: Facts) -> None:
+        self.path, self.world, self.plan, self.facts = path, world, plan, facts
+        self._file: BinaryIO | None = None
+        self._records = 0
+        self.rewrite()
+
+    @classmethod
+    def load(cls, path: pathlib.Path) -> Self:
+        """What a journal holds. A torn one is mended, and kept as it was under another name.
+
+        :class:`NotKept` if it is no journal, or one of another version: then it stays untouched.
+        """
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise NotKept(f"{path}: cannot be read ({error.strerror}): mend that, or give another --keep") from error
+        start = MAGIC + bytes((VERSION,))
+        if not content.startswith(MAGIC):
+            raise NotKept(f"{path}: is no journal of facts: move it away, or give another --keep")
+        if not content.startswith(start):
+            raise NotKept(
+                f"{path}: journal of version {content[len(MAGIC) : len(start)].hex() or 'none'}, this release reads "
+                f"{VERSION:02x}: use the release that wrote it, or give another --keep"
+            )
+        head: _Head | None = None
+        facts = Facts()
+        sound = len(start)
+        why = "its head is torn"
+        try:
+            for record, end in _records(content, len(start)):
+                if head is None:
+                    head = _head_decoder.decode(record)
+                    if head.protocol != messages.PROTOCOL:
+                        raise NotKept(
+                            f"{path}: facts of protocol version {head.protocol}, this release speaks "
+                            f"{messages.PROTOCOL}: use the release that wrote them, or give another --keep"
+                        )
+                else:
+                    for fact in messages.decode_facts(record[_CELL.size :]):
+                        facts.add(_CELL.unpack_from(record), fact)
+                sound = end
+        except (msgspec.DecodeError, MessageError, struct.error) as error:
+            why = str(error)
+        if head is None:
+            raise NotKept(f"{path}: {why}, so nobody knows whose facts these are: move it away, or give another --keep")
+        if sound < len(content):
+            aside = _free_name(path)
+            _write(aside, content)
+            log.warning(
+                "%s: torn after %d of %d bytes; %d facts before that hold, the file as it was is kept as %s",
+                path, sound, len(content), len(facts), aside.name,
+            )  # fmt: skip
+        return cls(path, head.world, Plan(head.scene, head.digest), facts)
+
+    def append(self, cell: Cell, fact: Fact) -> None:
+        """Write a fact down that :attr:`facts` has taken in. Safe against the end of this process at once."""
+        assert self._file is not None
+        try:
+            self._file.write(_packed(_CELL.pack(*cell) + messages.encode_facts([fact])))
+            self._file.flush()
+        except OSError as error:
+            raise _cannot_write(self.path, error) from error
+        self._records += 1
+
+    def settle(self) -> None:
+        """Make what was appended safe against the end of the machine; leave out what holds no more."""
+        try:
+            if self._records > SLACK + 4 * len(self.facts):
+                self.rewrite()
+            elif self._file is not None:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            raise _cannot_write(self.path, error) from error
+
+    def rewrite(self) -> None:
+        """Write all anew, beside the old file, then put it in its place."""
+        head = _encoder.encode(_Head(self.world, *self.plan))
+        parts = [MAGIC + bytes((VERSION,)), _packed(head)]
+        parts += [_packed(_CELL.pack(*cell) + messages.encode_facts([fact])) for cell, fact in self.facts]
+        try:
+            _write(self.path, b"".join(parts))
+            if self._file is not None:
+                self._file.close()
+            self._file = self.path.open("ab")
+        except OSError as error:
+            raise _cannot_write(self.path, error) from error
+        self._records = len(self.facts)
+
+    def close(self) -> None:
+        """Settle and give the file up."""
+        if self._file is not None:
+            try:
+                self.settle()
+            finally:
+                self._file.close()
+                self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def load_all(folder: pathlib.Path) -> dict[str, Journal]:
+    """The journals of a folder by their worlds; the folder is made if it is not there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for rest in folder.glob(f"*{SUFFIX}.part"):
+            rest.unlink()  # half of a journal written anew: the old one is still there
+    except OSError as error:
+        raise _cannot_write(folder, error) from error
+    journals: dict[str, Journal] = {}
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        journal = Journal.load(path)
+        if path.name != f"{journal.world}{SUFFIX}":
+            raise NotKept(
+                f"{path}: holds world {journal.world!r}: rename it to {journal.world}{SUFFIX} or move it away"
+            )
+        journals[journal.world] = journal
+    return journals
+
+
+def _records(content: bytes, at: int) -> Iterator[tuple[bytes, int]]:
+    """Sound records and where each ends, up to the first that is not."""
+    while at + _RECORD.size <= len(content):
+        length, crc = _RECORD.unpack_from(content, at)
+        record = content[at + _RECORD.size : at + _RECORD.size + length]
+        if len(record) < length or zlib.crc32(record) != crc:
+            return
+        at += _RECORD.size + length
+        yield record, at
+
+
+def _packed(record: bytes) -> bytes:
+    return _RECORD.pack(len(record), zlib.crc32(record)) + record
+
+
+def _write(path: pathlib.Path, content: bytes) -> None:
+    """All of it or nothing, whatever happens meanwhile."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _free_name(path: pathlib.Path) -> pathlib.Path:
+    number = 1
+    while (aside := path.with_name(f"{path.name}.torn-{number}")).exists():
+        number += 1
+    return aside
+
+
+def _cannot_write(path: pathlib.Path, error: OSError) -> NotKept:
+    return NotKept(f"{path}: cannot be written ({error.strerror}): make room or give another --keep")
+
+
+_encoder = msgspec.msgpack.Encoder()
+_head_decoder = msgspec.msgpack.Decoder(_Head)

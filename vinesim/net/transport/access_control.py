@@ -1,0 +1,117 @@
+"""Who may say what where links are secured: denied is what is not allowed by name.
+
+Every actor has a certificate whose common name is the actor's. Under it an actor hears its whole world, asks, and
+writes only under keys that end with its own name. A spectator only says that it is there, who it is and where its eyes
+are (or nobody would know that somebody looks); about the world it says nothing.
+The settings are Zenoh's; rules are applied by the router, so it is there that a foreign key ends.
+"""
+
+from __future__ import annotations
+
+import enum
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from vinesim.net.transport.bus import BusError
+
+SERVER = "server"
+"""Common name of all servers: they carry for everybody, so nothing is denied between them."""
+
+AUTHORITY = "ca"
+"""Common name of whoever signs, and the file of its certificate."""
+
+
+class Role(enum.StrEnum):
+    """What a certificate is for."""
+
+    ROBOT = "robot"
+    HUMAN = "human"
+    SPECTATOR = "spectator"
+    SERVER = "server"
+
+
+class NoCertificate(BusError):
+    """A certificate or key is missing or unusable; the text says which."""
+
+
+FAMILIES = ("c", "own", "fact", "voice")
+"""First chunks of keys ``FAMILY/<cx>/<cy>/<actor>``."""
+
+_EVERYTHING = [
+    "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply",
+    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
+]  # fmt: skip
+
+
+def secured(folder: pathlib.Path, name: str) -> dict[str, Any]:
+    """Settings of a session that shows the certificate of ``name`` and believes only what ``folder/ca.pem`` signed."""
+    authority, certificate, key = (folder / file for file in (f"{AUTHORITY}.pem", f"{name}.pem", f"{name}.key"))
+    for file in (authority, certificate, key):
+        if not file.is_file():
+            raise NoCertificate(
+                f"no {file}: make it with 'vinesim certs new {name} --dir {folder}' where the authority's key is, "
+                f"and copy {authority.name}, {certificate.name} and {key.name} here"
+            )
+    return {
+        "transport__link__tls": {
+            "root_ca_certificate": str(authority),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "listen_private_key": str(key),
+            "listen_certificate": str(certificate),
+            "connect_private_key": str(key),
+            "connect_certificate": str(certificate),
+        }
+    }
+
+
+def control(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
+    """Access control of a router for one world under ``root`` (like ``vs/1/vineyard``); all others do not exist."""
+    rules: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+
+    def rule(name: str, flow: str, messages: list[str], *keys: str) -> str:
+        rules.append(
+            {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": list(keys)}
+        )
+        return name
+
+    world = f"{root}/**"
+    hears = [
+        rule("hear", "egress", ["put", "delete", "reply", "liveliness_token"], world),
+        rule("listen", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world),
+        rule("ask", "ingress", ["query"], f"{root}/hello/*", f"{root}/clock", f"{root}/snap/*/*"),
+        rule("be asked", "egress", ["query"], f"{root}/hello/*"),
+        # a publisher's matching: it learns who listens, or it would never send
+        rule("see questions answered", "egress", ["declare_queryable"], world),
+        rule("see listeners", "egress", ["declare_subscriber"], world),
+    ]
+    for name, role in sorted(actors.items()):
+        if role == Role.SERVER:
+            continue
+        about_itself = (f"{root}/live/{name}/*", f"{root}/hello/{name}")
+        own = [
+            rule(
+                f"{name} is there", "ingress", ["liveliness_token", "declare_queryable", "reply"], *about_itself
+            ),
+            rule(f"{name} asks to be let in", "ingress", ["query"], f"{root}/join/{name}/*"),
+        ]  # fmt: skip
+        written = (f"{root}/a/{name}", f"{root}/a/{name}/far")
+        if role != Role.SPECTATOR:
+            written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))
+        own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *written))
+        policies.append({"rules": hears + own, "subjects": [name]})
+    everything = [rule(f"servers {flow}", flow, _EVERYTHING, "**") for flow in ("ingress", "egress")]
+    policies.append({"rules": everything, "subjects": [SERVER]})
+    subjects = [{"id": name, "cert_common_names": [name]} for name in sorted({*actors, SERVER})]
+    subjects = [subject for subject in subjects if actors.get(subject["id"]) != Role.SERVER or subject["id"] == SERVER]
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": rules,
+            "subjects": subjects,
+            "policies": policies,
+        }
+    }

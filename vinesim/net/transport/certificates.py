@@ -1,0 +1,214 @@
+"""Certificates for secured links: one authority a folder, one certificate an actor, made where the authority's key is.
+
+``ca.pem`` and ``ca.key`` are the authority, ``server.pem`` and ``server.key`` the server; ``NAME.pem`` and ``NAME.key``
+belong to an actor, who needs only those two and ``ca.pem``. An actor's role is its certificate's organisational unit.
+Keys are elliptic (P-256), readable only by their owner.
+"""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import os
+import pathlib
+import socket
+from collections.abc import Sequence
+
+from vinesim.net.codec.messages import valid_name
+from vinesim.net.transport.access_control import AUTHORITY, SERVER, NoCertificate, Role
+from vinesim.net.transport.bus import WrongUse
+
+try:
+    from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+except ImportError as error:
+    _missing: ImportError | None = error
+else:
+    _missing = None
+
+YEARS_OF_AUTHORITY = 10
+DAYS = 825
+"""How long an actor's or server's certificate is valid."""
+
+
+class NotInstalled(RuntimeError):
+    """The library that makes certificates is not there."""
+
+    exit_code = 3
+
+    def __init__(self) -> None:
+        super().__init__("certificates need the library cryptography: pip install 'vinesim[tls]'")
+
+
+def new(
+    folder: pathlib.Path, name: str, role: Role = Role.ROBOT, hosts: Sequence[str] = (), days: int = DAYS
+) -> list[pathlib.Path]:
+    """Make the certificate of an actor, and at first use the authority and the server; what was written.
+
+    For ``server`` itself ``hosts`` are the names and addresses under which clients reach it, besides this machine's
+    own; its certificate is replaced. An actor that has one is refused with :class:`NoCertificate`.
+    """
+    if _missing is not None:
+        raise NotInstalled from _missing
+    if not valid_name(name) or name == AUTHORITY:
+        raise WrongUse(f"actor name {name!r}: use 1 to 48 letters, digits, '_', '-' or '.', and not {AUTHORITY!r}")
+    if (name == SERVER) != (role == Role.SERVER):
+        raise WrongUse(f"{name!r} as {role}: only the server is called {SERVER!r}")
+    if hosts and role != Role.SERVER:
+        raise WrongUse(f"hosts {', '.join(hosts)} for {name!r}: only the server's certificate names hosts")
+    if name != SERVER and (folder / f"{name}.pem").exists():
+        raise NoCertificate(f"{folder / name}.pem is there already: remove it and its key first, if that is meant")
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        written = [] if (folder / f"{AUTHORITY}.key").exists() else _new_authority(folder)
+        if name != SERVER and not (folder / f"{SERVER}.pem").exists():
+            written += _signed(folder, SERVER, Role.SERVER, (), days)
+        return written + _signed(folder, name, role, hosts, days)
+    except OSError as error:
+        raise NoCertificate(f"{error.filename}: {error.strerror}: the certificate cannot be made there") from error
+
+
+def roles(folder: pathlib.Path) -> dict[str, Role]:
+    """Who has a certificate of this folder's authority, and what for; others in the folder are refused in words."""
+    if _missing is not None:
+        raise NotInstalled from _missing
+    authority = _read(folder / f"{AUTHORITY}.pem")
+    found: dict[str, Role] = {}
+    for file in sorted(folder.glob("*.pem")):
+        if file.stem == AUTHORITY:
+            continue
+        certificate = _read(file)
+        try:
+            certificate.verify_directly_issued_by(authority)
+            name, role = _text(certificate, NameOID.COMMON_NAME), Role(
+                _text(certificate, NameOID.ORGANIZATIONAL_UNIT_NAME)
+            )  # fmt: skip
+        except (InvalidSignature, ValueError, TypeError) as error:
+            raise NoCertificate(
+                f"{file}: not signed by {AUTHORITY}.pem beside it, or without a role: remove it, or make it anew with "
+                f"'vinesim certs new {file.stem} --dir {folder}'"
+            ) from error
+        if name != file.stem:
+            raise NoCertificate(f"{file}: is the certificate of {name!r}: rename it to {name}.pem")
+        if role == Role.SERVER:
+            now = datetime.datetime.now(datetime.UTC)
+            first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+            if not first <= now <= last:
+                raise NoCertificate(
+                    f"{file}: not valid now, but from {first:%Y-%m-%d} to {last:%Y-%m-%d}: make it anew with "
+                    f"'vinesim certs new {name} --dir {folder} --host HOST'"
+                )
+        found[name] = role
+    return found
+
+
+def _new_authority(folder: pathlib.Path) -> list[pathlib.Path]:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "vinesim authority")])
+    usage = x509.KeyUsage(
+        key_cert_sign=True, crl_sign=True, digital_signature=False, content_commitment=False, key_encipherment=False,
+        data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
+    )  # fmt: skip
+    certificate = (
+        _builder(name, name, key.public_key(), 365 * YEARS_OF_AUTHORITY)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    return _save(folder, AUTHORITY, key, certificate)
+
+
+def _signed(folder: pathlib.Path, name: str, role: Role, hosts: Sequence[str], days: int) -> list[pathlib.Path]:
+    """A key and the certificate for it, signed by the folder's authority."""
+    authority = _read(folder / f"{AUTHORITY}.pem")
+    try:
+        signer = serialization.load_pem_private_key((folder / f"{AUTHORITY}.key").read_bytes(), None)
+    except ValueError as error:
+        raise NoCertificate(f"{folder / AUTHORITY}.key is no private key: restore it, or begin a new folder") from error
+    assert isinstance(signer, ec.EllipticCurvePrivateKey)
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name(
+        [
+            x509.NameAttribute(NameOID.COMMON_NAME, name),
+            x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role.value),
+        ]
+    )
+    names = dict.fromkeys(
+        [*hosts, "localhost", "127.0.0.1", "::1", socket.gethostname()] if role == Role.SERVER else [name]
+    )
+    certificate = (
+        _builder(subject, authority.subject, key.public_key(), days)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.SubjectAlternativeName([_host(one) for one in names]), critical=False)
+        # a server is also a client: of the router it is linked to
+        .add_extension(
+            x509.ExtendedKeyUsage(
+                [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * (role == Role.SERVER)
+            ),
+            critical=False,
+        )
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
+        .sign(signer, hashes.SHA256())
+    )
+    return _save(folder, name, key, certificate)
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
+) -> x509.CertificateBuilder:
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=2))  # clocks of machines differ
+        .not_valid_after(now + datetime.timedelta(days=days))
+    )
+
+
+def _host(text: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(text.strip("[]")))
+    except ValueError:
+        return x509.DNSName(text)
+
+
+def _save(
+    folder: pathlib.Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate
+) -> list[pathlib.Path]:
+    secret = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    public = certificate.public_bytes(serialization.Encoding.PEM)
+    files = []
+    for suffix, content, mode in ((".key", secret, 0o600), (".pem", public, 0o644)):
+        path = folder / f"{name}{suffix}"
+        part = folder / f"{name}{suffix}.part"
+        part.unlink(missing_ok=True)
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(content)
+        part.replace(path)
+        files.append(path)
+    return files
+
+
+def _read(file: pathlib.Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(file.read_bytes())
+    except FileNotFoundError as error:
+        raise NoCertificate(
+            f"no {file}: make certificates with 'vinesim certs new server --dir {file.parent} --host HOST'"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise NoCertificate(f"{file}: cannot be read as a certificate ({error}): remove it or make it anew") from error
+
+
+def _text(certificate: x509.Certificate, what: x509.ObjectIdentifier) -> str:
+    (attribute,) = certificate.subject.get_attributes_for_oid(what)
+    return str(attribute.value)

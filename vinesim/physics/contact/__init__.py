@@ -1,0 +1,1 @@
+"""Contacts: detection and the shared solve of plants and rigid bodies."""

@@ -1,0 +1,89 @@
+"""How finely bunches move: berries in clusters where somebody is near or looks closely, one compound each elsewhere.
+
+Switching changes no pose and no momentum (:meth:`Plants.refine`, :meth:`Plants.coarsen`), so it may happen in any tick.
+Refining is never late: it happens in the tick in which somebody's box reaches into the tree's. Coarsening waits until
+everybody is gone for a while and the clusters have come to rest against their bunch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.physics.plants.articulation_solver import Plants
+
+LINGER = 100
+"""[tick] A tree stays fine for so long after the last one has gone."""
+QUIET = 0.05
+"""[rad/s] Clusters are at rest while all of a tree's turn slower than this against what they hang on."""
+PATIENCE = 25
+"""[tick] So long must they be at rest: longer than the turning point of any swing of theirs."""
+
+
+class Detail:
+    """Refines the trees that somebody is near or watches, and coarsens them when that is over."""
+
+    def __init__(self, plants: Plants, *, linger: int = LINGER, quiet: float = QUIET, patience: int = PATIENCE) -> None:
+        self.plants, self.linger, self.quiet, self.patience = plants, linger, quiet, patience
+        model = plants.model
+        trees = len(model.tree_first)
+        self._clustered = np.flatnonzero(model.bunch_clusters > 0)
+        self._bodies = model.bunch_body[self._clustered]
+        self._tree = model.body_tree[self._bodies]
+        self._alone, self._still = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
+        self._wanted = np.zeros(trees, bool)
+        self._points, self._radius = np.zeros((0, 3)), 0.0
+        self._attached = -1
+        self._worth = np.zeros(trees, bool)
+
+    def watch(self, points: np.ndarray, radius: float) -> None:
+        """Look closely at what hangs within ``radius`` [m] of ``points`` [n, 3], until told otherwise; none: stop."""
+        self._points, self._radius = np.asarray(points, float).reshape(-1, 3), float(radius)
+
+    @property
+    def fine(self) -> np.ndarray:
+        """The trees whose clusters move, sorted [k]."""
+        return np.flatnonzero(self.plants.state.tree_fine)
+
+    def update(self, near: np.ndarray) -> None:
+        """Before ``free()``: ``near`` [k] are the awake trees that somebody reaches into."""
+        plants, state = self.plants, self.plants.state
+        attached = int(np.count_nonzero(state.bunch_attached))
+        if attached != self._attached:  # a tree whose bunches are gone has nothing to refine
+            self._attached = attached
+            self._worth[:] = False
+            self._worth[self._tree[state.bunch_attached[self._clustered]]] = True
+        wanted = near[self._worth[near]]
+        if len(self._points):
+            seen = self._seen()
+            wanted = np.union1d(wanted, seen) if len(seen) else wanted
+        fine = self.fine
+        if len(fine):
+            self._wanted[wanted] = True
+            self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)
+            self._wanted[wanted] = False
+            self._still[fine] = np.where(self._rate(fine) < self.quiet, self._still[fine] + 1, 0)
+            done = fine[(self._alone[fine] > self.linger) & (self._still[fine] >= self.patience)]
+            if len(done):
+                plants.coarsen(done)
+        fresh = wanted[~state.tree_fine[wanted]]
+        if len(fresh):
+            self._alone[fresh] = self._still[fresh] = 0
+            plants.refine(fresh)
+
+    def _seen(self) -> np.ndarray:
+        """Awake trees [k] with a bunch near a watched point; poses are those of the last tick's start."""
+        state = self.plants.state
+        here = np.flatnonzero(state.tree_awake[self._tree] & state.bunch_attached[self._clustered])
+        apart = state.body_q[self._bodies[here], None, :3] - self._points
+        close = ((apart * apart).sum(-1) < self._radius * self._radius).any(1)
+        return np.unique(self._tree[here[close]])
+
+    def _rate(self, trees: np.ndarray) -> np.ndarray:
+        """The fastest cluster of each tree [k] rad/s, against what it hangs on."""
+        model = self.plants.model
+        core = model.tree_core[trees]
+        count = model.tree_size[trees] - core
+        start = np.cumsum(count) - count
+        clusters = np.repeat(model.tree_first[trees] + core - start, count) + np.arange(count.sum())
+        rate = self.plants.state.joint_qd[clusters]
+        return np.sqrt(np.maximum.reduceat((rate * rate).sum(1), start))

@@ -1,0 +1,1 @@
+"""Rigid bodies in MuJoCo: static world, robots, people, boxes and picked bunches."""

@@ -1,0 +1,108 @@
+"""Bunches that lie where nobody is near: known and drawn, and without a body until somebody comes.
+
+Whoever joins late learns of a thousand bunches at once that others have picked. A body for each would cost milliseconds
+to make and something in every tick; a row here costs nothing until :meth:`Lying.embody` makes it a body.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.detachment import STUB
+from vinesim.physics.rigid.free_bunch import Loose
+from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.support_tracking import Riding
+from vinesim.scene.ids import Organ
+from vinesim.scene.values import Link
+
+NEAR = 2.5
+"""[m] A bunch gets its body when an actor is so near on the ground plan: seconds before an arm reaches it."""
+
+
+class Lying:
+    """Picked bunches without bodies, each at a pose in the frame of its parent."""
+
+    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching, riding: Riding) -> None:
+        self.plants, self.rigid, self.touching, self.riding = plants, rigid, touching, riding
+        self._loose: dict[int, Loose] = {}
+        self._parent: dict[int, str] = {}
+        self._relative: dict[int, np.ndarray] = {}
+        self._links: tuple[Link, ...] | None = ()
+        self._groups: list[tuple[str, np.ndarray, np.ndarray]] = []
+        shapes = touching.shapes
+        fruit = np.flatnonzero((plants.model.body_organ[shapes.body] == int(Organ.BUNCH)) & (shapes.when != 2))
+        self._shape = fruit[np.argsort(shapes.bunch[fruit], kind="stable")]
+        self._first = np.searchsorted(shapes.bunch[self._shape], np.arange(len(plants.model.bunch_body) + 1))
+
+    def __contains__(self, bunch: int) -> bool:
+        return bunch in self._loose
+
+    def __len__(self) -> int:
+        return len(self._loose)
+
+    def lay(self, bunches: list[int], parents: list[str], poses: np.ndarray) -> None:
+        """Take bunches off their vines at once, wherever those are, and let them lie: ``poses`` [k, 7] in the frames
+        of their parents. What lies already is moved.
+        """
+        plants, model = self.plants, self.plants.model
+        new = [bunch for bunch in bunches if bunch not in self._loose]
+        if new:
+            bodies = model.bunch_body[new]
+            plants.coarsen(np.unique(model.body_tree[bodies]))
+            columns = (plants.body_mass, plants.body_com, plants.body_inertia, plants.body_product)
+            rows = zip(new, *(column[bodies].astype(float) for column in columns), strict=True)
+            shapes = self.touching.shapes
+            for bunch, mass, com, inertia, product in rows:
+                of = self._shape[self._first[bunch] : self._first[bunch + 1]]
+                start, end, radius = (column[of].astype(float) for column in (shapes.start, shapes.end, shapes.radius))
+                self._loose[bunch] = Loose(float(mass), com, inertia, product, start, end, radius)
+            plants.state.bunch_attached[new] = False
+            plants.body_drag[bodies] = 0.0
+            for body in bodies.tolist():
+                plants.reweigh(body, STUB)
+        for bunch, parent, pose in zip(bunches, parents, poses, strict=True):
+            self._parent[bunch], self._relative[bunch] = parent, np.asarray(pose, float)
+        self._links = None
+
+    def embody(self, bunches: list[int]) -> None:
+        """Give some bunches their bodies, where they lie."""
+        if bunches:
+            there = {bunch: self._where(bunch) for bunch in bunches}
+            self.rigid.add_bunches({bunch: (self._loose.pop(bunch), *there[bunch]) for bunch in bunches})
+            for bunch in bunches:
+                del self._parent[bunch], self._relative[bunch]
+            self._links = None
+
+    def _where(self, bunch: int) -> tuple[np.ndarray, np.ndarray]:
+        there = self.riding.where(self._parent[bunch], self._relative[bunch])
+        return (self._relative[bunch], np.zeros(6)) if there is None else there
+
+    def nearest(self, actors: np.ndarray, most: int) -> list[int]:
+        """At most so many bunches, nearest to one of some actors [k, 3] m, that are near enough to want a body."""
+        if not self._loose or not len(actors):
+            return []
+        away = np.linalg.norm(self.link_q()[:, None, :2] - actors[None, :, :2], axis=-1).min(1)
+        links = self.links()
+        return [links[i].index for i in np.argsort(away, kind="stable")[:most].tolist() if away[i] < NEAR]
+
+    def links(self) -> tuple[Link, ...]:
+        """As :meth:`Rigid.links`."""
+        if self._links is None:
+            order = sorted(self._loose)
+            self._links = tuple(Link(f"bunch/{i}", Organ.BUNCH, i, self._loose[i].shapes) for i in order)
+            parents = np.array([self._parent[i] for i in order])
+            poses = np.array([self._relative[i] for i in order]).reshape(-1, 7)
+            here = [(str(parent), np.flatnonzero(parents == parent)) for parent in np.unique(parents)]
+            self._groups = [(parent, rows, poses[rows]) for parent, rows in here]
+        return self._links
+
+    def link_q(self) -> np.ndarray:
+        """Poses [link, 7] of :meth:`links`."""
+        pose = np.zeros((len(self.links()), 7))
+        for parent, rows, relative in self._groups:
+            frame = self.riding.frame(parent)
+            pose[rows] = relative if frame is None else frames.compose(frame[0], relative)
+        return pose

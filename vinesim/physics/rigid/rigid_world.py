@@ -1,0 +1,706 @@
+"""Everything rigid, in one MuJoCo world: ground, poles and trunks, picking boxes, robots, people.
+
+A tick is split in two, with the shared contact solve of :mod:`vinesim.physics.contact.contact_solver` between the halves:
+:meth:`Rigid.prep` predicts the velocity at the end of the tick as if no plant were there, :meth:`Rigid.inverse`
+says how an impulse changes that prediction, and :meth:`Rigid.finish` integrates with the contact forces known.
+
+MuJoCo's integrator ``discrete`` is implicit in joint damping and in the servos: the metric of the tick is
+M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where its servos give 40 N.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.contact import collision_geoms
+from vinesim.physics.contact.effective_mass import Metric
+from vinesim.physics.rigid import free_bunch, hand_wrenches, recompile, static_world
+from vinesim.physics.rigid.free_bunch import Loose
+from vinesim.physics.rigid.human_body import HAND, LIMBS, PARTS, Hand, HumanError, Person, rouse
+from vinesim.physics.rigid.robot_body import GIVE, Felt, RobotBody, unfit
+from vinesim.physics.rigid.urdf import RobotError
+from vinesim.scene import appearance
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import HandSample, HumanPose, HumanSpec, Link, RobotSpec
+
+_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+
+
+@dataclasses.dataclass(frozen=True)
+class Draft:
+    """A world that is compiled and in which nothing has happened yet."""
+
+    robots: tuple[RobotBody, ...]
+    people: tuple[Person, ...]
+    slots: int
+    """How many loose bunches have room in it."""
+    world: mujoco.MjModel
+
+
+class Rigid:
+    """Robots, boxes and what stands, in one MuJoCo world that is compiled anew when an actor comes or goes."""
+
+    def __init__(self, model: Model, *, dt: float = 0.01) -> None:
+        self.model = model
+        self.dt = dt
+        self._robots: dict[str, RobotBody] = {}
+        self._people: dict[str, Person] = {}
+        self._bunches: dict[int, Loose] = {}
+        self._waiting = 0
+        self._slot: dict[int, int] = {}
+        self._scene = static_world.furnished(model, dt)
+        self._drafting = threading.Lock()
+        self.world: mujoco.MjModel
+        self.data: mujoco.MjData
+        self.faults = 0
+        """How many things were stopped because a number of theirs was not finite; ``complaint`` names the last."""
+        self.complaint = ""
+        self.generation = 0
+        """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
+        self.owners: dict[int, tuple[str, str]] = {}
+        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`geoms.Geoms` names them."""
+        self._compile()
+
+    # ------------------------------------------------------------------ who is here
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names in the order of arrival."""
+        return tuple(self._robots)
+
+    def add_robot(self, spec: RobotSpec) -> None:
+        """Let a robot join, at ``spec.pose`` and ``spec.home``; all others go on exactly where they are.
+
+        Raises :class:`RobotError` and leaves the world as it was if the URDF does not compile.
+        """
+        while not self.admit(self.prepare(spec)):
+            pass
+
+    def prepare(self, spec: RobotSpec | HumanSpec, *, copy: bool = False) -> Draft:
+        """The world with one more actor in it, for :meth:`admit`. Any thread may call this while the ticks go on.
+
+        Raises :class:`RobotError` if the URDF does not compile. ``copy``: see :meth:`add_human`.
+        """
+        robots, people = tuple(self._robots.values()), tuple(self._people.values())
+        if isinstance(spec, HumanSpec):
+            return self._draft(robots, (*people, Person(spec, self._admit("human", spec.name, HumanError), copy=copy)))
+        robot = RobotBody(spec, self._admit("robot", spec.name, RobotError))
+        try:
+            return self._draft((*robots, robot), people)
+        except ValueError as error:
+            raise unfit(spec, error) from error
+
+    def admit(self, draft: Draft) -> bool:
+        """Between ticks, let the actor in for whom ``draft`` was made, where its ``spec`` says.
+
+        False, and nothing has happened, if others came or went meanwhile: prepare it anew.
+        """
+        here = (*self._robots.values(), *self._people.values())
+        those = (*draft.robots, *draft.people)
+        (newcomer, *more) = [actor for actor in those if actor not in here] or [None]
+        others = tuple(actor for actor in those if actor is not newcomer)
+        if newcomer is None or more or others != here or draft.slots <= max(self._slot.values(), default=-1):
+            return False
+        if isinstance(newcomer, Person):
+            self._people[newcomer.spec.name] = newcomer
+            self._renew(draft)
+            return True
+        spec = newcomer.spec
+        self._robots[spec.name] = newcomer
+        self._renew(draft)
+        self.place(spec.name, spec.pose, spec.home)
+        return True
+
+    def remove_robot(self, name: str) -> None:
+        """Let a robot leave; all others go on exactly where they are."""
+        self._robot(name)
+        del self._robots[name]
+        self._compile()
+
+    def place(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
+        """Put a robot somewhere, at rest and asking for nothing else: base ``pose`` [7], ``position`` [joint]."""
+        self._robot(name).place(self.world, self.data, np.asarray(pose, float), position)
+        self._fresh = False
+
+    @property
+    def people(self) -> tuple[str, ...]:
+        """Names in the order of arrival."""
+        return tuple(self._people)
+
+    @property
+    def actors(self) -> tuple[str, ...]:
+        """Robots and people."""
+        return (*self._robots, *self._people)
+
+    def stands(self, name: str) -> np.ndarray:
+        """[3] m where a robot's base or a person's hips are."""
+        return self.person(name).parts[PARTS.index("hips"), :3] if name in self._people else self.base(name)[0][:3]
+
+    def person(self, name: str) -> Person:
+        """The body of a person who is here."""
+        try:
+            return self._people[name]
+        except KeyError:
+            raise HumanError(f"no human {name!r} here; there are: {', '.join(self._people) or 'none'}") from None
+
+    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
+        """Let a person join, at ``spec.pose``; all others go on exactly where they are. Raises :class:`HumanError`.
+
+        ``copy``: another client moves the person; here the hands neither hold anything nor touch robots.
+        """
+        while not self.admit(self.prepare(spec, copy=copy)):
+            pass
+
+    def remove_human(self, name: str) -> None:
+        """Let a person leave, and whatever the hands hold."""
+        self.person(name)
+        del self._people[name]
+        self._compile()
+
+    def move_human(self, name: str, pose: HumanPose) -> None:
+        """Tell where a person's tracked points are at the end of the coming tick."""
+        person = self.person(name)
+        busy = [hand.busy for hand in person.hands]
+        person.move(pose)
+        if busy != [hand.busy for hand in person.hands]:
+            person.excuse(self.world)
+            self._list()
+
+    def hand(self, name: str, side: str) -> HandSample:
+        """A person's ``"left"`` or ``"right"`` hand after the last tick."""
+        person = self.person(name)
+        return person.sample(person.hand(side), self.data)
+
+    def hold(self, name: str, side: str, actor: str, link: str) -> None:
+        """Let a hand hold a link of an actor, a box or a bunch where it is now; names are those of ``geoms.Geoms``."""
+        person, body = self.person(name), self._body_of(actor, link)
+        hand = person.hand(side)
+        self.refresh()
+        pose = np.concatenate([self.data.xpos[[body, hand.body]], self.data.xquat[[body, hand.body]]], -1)
+        pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
+        hand.grip, hand.holds = frames.compose(frames.inverse(pose[0]), pose[1]), (actor, link)
+        person.grasp(self.world, self.data, hand, body)
+        self._list()
+
+    def ride(self, name: str, side: str, body: int) -> None:
+        """Let a hand hold a plant's ``body``: it meets nothing, and goes where :meth:`put_hand` says."""
+        person = self.person(name)
+        hand = person.hand(side)
+        hand.holds = ("plants", f"body/{body}")
+        person.grasp(self.world, self.data, hand, None)
+        self._list()
+
+    def put_hand(self, name: str, side: str, pose: np.ndarray) -> None:
+        """Put a hand somewhere, at rest: ``pose`` [7]."""
+        hand = self.person(name).hand(side)
+        self.data.qpos[hand.q] = np.concatenate([pose[:3], frames.to_wxyz(pose[3:])])
+        self.data.qvel[hand.v] = 0.0
+        self._fresh = False
+
+    def let_go(self, name: str, side: str) -> None:
+        """Open a hand."""
+        person = self.person(name)
+        person.release(self.world, self.data, person.hand(side))
+        self._list()
+
+    def near_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
+        """What a hand could close on: gap [m] below ``reach``, actor and link of the nearest thing; not the ground."""
+        person = self.person(name)
+        self.refresh()
+        m, d = self.world, self.data
+        body = person.hand(side).body
+        mine = range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body])
+        best: tuple[float, str, str] | None = None
+        for of in (self.geoms, self.standing):
+            apart = np.linalg.norm(d.geom_xpos[of.id] - d.xpos[body], axis=1)
+            for i in np.flatnonzero(apart - of.radius < reach + HAND):
+                if of.kind[i] != mujoco.mjtGeom.mjGEOM_PLANE and of.actor[i] != name:
+                    gap = min(mujoco.mj_geomDistance(m, d, geom, int(of.id[i]), reach, None) for geom in mine)
+                    if gap < reach and (best is None or gap < best[0]):
+                        best = (gap, of.actor[i], of.link[i])
+        return best
+
+    @property
+    def loose(self) -> tuple[int, ...]:
+        """Bunches that lie, fall or are held, in the order in which they left their vines."""
+        return tuple(self._bunches)
+
+    def add_bunch(self, bunch: int, body: Loose, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Take a bunch over from its vine: ``pose`` [7] and ``velocity`` [6] (of its origin, angular; world axes)."""
+        self.add_bunches({bunch: (body, pose, velocity)})
+
+    def add_bunches(self, bunches: dict[int, tuple[Loose, np.ndarray, np.ndarray]]) -> None:
+        """Several at once, each with its pose [7] and velocity [6]: they are listed but once."""
+        if known := sorted(bunches.keys() & self._bunches.keys()):
+            raise ValueError(f"bunch {known[0]} is loose already")
+        derived = {bunch: free_bunch.alone(body) for bunch, (body, _, _) in bunches.items()}
+        free = iter(sorted(set(range(self._waiting + len(bunches))) - set(self._slot.values())))
+        for bunch, (body, _, _) in bunches.items():
+            self._bunches[bunch], self._slot[bunch] = body, next(free)
+        if max(self._slot[bunch] for bunch in bunches) >= self._waiting:
+            self._compile()
+        else:
+            for bunch, (body, _, _) in bunches.items():
+                free_bunch.embody(self.world, self._slot[bunch], body, derived[bunch])
+            self._list()
+        for bunch, (_, pose, velocity) in bunches.items():
+            self.place_bunch(bunch, pose, velocity)
+
+    def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Put a loose bunch somewhere: ``pose`` [7], ``velocity`` [6] in world axes."""
+        joint, pose = self._joint_of(bunch), np.asarray(pose, float)
+        turn = frames.normalize(pose[3:])
+        joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(turn)])
+        joint.qvel[:3] = velocity[:3]
+        joint.qvel[3:] = frames.rotate(frames.conjugate(turn), np.asarray(velocity[3:], float))
+        rouse(self.world, self.data, self._body_of(f"bunch/{bunch}", "bunch"))
+        self._fresh = False
+
+    def remove_bunch(self, bunch: int) -> None:
+        """Take a loose bunch out of the world; its body waits for the next one (the world is compiled anew)."""
+        del self._bunches[bunch], self._slot[bunch]
+        self._compile()
+
+    def bunch_pose(self, bunch: int) -> np.ndarray:
+        """World pose [7] of a loose bunch."""
+        qpos = self._joint_of(bunch).qpos
+        return np.concatenate([qpos[:3], frames.from_wxyz(qpos[3:])])
+
+    # ------------------------------------------------------------------ what they are asked to do
+
+    def command(self, name: str, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Ask the drives for ``position`` [joint] moving with ``velocity`` [joint] (standing, unless given)."""
+        self._robot(name).command(position, velocity)
+
+    def tune(
+        self,
+        name: str,
+        stiffness: np.ndarray,
+        damping: np.ndarray,
+        effort: np.ndarray,
+        *,
+        limit: np.ndarray | None = None,
+        exact: np.ndarray | None = None,
+    ) -> None:
+        """Give the servos other gains, and an ``effort`` beside (all [joint]): zero gains make a joint effort-driven.
+
+        The effort is added within ``limit`` [joint], which is the drive's own unless a lower one is given. Joints that
+        are ``exact`` [joint] swing with just this damping; the others are damped as if it were larger by dt times
+        stiffness, as stiff servos should be. All stay until they are given anew.
+        """
+        self._robot(name).tune(self.world, self.data, (stiffness, damping, effort), limit, exact)
+
+    def drive_base(self, name: str, velocity: tuple[float, float, float]) -> None:
+        """Ask the tracks for (vx, vy, wz) [m/s, m/s, rad/s] in the base's axes; zero holds the place."""
+        robot = self._robot(name)
+        robot.base_velocity[:] = velocity
+        robot.give = GIVE
+
+    def follow(
+        self, name: str, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> None:
+        """Pull the copy of a remote robot to its received state; it stays dynamic, so a vine still holds it back.
+
+        ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
+        """
+        self.command(name, position, velocity)
+        self._robot(name).follow(self.data, np.asarray(base_q, float), np.asarray(base_qd, float))
+
+    def push(self, name: str, link: str, force: np.ndarray, moment: np.ndarray = np.zeros(3)) -> None:
+        """A force [N] and a moment [N m] on a link's centre of mass, world axes, until it is set anew."""
+        wrench = self.data.xfrc_applied[self._body(name, link)]
+        wrench[:3], wrench[3:] = force, moment
+
+    def bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
+        """Let a robot feel how people push it whom other clients move: wrenches [6] by link, until told anew.
+
+        Force [N] and moment about the link's centre of mass [N m], world axes. They count as contacts in :meth:`read`.
+        """
+        self._robot(name).bear(self.data, pushes)
+
+    def pushed_by(self, name: str) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
+        """What a person's hands did to robots in the last tick; see :func:`wrenches.of_hands`."""
+        robots = self._robots.items()
+        links = {body: (robot, link) for robot, found in robots for link, body in found.bodies.items()}
+        return hand_wrenches.of_hands(self.world, self.data, self.person(name), links)
+
+    # ------------------------------------------------------------------ what they feel and where they are
+
+    def read(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Position, velocity, effort and contact of the drives, each [joint] in the order of ``spec.drives``.
+
+        ``effort`` is what the drive transmitted in the last tick: servo and its share of gravity compensation.
+        ``contact`` is J^T f of the contacts with plants and with rigid things; at rest the two cancel.
+        """
+        robot, d = self._robot(name), self.data
+        return d.qpos[robot.q], d.qvel[robot.v], robot.effort_given(d), self._contact[robot.v]
+
+    def state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity of the drives alone, as :meth:`read` gives them."""
+        robot = self._robot(name)
+        return self.data.qpos[robot.q], self.data.qvel[robot.v]
+
+    def weight(self, name: str) -> np.ndarray:
+        """[joint] what the drives give to carry the robot's own weight [N m or N], part of their effort."""
+        return self.data.qfrc_gravcomp[self._robot(name).v]
+
+    def inertia(self, name: str) -> np.ndarray:
+        """[joint] what each drive has to speed up if the others stand, rotor included [kg m2 or kg], in this pose."""
+        return self.data.M[self._robot(name).diagonal]
+
+    def base(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Pose [7] and velocity [6] (world axes) of the base link."""
+        robot, d = self._robot(name), self.data
+        x, y, yaw = d.qpos[robot.base_q]
+        vx, vy, wz = d.qvel[robot.base_v]
+        half = 0.5 * yaw
+        pose = np.array([x, y, robot.spec.pose[2], 0.0, 0.0, np.sin(half), np.cos(half)])
+        return pose, np.array([vx, vy, 0.0, 0.0, 0.0, wz])
+
+    def link_pose(self, name: str, link: str) -> np.ndarray:
+        """World pose [7] of a link, whether or not it can move against its parent."""
+        body = self._body(name, link)
+        self.refresh()
+        return np.concatenate([self.data.xpos[body], frames.from_wxyz(self.data.xquat[body])])
+
+    def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
+        """[6, joint]: velocity of the world ``point`` [3] of a link, then its angular velocity, per drive's speed."""
+        robot, body = self._robot(name), self._body(name, link)
+        self.refresh()
+        jacobian = np.zeros((6, self.world.nv))
+        mujoco.mj_jac(self.world, self.data, jacobian[:3], jacobian[3:], np.asarray(point, float), body)
+        return jacobian[:, robot.v]
+
+    def instrument(self, name: str, link: str) -> None:
+        """From the next tick on, measure at a link what :meth:`wrench` and :meth:`acceleration` tell."""
+        self._body(name, link)
+        self._robot(name).felt[link] = Felt()
+
+    def wrench(self, name: str, link: str) -> np.ndarray:
+        """Force [N] and moment about the link's origin [N m] of the link, and all beyond it, on its parent [6].
+
+        In the link's axes, mean of the last tick. Weight, inertia, pushes and contacts with rigid things count; those
+        with plants do not: who solves them has them.
+        """
+        return self._felt(name, link).wrench
+
+    def acceleration(self, name: str, link: str) -> np.ndarray:
+        """Angular [rad/s2] and proper acceleration of a link's origin [m/s2] in its axes [6]; at rest 9.81 upwards."""
+        return self._felt(name, link).acceleration.copy()
+
+    def angular_velocity(self, name: str, link: str) -> np.ndarray:
+        """[3] rad/s of a link, in its axes."""
+        body = self._body(name, link)
+        self.refresh()
+        jacobian = np.zeros((3, self.world.nv))
+        mujoco.mj_jacBody(self.world, self.data, None, jacobian, body)
+        return jacobian @ self.data.qvel @ self.data.xmat[body].reshape(3, 3)
+
+    def overlaps(self) -> list[tuple[str, str, float]]:
+        """Who stood in whom when the tick began, as :meth:`prep` found it: actors or things, and how deep [m]."""
+        m, d = self.world, self.data
+        found = []
+        for contact in d.contact:
+            bodies = [m.geom_bodyid[geom] for geom in contact.geom]
+            pairs = zip(bodies, contact.geom, strict=True)
+            names = [self.owners[body][0] if body in self.owners else m.geom(geom).name for body, geom in pairs]
+            found.append((names[0], names[1], -float(contact.dist)))
+        return found
+
+    def refresh(self) -> None:
+        """Bring MuJoCo's poses to the state as it is now: after a step they are those of the step's start."""
+        if not self._fresh:
+            mujoco.mj_kinematics(self.world, self.data)
+            mujoco.mj_comPos(self.world, self.data)
+            self._fresh = True
+
+    def links(self) -> tuple[Link, ...]:
+        """Every robot's and box's bodies that have a shape; the same object until an actor comes or goes."""
+        return self._links
+
+    def link_q(self) -> np.ndarray:
+        """Poses [link, 7] of :meth:`links`."""
+        self.refresh()
+        d, body = self.data, self._link_body
+        pose = np.empty((len(body), 7))
+        pose[:, :3] = d.xpos[body]
+        pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
+        for person in self._people.values():  # bit by bit: MuJoCo makes quaternions unit anew
+            pose[self._link_row[person.part_bodies]] = person.parts
+            hands = self._link_row[[hand.body for hand in person.hands]]
+            first = hands[-1] + 1
+            pose[first : first + len(LIMBS)] = person.limbs(pose[hands])
+        return pose
+
+    # ------------------------------------------------------------------ the tick, in two halves
+
+    def drive(self) -> None:
+        """Turn every robot's targets into MuJoCo's controls."""
+        for robot in self._robots.values():
+            robot.drive(self.data, self.dt)
+
+    def prep(self) -> None:
+        """First half: positions, native contacts, and the velocity that the tick would end with without plants."""
+        m, d = self.world, self.data
+        self.drive()
+        for person in self._people.values():
+            person.drive(m, d, self.dt)
+        self._sound[:] = d.qpos
+        # still applied from the last tick: what pushed a sleeping box wakes it now
+        mujoco.mj_step1(m, d)
+        d.qfrc_applied[:] = 0.0
+        # the whole forward pass behind the velocity stage: single calls of its parts leave out dt K v
+        mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
+
+    @property
+    def velocity_free(self) -> np.ndarray:
+        """[dof] the prediction of :meth:`prep`; zero for what sleeps, whose ``qacc`` MuJoCo leaves as it was."""
+        m, d = self.world, self.data
+        velocity = d.qvel + self.dt * d.qacc
+        if d.nv_awake < m.nv:
+            velocity[d.tree_asleep[m.dof_treeid] >= 0] = 0.0
+        return velocity
+
+    @property
+    def dof_names(self) -> list[tuple[str, int]]:
+        """[dof] joint (or loose bunch) and number in it: they outlive a compilation, their places do not."""
+        m = self.world
+        bunch_in = {free_bunch.name_of(slot): f"bunch/{bunch}" for bunch, slot in self._slot.items()}
+        names = [m.joint(i).name for i in range(m.njnt)]
+        of = [bunch_in.get(name, name) for name in names]
+        return [(of[i], int(v - m.jnt_dofadr[i])) for v, i in enumerate(m.dof_jntid.tolist())]
+
+    @property
+    def group(self) -> np.ndarray:
+        """See :meth:`Metric.group`."""
+        return self._metric.group(self.data)
+
+    def bound(self, bodies: np.ndarray) -> bool:
+        """See :meth:`Metric.bound`."""
+        return self._metric.bound(self.data, bodies)
+
+    def inverse(self, J: np.ndarray) -> np.ndarray:
+        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see :class:`Metric`."""
+        return self._metric.inverse(self.data, J)
+
+    def finish(self, force: np.ndarray | None = None) -> None:
+        """Second half: integrate with generalised contact forces of plants, ``force`` [dof]."""
+        m, d = self.world, self.data
+        if force is not None:
+            np.add(force, 0.0, out=d.qfrc_applied)  # +0 for -0, which would keep sleeping boxes awake
+        mujoco.mj_step2(m, d)
+        self._feel()
+        if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
+            self._roll_back()
+            force = None
+        self._contact[:] = 0.0 if force is None else force
+        if d.ncon:
+            native = np.where(d.efc_type >= _CONTACT, d.efc_force, 0.0)
+            out = np.zeros(m.nv)
+            mujoco.mj_mulJacTVec(m, d, out, native)
+            self._contact += out
+        for robot in self._robots.values():
+            if robot.afar:
+                self._contact += robot.effort_from_afar(m, d)
+        for person in self._people.values():
+            person.feel(d)
+        self._fresh = False
+
+    def inhabit(self, world: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Let the robots live in another world, in which their joints and bodies have the same names."""
+        self.world, self.data, self._contact, self._fresh = world, data, np.zeros(world.nv), False
+        for robot in self._robots.values():
+            robot.locate(world)
+
+    def stale(self) -> None:
+        """Whoever steps MuJoCo by hand says so: its poses are those of the step's start."""
+        self._fresh = False
+
+    # ------------------------------------------------------------------ inside
+
+    def _admit(self, kind: str, name: str, error: type[ValueError]) -> int:
+        """The collision bit of a newcomer."""
+        if name in self.actors:
+            raise error(f"{kind} {name!r} is already here; give the newcomer another name")
+        if "/" in name or not name:
+            raise error(f"{kind} name {name!r} must not be empty nor contain '/', which parts actor and link")
+        used = {actor.bit for actor in (*self._robots.values(), *self._people.values())}
+        free = [bit for bit in range(static_world.FIRST_ACTOR, static_world.LAST_ACTOR + 1) if bit not in used]
+        if not free:
+            raise error(f"{kind} {name!r} is one too many: {len(used)} robots and people share this world, remove one")
+        return free[0]
+
+    def _body_of(self, actor: str, link: str) -> int:
+        """MuJoCo body of anything that has a name."""
+        if actor in self._people:
+            return self._people[actor].bodies[link]
+        if actor in self._robots:
+            return self._body(actor, link)
+        kind, _, number = actor.partition("/")
+        if actor == "world":
+            return 0
+        return self.world.body(free_bunch.name_of(self._slot[int(number)]) if kind == "bunch" else actor).id
+
+    def _joint_of(self, bunch: int) -> Any:  # MuJoCo does not name its views
+        return self.data.joint(free_bunch.name_of(self._slot[bunch]))
+
+    def _robot(self, name: str) -> RobotBody:
+        try:
+            return self._robots[name]
+        except KeyError:
+            raise ValueError(f"no robot {name!r} here; there are: {', '.join(self._robots) or 'none'}") from None
+
+    def _body(self, name: str, link: str) -> int:
+        robot = self._robot(name)
+        try:
+            return robot.bodies[link]
+        except KeyError:
+            raise ValueError(f"robot {name!r} has no link {link!r}; it has: {', '.join(robot.bodies)}") from None
+
+    def _felt(self, name: str, link: str) -> Felt:
+        try:
+            return self._robot(name).felt[link]
+        except KeyError:
+            raise ValueError(f"nothing is measured at {link!r} of robot {name!r}; instrument() it first") from None
+
+    def _feel(self) -> None:
+        """Keep what links felt in the tick that ends, while MuJoCo's places are still those of its start."""
+        m, d = self.world, self.data
+        if not any(robot.felt for robot in self._robots.values()):
+            return
+        mujoco.mj_rnePostConstraint(m, d)
+        for robot in self._robots.values():
+            for link, felt in robot.felt.items():
+                felt.feel(m, d, robot.bodies[link])
+
+    def _roll_back(self) -> None:
+        """Stop the kinematic trees with a number that is not finite where the tick began; the others go on."""
+        m, d = self.world, self.data
+        joint_tree = m.dof_treeid[m.jnt_dofadr]
+        width = np.where(m.jnt_type == mujoco.mjtJoint.mjJNT_FREE, 7, 1)
+        tree = np.repeat(joint_tree, width)  # of each entry of qpos
+        bad = np.zeros(m.ntree, bool)
+        bad[m.dof_treeid[~np.isfinite(d.qvel)]] = True
+        bad[tree[~np.isfinite(d.qpos)]] = True
+        sound = np.where(np.isfinite(self._sound), self._sound, m.qpos0)
+        d.qpos[bad[tree]] = sound[bad[tree]]
+        dofs = bad[m.dof_treeid]
+        for name in recompile.OF_DOFS:
+            getattr(d, name)[dofs] = 0.0
+        for name, robot in self._robots.items():
+            if bad[m.dof_treeid[robot.base_v[0]]]:
+                self.place(name, self.base(name)[0], d.qpos[robot.q].copy())
+                robot.forward[:] = 0.0
+        stopped = [m.body(m.tree_bodyadr[tree]).name for tree in np.flatnonzero(bad)]
+        self.faults += len(stopped)
+        self.complaint = f"t = {d.time:.2f} s: {', '.join(stopped)} moved by a number that is not finite; stopped"
+
+    # ------------------------------------------------------------------ building the world
+
+    def _draft(self, robots: tuple[RobotBody, ...], people: tuple[Person, ...]) -> Draft:
+        """A world with these in it and room for loose bunches, compiled; nothing here changes."""
+        slots = max(self._slot.values(), default=-1) + 1 + free_bunch.WAITING
+        with self._drafting:
+            spec = self._scene.copy()
+            for robot in robots:
+                robot.attach(spec)
+            for person in people:
+                person.attach(spec, sum(1 << robot.bit for robot in robots))
+            for slot in range(slots):
+                free_bunch.wait(spec, slot)
+            world = recompile.compiled(spec)
+        # the solver's tolerance is relative to it: whoever joins would change when it stops for everybody else
+        world.stat.meaninertia = 1.0
+        for slot in range(slots):
+            free_bunch.untouch(world, slot)
+        return Draft(robots, people, slots, world)
+
+    def _compile(self) -> None:
+        """Build the world anew for those who are here now."""
+        self._renew(self._draft(tuple(self._robots.values()), tuple(self._people.values())))
+
+    def _renew(self, draft: Draft) -> None:
+        """Go on in another world, every joint's and body's state carried over by its name."""
+        before = (self.world, self.data, self._contact) if self.generation else None
+        self.world, self._waiting = draft.world, draft.slots
+        world = self.world
+        for bunch, body in self._bunches.items():
+            free_bunch.embody(world, self._slot[bunch], body, free_bunch.alone(body))
+        if before is None:
+            self.data, self._contact = mujoco.MjData(world), np.zeros(world.nv)
+        else:
+            parked = {free_bunch.name_of(slot) for slot in set(range(self._waiting)) - set(self._slot.values())}
+            self.data, self._contact = recompile.carried(*before, world, parked)
+        self._metric = Metric(world)
+        self._sound = self.data.qpos.copy()
+        self._fresh = False
+        for robot in self._robots.values():
+            robot.locate(world)
+        for person in self._people.values():
+            person.locate(world)
+        for person in self._people.values():
+            for hand in person.hands:
+                self._regrasp(person, hand)
+        if before is None:
+            self.standing = collision_geoms.standing(world)
+        self._list()
+
+    def _regrasp(self, person: Person, hand: Hand) -> None:
+        """In a world compiled anew: hold on to what was held, if it is still there."""
+        if hand.holds is None:
+            return
+        try:
+            body = None if hand.rides else self._body_of(*hand.holds)
+        except (KeyError, ValueError):
+            person.release(self.world, self.data, hand)
+        else:
+            person.grasp(self.world, self.data, hand, body)
+
+    def _list(self) -> None:
+        """List anew what is here; whoever keeps views of it takes notice of the new ``generation``."""
+        self.generation += 1
+        self._links, self._link_body = self._list_links()
+        self._link_row = np.zeros(self.world.nbody, int)
+        own = self._link_body > 0
+        self._link_row[self._link_body[own]] = np.flatnonzero(own)
+        self.owners = self._owners()
+        self.geoms = collision_geoms.listed(self.world, self.owners)
+
+    def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
+        links, bodies = [], []
+        for box, size in enumerate(self.model.box_size):
+            links.append(Link(f"box/{box}", Organ.BOX, box, appearance.crate(tuple(map(float, size)), box)))
+            bodies.append(self.world.body(f"box/{box}").id)
+        for name, robot in self._robots.items():
+            for link, shapes in robot.shapes.items():
+                if shapes:
+                    links.append(Link(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
+                    bodies.append(robot.bodies[link])
+        for name, person in self._people.items():
+            drawn = appearance.person(person.spec.height).parts
+            mine = [(part, person.bodies[part]) for part in (*PARTS, *(hand.link for hand in person.hands))]
+            for part, body in (*mine, *((limb, 0) for limb in LIMBS)):  # limbs have no body: link_q() places them
+                links.append(Link(f"{name}/{part}", Organ.HUMAN, person.spec.index, drawn[part]))
+                bodies.append(body)
+        for bunch, body in self._bunches.items():
+            links.append(Link(f"bunch/{bunch}", Organ.BUNCH, bunch, body.shapes))
+            bodies.append(self._body_of(f"bunch/{bunch}", "bunch"))
+        return tuple(links), np.array(bodies, int)
+
+    def _owners(self) -> dict[int, tuple[str, str]]:
+        """Actor and link of every MuJoCo body that can come, go or be moved."""
+        m = self.world
+        owner = {m.body(f"box/{i}").id: (f"box/{i}", "box") for i in range(len(self.model.box_size))}
+        for name, robot in self._robots.items():
+            owner.update({body: (name, link) for link, body in robot.bodies.items()})
+        for name, person in self._people.items():
+            owner.update({body: (name, link) for link, body in person.bodies.items()})
+        owner.update({m.body(free_bunch.name_of(slot)).id: (f"bunch/{i}", "bunch") for i, slot in self._slot.items()})
+        return owner

@@ -1,0 +1,111 @@
+"""URDF as the rigid world reads it: what is wrong with one, what of it can touch, what of it is seen."""
+
+from __future__ import annotations
+
+import functools
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.appearance import SURFACES
+from vinesim.scene.values import RobotSpec, Shape
+
+
+class RobotError(ValueError):
+    """A robot that cannot join: the text says which one, what is wrong with it and what helps."""
+
+
+def check(spec: RobotSpec) -> None:
+    """Raise :class:`RobotError` for what MuJoCo would not notice or would say in other words."""
+    count = len(spec.drives)
+    if np.shape(spec.home) != (count,):
+        raise RobotError(f"robot {spec.name!r} has {count} drives and a home position of shape {np.shape(spec.home)}")
+    try:
+        root = ElementTree.fromstring(spec.urdf)
+    except ElementTree.ParseError as error:
+        raise RobotError(f"robot {spec.name!r}: its URDF is not XML: {error}") from error
+    links = {link.get("name") for link in root.findall("link")}
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    roots = links - {joint.find("child").get("link") for joint in joints.values()}
+    if roots != {spec.base}:
+        raise RobotError(f"robot {spec.name!r}: base {spec.base!r} must be its URDF's root, which is {sorted(roots)}")
+    for drive in spec.drives:
+        if drive.joint not in joints:
+            raise RobotError(
+                f"robot {spec.name!r} drives {drive.joint!r}, which its URDF lacks, having {sorted(joints)}"
+            )
+        if joints[drive.joint].get("type") not in ("revolute", "continuous", "prismatic"):
+            kind = joints[drive.joint].get("type")
+            raise RobotError(f"robot {spec.name!r} drives {drive.joint!r}, a {kind} joint; only axes can be driven")
+        if min(drive.stiffness, drive.damping) < 0.0 or drive.effort <= 0.0:
+            raise RobotError(f"robot {spec.name!r}: {drive} must have gains of 0 or more and an effort above 0")
+
+
+@functools.lru_cache(16)  # robots of one kind share it
+def touchable(urdf: str, driven: frozenset[str]) -> str:
+    """The URDF as physics needs it: no pictures; joints that nobody drives and that copy nobody are fixed."""
+    root = ElementTree.fromstring(urdf)
+    for link in root.iter("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+    for joint in root.findall("joint"):
+        if joint.get("type") != "fixed" and joint.get("name") not in driven and joint.find("mimic") is None:
+            joint.set("type", "fixed")
+    for mesh in root.iter("mesh"):
+        mesh.set("filename", mesh.get("filename", "").removeprefix("file://"))
+    for old in root.findall("mujoco"):
+        root.remove(old)
+    options = {"fusestatic": "false", "strippath": "false", "balanceinertia": "true", "discardvisual": "true"}
+    ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+@functools.lru_cache(16)
+def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
+    """What sensors see of each link of a URDF: its visual shapes, or its collision shapes if it has none."""
+    root = ElementTree.fromstring(urdf)
+    paints = {m.get("name"): m for m in root.findall("material")}
+    shapes = {}
+    for link in root.findall("link"):
+        seen = link.findall("visual") or link.findall("collision")
+        shapes[link.get("name", "")] = tuple(filter(None, (_shape(element, paints) for element in seen)))
+    return shapes
+
+
+_SURFACES = {name: name for name in SURFACES} | {"steel": "metal", "aluminium": "metal", "lens": "glass"}
+"""What a material of a URDF is made of, by a word of its name: ``rubber``, ``dark_rubber``, ``lamp_green``."""
+
+
+def _numbers(element: ElementTree.Element | None, key: str, default: str) -> np.ndarray:
+    return np.array(((element.get(key) if element is not None else None) or default).split(), float)
+
+
+def _shape(element: ElementTree.Element, paints: dict) -> Shape | None:
+    origin = element.find("origin")
+    roll, pitch, yaw = _numbers(origin, "rpy", "0 0 0")
+    turn = frames.exp(np.array([0.0, 0.0, yaw]))
+    for angle in ((0.0, pitch, 0.0), (roll, 0.0, 0.0)):
+        turn = frames.multiply(turn, frames.exp(np.array(angle)))
+    material = element.find("material")
+    if material is not None and material.find("color") is None:
+        material = paints.get(material.get("name"), material)
+    rgba = tuple(_numbers(None if material is None else material.find("color"), "rgba", "0.6 0.6 0.6 1"))
+    words = ("" if material is None else material.get("name") or "").lower().split("_")
+    surface = next((_SURFACES[word] for word in words if word in _SURFACES), "")
+    geometry = element.find("geometry")
+    form = None if geometry is None else next(iter(geometry), None)
+    if form is None:
+        return None
+    file = ""
+    if form.tag == "box":
+        size = tuple(_numbers(form, "size", "0 0 0") / 2)
+    elif form.tag in ("cylinder", "capsule"):
+        size = (float(form.get("radius", 0)), float(form.get("length", 0)) / 2)
+    elif form.tag == "sphere":
+        size = (float(form.get("radius", 0)),)
+    elif form.tag == "mesh":
+        size, file = tuple(_numbers(form, "scale", "1 1 1")), form.get("filename", "").removeprefix("file://")
+    else:
+        return None
+    return Shape(form.tag, size, frames.pose(_numbers(origin, "xyz", "0 0 0"), turn), rgba, file, surface)

@@ -1,0 +1,1 @@
+"""Controllers: joint trajectories, Cartesian motion, way points, admittance."""

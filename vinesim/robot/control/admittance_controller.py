@@ -1,0 +1,64 @@
+"""Give way: a hand that moves as the force at its wrist asks, the example of a controller that uses force feedback.
+
+    controller = Admittance(robot, "arm_left", "wrist_left_ft")
+    ...
+    controller(robot.sample(time, contacts))    # each tick, before robot.control(time)
+
+It hears nothing but the robot's samples, so a ROS node can do the same from topics (D6.4 section 3.1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.robot.drives import CommandError, Robot
+from vinesim.scene.values import RobotSample
+
+SINGULAR = 0.05
+"""Damping of the inverse Jacobian: stretched out, an arm moves slower than asked instead of fast."""
+
+
+class Admittance:
+    """The hand is a mass in honey: mass dv/dt + damping v = force; it keeps its attitude."""
+
+    def __init__(
+        self, robot: Robot, group: str, sensor: str, *, mass: float = 6.0, damping: float = 60.0, ignored: float = 0.5
+    ) -> None:
+        """``mass`` [kg] and ``damping`` [N s/m] that a hand feels; forces below ``ignored`` [N] count as none.
+
+        The mass must be larger than that of what hangs on the sensor, which feels its own inertia. What it carries at
+        the first sample, or at :meth:`tare`, is taken for weight.
+        """
+        known = [mount.name for mount in robot.description.wrenches]
+        if sensor not in known:
+            raise CommandError(f"{robot.name} has no wrist sensor {sensor!r}; it has: {', '.join(known) or 'none'}")
+        if not (mass > 0.0 and damping > 0.0):
+            raise CommandError(f"mass {mass} and damping {damping} of an admittance must both be above 0")
+        self.robot, self.sensor = robot, sensor
+        self.mass, self.damping, self.ignored = mass, damping, ignored
+        self.velocity = np.zeros(3)
+        """[3] m/s of the hand, world axes, as it is asked for"""
+        self._joints = robot.description.indices(group)
+        self._weight: np.ndarray | None = None
+
+    def tare(self) -> None:
+        """Take what the next sample carries for weight."""
+        self._weight = None
+
+    def __call__(self, sample: RobotSample) -> None:
+        """Move on by a tick."""
+        wrench = next(wrench for wrench in sample.wrenches if wrench.name == self.sensor)
+        pose = self.robot.frame_pose(wrench.frame)
+        force = frames.rotate(pose[3:], wrench.force)
+        if self._weight is None:
+            self._weight = force
+        force = force - self._weight
+        if np.linalg.norm(force) < self.ignored:
+            force = np.zeros(3)
+        dt = self.robot.rigid.dt
+        self.velocity = (self.velocity + dt / self.mass * force) / (1.0 + dt * self.damping / self.mass)
+        J = self.robot.rigid.jacobian(self.robot.name, wrench.frame, pose[:3])[:, self._joints]
+        wanted = np.concatenate([self.velocity, np.zeros(3)])
+        rates = J.T @ np.linalg.solve(J @ J.T + SINGULAR**2 * np.eye(6), wanted)
+        self.robot.command_velocity(rates, self._joints)

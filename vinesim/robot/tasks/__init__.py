@@ -1,0 +1,1 @@
+"""Scripted tasks: push a bunch, pick a bunch into a box, swap boxes."""

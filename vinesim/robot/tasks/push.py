@@ -1,0 +1,168 @@
+"""Reach for a bunch and push it: a scripted motion for demonstrations, benchmarks and tests.
+
+    reach = ReachAndPush(robot, "left", lambda: bunch_position)
+    while running:
+        reach.control(time)
+        robot.control(time)
+        physics.step()
+
+The fingertips are led along straight lines, see :mod:`vinesim.robot.control.cartesian_controller`.
+"""
+
+from __future__ import annotations
+
+import enum
+import logging
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.robot.control.cartesian_controller import Hand
+from vinesim.robot.drives import Robot
+
+log = logging.getLogger(__name__)
+
+TIP = 0.027
+"""How far vinebot's fingers reach beyond its grasping frame [m]."""
+RISE = 0.35
+"""Fingers point up by this angle [rad]: forearm and wrist stay below the leaves."""
+NEAR = 0.003
+"""Fingertips this close to the end of a phase [m] are there."""
+
+FAR = 0.01
+"""Fingertips that end an approach farther off than this [m] have missed."""
+
+
+class Phase(enum.Enum):
+    """Stages of one push, in their order."""
+
+    APPROACH = "approach"
+    TOUCH = "touch"
+    PUSH = "push"
+    HOLD = "hold"
+    RETREAT = "retreat"
+    DONE = "done"
+
+
+class ReachAndPush:
+    """One arm touches a target, pushes it, lets go, and begins again.
+
+    ``target`` gives the bunch's centre in the world [3] m; it is asked once for every approach. The fingers come from
+    the robot's side and from below, where no wire and few leaves are.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        side: str,
+        target: Callable[[], np.ndarray],
+        *,
+        radius: float = 0.05,
+        depth: float = 0.04,
+        clearance: float = 0.10,
+        hold: float = 1.0,
+        speed: float = 0.35,
+        touch_speed: float = 0.10,
+        acceleration: float = 0.8,
+        repeat: bool = True,
+        lift: bool = True,
+    ) -> None:
+        """``radius`` of the bunch, ``depth`` of the push and ``clearance`` before the touch [m], ``hold`` [s];
+        ``speed`` through free space, ``touch_speed`` [m/s] and ``acceleration`` [m/s2] of the fingertips;
+        ``lift`` False leaves the torso to somebody else, such as the other arm.
+        """
+        self.robot = robot
+        self.target = target
+        self.hand = Hand(robot, side, tip=TIP, acceleration=acceleration, lift=lift)
+        self.tool = self.hand.tool
+        self.radius, self.depth, self.clearance, self.hold = radius, depth, clearance, hold
+        self.speed, self.touch_speed = speed, touch_speed
+        self.repeat = repeat
+        self.phase = Phase.APPROACH
+        self.cycles = 0
+        """Pushes done so far."""
+        self.missed = 0
+        """Approaches given up because the target is out of reach."""
+
+        self._way: dict[Phase, np.ndarray] = {}
+        self._started = -np.inf
+
+    @property
+    def tip(self) -> np.ndarray:
+        """Fingertips in the world [3] m."""
+        return self.hand.point
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where the fingertips are to be at the end of the present phase [3] m; where they are, if there is none."""
+        return self._way.get(self.phase, self.hand.place)
+
+    @property
+    def error(self) -> float:
+        """Distance of the fingertips from :attr:`goal` [m]."""
+        return float(np.linalg.norm(self.goal - self.tip))
+
+    def control(self, time: float) -> None:
+        """Command the arm for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
+        if self.phase is Phase.DONE:
+            return
+        if not self._way:
+            self._plan()
+            self._begin(self.phase, time)
+        if self._ended(time):
+            self._advance(time)
+        if self.phase is not Phase.DONE:
+            self.hand.lead(self.goal, self._axis, speed=self._fastest, height=self._height)
+
+    # ------------------------------------------------------------------ phases
+
+    def _plan(self) -> None:
+        """Lay the way to where the target is now."""
+        center = np.asarray(self.target(), float)
+        ahead = center - self.hand.shoulder
+        ahead[2] = np.hypot(ahead[0], ahead[1]) * np.tan(RISE)
+        self._axis = frames.normalize(ahead)
+        touch = center - self.radius * self._axis
+        ready = touch - self.clearance * self._axis
+        pushed = touch + self.depth * self._axis
+        self._way = {
+            Phase.APPROACH: ready,
+            Phase.TOUCH: touch,
+            Phase.PUSH: pushed,
+            Phase.HOLD: pushed,
+            Phase.RETREAT: ready,
+        }
+        self._height = center[2]
+        self.hand.start()
+        if self.hand.gripper:
+            self.robot.command_gripper(self.hand.gripper, 0.0)
+
+    def _begin(self, phase: Phase, time: float) -> None:
+        self.phase, self._started = phase, time
+        fast = phase in (Phase.APPROACH, Phase.RETREAT)
+        self._fastest = self.speed if fast else self.touch_speed
+        way = np.linalg.norm(self.goal - self.hand.place)
+        # a bunch that pushes back may keep the tip from arriving; then time ends the phase
+        self._patience = 2.0 * way / self._fastest + 2.0 * self._fastest / self.hand.acceleration + 3.0
+
+    def _ended(self, time: float) -> bool:
+        elapsed = time - self._started
+        if self.phase is Phase.HOLD:
+            return elapsed >= self.hold
+        return bool(self.error < NEAR or elapsed > self._patience)
+
+    def _advance(self, time: float) -> None:
+        order = list(Phase)
+        phase = order[order.index(self.phase) + 1]
+        if self.phase is Phase.APPROACH and self.error > FAR:
+            log.warning("%s: target out of reach by %.2f m; bring the base closer", self.robot.name, self.error)
+            self.missed += 1
+            phase = Phase.RETREAT
+            self._way[phase] = self.tip
+        if phase is Phase.DONE:
+            self.cycles += 1
+            if self.repeat:
+                self._plan()
+                phase = Phase.APPROACH
+        self._begin(phase, time)

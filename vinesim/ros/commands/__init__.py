@@ -1,0 +1,1 @@
+"""Subscriptions: commands of ROS peers as plain values."""

@@ -1,0 +1,1 @@
+"""Messages: conversion of values, packages built from definitions, serialised transforms."""

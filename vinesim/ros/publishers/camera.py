@@ -1,0 +1,33 @@
+"""Topics of one RGB-D camera. Frames are optical: z forward, x right, y down (REP-103)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+
+from vinesim.ros.messages import convert
+from vinesim.ros.topic import SENSOR, Advertise, Offer
+from vinesim.scene.values import CameraFrame
+
+
+class Camera:
+    """``<name>/{rgb,depth}/{image_raw,camera_info}``, ``rgb/image_raw/compressed``, ``depth/points``, ``labels``."""
+
+    def __init__(self, advertise: Advertise, name: str) -> None:
+        self._infos = [advertise(CameraInfo, f"{name}/{kind}/camera_info", SENSOR) for kind in ("rgb", "depth")]
+        self._built = (
+            (advertise(Image, f"{name}/rgb/image_raw", SENSOR), convert.rgb_image),
+            (advertise(Image, f"{name}/depth/image_raw", SENSOR), convert.depth_image),
+            (advertise(Image, f"{name}/labels", SENSOR), convert.label_image),
+            (advertise(CompressedImage, f"{name}/rgb/image_raw/compressed", SENSOR), convert.compressed_image),
+            (advertise(PointCloud2, f"{name}/depth/points", SENSOR), convert.depth_cloud),
+        )
+
+    def offers(self, frame: CameraFrame) -> Iterator[Offer]:
+        """Everything that one picture tells, cheap things first."""
+        for topic in self._infos:
+            yield topic, partial(convert.camera_info, frame.info, frame.time)
+        for topic, build in self._built:
+            yield topic, partial(build, frame)

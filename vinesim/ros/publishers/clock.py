@@ -1,0 +1,22 @@
+"""/clock: simulation time for nodes that run with use_sim_time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from vinesim.ros.messages import convert
+from vinesim.ros.topic import RELIABLE, Advertise, Offer
+
+
+class Clock:
+    """There is one clock per ROS domain, so its name is absolute under every namespace."""
+
+    def __init__(self, advertise: Advertise) -> None:
+        self._topic = advertise(ClockMessage, "/clock", RELIABLE, urgent=True)
+
+    def offers(self, time: float) -> Iterator[Offer]:
+        """The time [s]."""
+        yield self._topic, partial(convert.clock, time)

@@ -1,0 +1,218 @@
+"""A stranger's ears: a process of its own that subscribes with stock rclpy and counts what arrives.
+
+``python -m vinesim.ros.tools.topic_monitor --seconds 10`` listens to every topic there is (``--topic`` names some) and prints one
+JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here (the age,
+for what was latched), the messages lost (gaps in the publisher's numbering) and whether the stamps ever went back.
+Without ``--seconds`` it listens until its standard input is closed.
+
+It takes messages in their serialised form, so that counting costs next to nothing; the first one of every topic is
+taken apart, to see that it is well-formed. It runs without vinesim's middleware profile, as a stranger would.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import importlib
+import json
+import pathlib
+import statistics
+import struct
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from vinesim.ros import ros_setup
+from vinesim.ros.messages import interfaces
+
+LOOK_PERIOD = 0.2
+"""How often the graph is searched for new topics [s]."""
+NOISE = ("/rosout", "/parameter_events")
+"""Topics of every node, not listened to unless named."""
+
+
+class Ear:
+    """What one topic brought."""
+
+    def __init__(self, type_name: str, type_hash: str, message: type, publishers: int) -> None:
+        self.type_name, self.type_hash = type_name, type_hash
+        self.publishers = publishers
+        self.count = self.bytes = self.lost = 0
+        self.first = self.last = 0.0
+        self.stamps_rise = True
+        self._message = message
+        self._stamp_at = _stamp_offset(message)
+        self._stamp = (-1, 0)
+        self._sequence: int | None = None
+        self._latencies: deque[int] = deque(maxlen=10_000)
+
+    def hear(self, message: bytes, info: dict[str, Any]) -> None:
+        """One serialised message, and what the middleware says of it."""
+        now = time.time_ns()
+        if not self.count:
+            from rclpy.serialization import deserialize_message
+
+            deserialize_message(message, self._message)
+            self.first = now * 1e-9
+        self.last = now * 1e-9
+        self.count += 1
+        self.bytes += len(message)
+        self._latencies.append(now - info["source_timestamp"])
+        sequence = info["publication_sequence_number"]
+        if sequence is not None:
+            if self._sequence is not None:
+                self.lost += max(sequence - self._sequence - 1, 0)
+            self._sequence = sequence
+        if self._stamp_at is not None and len(message) >= self._stamp_at + 8:
+            order = "<" if message[1] & 1 else ">"
+            stamp = struct.unpack_from(order + "iI", message, self._stamp_at)
+            self.stamps_rise &= stamp >= self._stamp
+            self._stamp = stamp
+
+    def report(self) -> dict[str, Any]:
+        """As plain numbers; ``lost`` is None if several publishers number their messages apart."""
+        span = self.last - self.first
+        return {
+            "type": self.type_name,
+            "type_hash": self.type_hash,
+            "count": self.count,
+            "hz": round((self.count - 1) / span, 2) if self.count > 1 and span > 0.0 else None,
+            "bytes": self.bytes,
+            "latency_ms": round(statistics.median(self._latencies) * 1e-6, 3) if self._latencies else None,
+            "lost": self.lost if self.publishers <= 1 else None,
+            "stamps_rise": self.stamps_rise if self._stamp_at is not None else None,
+        }
+
+
+class Witness:
+    """Subscribes to topics as they appear."""
+
+    def __init__(self, topics: Sequence[str] = ()) -> None:
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+
+        self.ears: dict[str, Ear] = {}
+        self._asked = tuple(topics)
+        self._context = Context()
+        self._context.init([])
+        self._node = Node("witness", context=self._context, enable_rosout=False, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def listen(self, until: threading.Event, seconds: float | None) -> None:
+        """Listen until the event, or for so many seconds from the first message on."""
+        next_look = 0.0
+        deadline = None
+        while not until.is_set() and (deadline is None or time.monotonic() < deadline):
+            if time.monotonic() >= next_look:
+                self._look()
+                next_look = time.monotonic() + LOOK_PERIOD
+            self._executor.spin_once(timeout_sec=LOOK_PERIOD)
+            if seconds is not None and deadline is None and any(ear.count for ear in self.ears.values()):
+                deadline = time.monotonic() + seconds
+
+    def report(self) -> dict[str, dict[str, Any]]:
+        """By topic."""
+        return {name: ear.report() for name, ear in sorted(self.ears.items())}
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.shutdown()
+
+    def _look(self) -> None:
+        for name, types in self._node.get_topic_names_and_types():
+            heard = name in self._asked if self._asked else name not in NOISE
+            if heard and name not in self.ears:
+                self._subscribe(name, types[0])
+
+    def _subscribe(self, name: str, type_name: str) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+        offered = self._node.get_publishers_info_by_topic(name)
+        message = _message_class(type_name)
+        if not offered or message is None:
+            return
+        # The strictest that every publisher offers, as `ros2 topic hz` does.
+        reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in offered)
+        latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in offered)
+        qos = QoSProfile(
+            depth=20,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        ear = Ear(type_name, str(offered[0].topic_type_hash), message, len(offered))
+        self.ears[name] = ear
+        hear: Any = ear.hear  # rclpy hands over what the signature has room for, its annotations know less
+        self._node.create_subscription(message, name, hear, qos, raw=True)
+
+
+def _message_class(type_name: str) -> type | None:
+    """The class of ``package/msg/Name``, or None if its package is not installed."""
+    package, kind, name = type_name.split("/")
+    with contextlib.suppress(ImportError, AttributeError):
+        return getattr(importlib.import_module(f"{package}.{kind}"), name)
+    return None
+
+
+def _stamp_offset(message: Any) -> int | None:
+    """Where the (first) stamp lies in the serialised message, if it begins with one."""
+    first = next(iter(message.get_fields_and_field_types().values()), "")
+    if first in ("std_msgs/Header", "builtin_interfaces/Time"):
+        return 4
+    return 8 if first == "sequence<geometry_msgs/TransformStamped>" else None
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """What the command line says."""
+
+    topics: list[str]
+    seconds: float | None
+    out: pathlib.Path | None
+
+
+def parse(arguments: Sequence[str] | None = None) -> Arguments:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m vinesim.ros.tools.topic_monitor", description="Count what arrives on ROS topics."
+    )
+    parser.add_argument("--topic", action="append", default=[], help="listen to this one only (may be repeated)")
+    parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
+    parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
+    given = parser.parse_args(arguments)
+    return Arguments(given.topic, given.seconds, given.out)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Listen and report; returns the exit status."""
+    given = parse(arguments)
+    reason = ros_setup.available()
+    if reason is not None:
+        sys.stderr.write(reason + "\n")
+        return 2
+    ros_setup.without_profile()
+    interfaces.ensure(["tf2_msgs"])
+    stop = threading.Event()
+    if given.seconds is None:
+        threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+    witness = Witness(given.topics)
+    with contextlib.suppress(KeyboardInterrupt):
+        witness.listen(stop, given.seconds)
+    text = json.dumps(witness.report(), indent=1)
+    witness.close()
+    if given.out is None:
+        sys.stdout.write(text + "\n")
+    else:
+        given.out.write_text(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

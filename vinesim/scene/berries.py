@@ -1,0 +1,246 @@
+"""Berries of a bunch, derived from (count, seed): sensors see them and truth counts them, physics never simulates them.
+
+A small library of bunches is packed once by position-based relaxation, with berries of unit radius: each berry has a
+foot on the rachis, is pulled to it by its pedicel, and is pushed out of its neighbours. A bunch takes the prototype its
+seed names and scales it, so ten thousand bunches cost eighteen relaxations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from vinesim.frames import normalize
+from vinesim.scene import plant_parameters
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Variety:
+    """Looks and size of the berries of one variety (sources in ``data/plants/varieties.toml``)."""
+
+    name: str
+    colour: tuple[float, float, float]
+    """Linear RGB reflectance."""
+    radius: float
+    """Half thickness across the berry's axis [m]."""
+    elongation: float
+    """Length over thickness."""
+
+    @property
+    def volume_radius(self) -> float:
+        """Radius of the sphere of the same volume [m]."""
+        return self.radius * self.elongation ** (1.0 / 3.0)
+
+    @property
+    def mass(self) -> float:
+        """Of one berry [kg]."""
+        return DENSITY * 4.0 / 3.0 * np.pi * self.volume_radius**3
+
+
+DENSITY = 1080.0
+"""Of a ripe berry [kg/m^3]: GUESSED from 18 % sugar."""
+
+VARIETIES = tuple(
+    Variety(b.name, b.colour.value, b.radius.value, b.elongation.value) for b in plant_parameters.load_varieties()
+)  # fmt: skip
+"""Indexed by ``Model.bunch_variety``."""
+
+COUNTS = (50, 64, 80, 97, 116, 140)
+"""Berries of the prototypes; a bunch takes the next larger one and leaves berries off at its tip."""
+FEWEST, MOST = 40, COUNTS[-1]
+_SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
+"""Taper and wings of the three prototypes of each count: conical, shouldered, cylindrical with two wings."""
+_ITERATIONS = 400
+_SPREAD = 0.07
+"""Standard deviation of a berry's radius, share."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Bunch:
+    """Berries in the bunch's body frame: origin at the end of the peduncle, +x down the rachis."""
+
+    position: np.ndarray
+    """[n, 3] m"""
+    radius: np.ndarray
+    """[n] m, half thickness across the axis; half length is ``radius * elongation``."""
+    axis: np.ndarray
+    """[n, 3] unit, from pedicel to stylar scar."""
+    foot: np.ndarray
+    """[n, 3] m, where the pedicel leaves the rachis."""
+    rachis: np.ndarray
+    """[line, point, 3] m, main axis and wings."""
+    neighbours: np.ndarray
+    """[n, 8] int32, nearest first, -1 where there are fewer."""
+
+
+def berries(length: float, radius: float, count: int, variety: int, seed: int) -> Bunch:
+    """The berries of one bunch of ``Model``; it fits the hull ``length`` x ``radius`` [m] that :func:`hull` gave."""
+    return _scaled(int(_prototype(count, seed)), int(count), float(length), float(radius), int(variety))
+
+
+def hull(count: np.ndarray, seed: np.ndarray) -> np.ndarray:
+    """Length and radius of bunches [..., 2] in units of the berry's volume radius."""
+    which = _prototype(count, seed)
+    count = np.asarray(count)
+    return np.stack([_tables()[0][which, count], _tables()[1][which]], -1)
+
+
+def piece_of(position: np.ndarray, length: float, pieces: int) -> np.ndarray:
+    """Which of the equal pieces of a rachis of this length points [..., 3] belong to; 0 is at the peduncle."""
+    return np.clip((position[..., 0] * (pieces / length)).astype(int), 0, pieces - 1)
+
+
+def spread(count: np.ndarray, seed: np.ndarray, pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How berries weigh on equal pieces of their rachis: bunches [n] cut into ``pieces`` [n], for unit mass and length.
+
+    Share of the mass [n, most], centre of mass [n, most, 3] and moments of inertia about it [n, most, 3], axes of the
+    bunch's body; zero behind the last piece.
+    """
+    which = _prototype(count, seed)
+    position, radius = _packed()
+    number, most = np.arange(MOST), int(np.max(pieces, initial=1))
+    count, pieces = np.asarray(count), np.asarray(pieces)
+    length = _tables()[0][which, count]
+    position, radius = position[which] / length[:, None, None], radius[which] / length[:, None]
+    weight = np.where(number < count[:, None], radius**3, 0.0)
+    weight = weight / weight.sum(1, keepdims=True)
+    piece = np.clip((position[..., 0] * pieces[:, None]).astype(int), 0, pieces[:, None] - 1)
+    flat = (np.arange(len(count))[:, None] * most + piece).ravel()
+
+    def gathered(value: np.ndarray) -> np.ndarray:
+        return np.bincount(flat, value.ravel(), len(count) * most).reshape(len(count), most)
+
+    share = gathered(weight)
+    some = np.where(share > 0.0, share, 1.0)[..., None]
+    centre = np.stack([gathered(weight * position[..., axis]) for axis in range(3)], -1) / some
+    square = np.stack([gathered(weight * position[..., axis] ** 2) for axis in range(3)], -1)
+    square = square - share[..., None] * centre * centre
+    own = gathered(0.4 * weight * radius * radius)[..., None]  # a ball's 2/5 m r^2
+    return share, centre, square.sum(-1, keepdims=True) - square + own
+
+
+@functools.cache
+def _packed() -> tuple[np.ndarray, np.ndarray]:
+    """Positions [prototype, MOST, 3] and radii [prototype, MOST]; rounded as :func:`_tables` is."""
+    position, radius = np.zeros((len(prototypes()), MOST, 3)), np.zeros((len(prototypes()), MOST))
+    for i, bunch in enumerate(prototypes()):
+        position[i, : len(bunch.radius)], radius[i, : len(bunch.radius)] = bunch.position, bunch.radius
+    return position.round(3), radius.round(3)
+
+
+def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
+    """Number of the prototype: the next larger count, its shape by seed."""
+    if np.min(count) < 1 or np.max(count) > MOST:
+        raise ValueError(f"a bunch has 1 to {MOST} berries, not {np.min(count)} to {np.max(count)}")
+    return np.searchsorted(COUNTS, count) * len(_SHAPES) + np.asarray(seed, np.int64) % len(_SHAPES)
+
+
+@functools.cache
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """Length by prototype and count, radius by prototype; rounded so that a last bit cannot differ between machines."""
+    lengths = np.zeros((len(prototypes()), MOST + 1))
+    for i, bunch in enumerate(prototypes()):
+        reach = np.maximum.accumulate(bunch.position[:, 0] + bunch.radius)
+        lengths[i, 1 : len(reach) + 1] = reach
+    across = [np.quantile(np.hypot(*b.position[:, 1:].T) + b.radius, 0.9) for b in prototypes()]
+    return lengths.round(3), np.array(across).round(3)
+
+
+@functools.lru_cache(maxsize=512)
+def _scaled(which: int, count: int, length: float, radius: float, variety: int) -> Bunch:
+    unit = prototypes()[which]
+    lengths, across = _tables()
+    scale = min(length / lengths[which, count], radius / across[which])
+    thin = VARIETIES[variety].elongation ** (-1.0 / 3.0)
+    near = np.where(unit.neighbours[:count] < count, unit.neighbours[:count], -1)
+    order = np.argsort(near < 0, axis=1, kind="stable")
+    return Bunch(
+        position=unit.position[:count] * scale, radius=unit.radius[:count] * (scale * thin), axis=unit.axis[:count],
+        foot=unit.foot[:count] * scale, rachis=unit.rachis * scale, neighbours=np.take_along_axis(near, order, 1),
+    )  # fmt: skip
+
+
+@functools.cache
+def prototypes() -> tuple[Bunch, ...]:
+    """The packed library, berries of unit volume radius sorted from the top of the bunch to its tip."""
+    drafts = [
+        _draft(count, *shape, i * len(_SHAPES) + j) for i, count in enumerate(COUNTS) for j, shape in enumerate(_SHAPES)
+    ]
+    position, foot, radius = (np.concatenate([d[k] for d in drafts]) for k in (0, 1, 2))
+    position = _relax(position, foot, radius, [len(d[0]) for d in drafts])
+    library, first = [], 0
+    for _, foot, radius, rachis in drafts:
+        p = position[first : first + len(foot)]
+        first += len(foot)
+        down = (p[:, 0] - radius).min()  # the topmost berry just reaches the peduncle's end
+        p, foot, rachis = p - [down, 0, 0], foot - [down, 0, 0], rachis - [down, 0, 0]
+        rachis[0, 0] = 0.0
+        order = np.argsort(p[:, 0], kind="stable")
+        p, foot, radius = p[order], foot[order], radius[order]
+        distance = np.linalg.norm(p[:, None] - p[None], axis=2) + np.diag(np.full(len(p), np.inf))
+        near = np.argsort(distance, axis=1, kind="stable")[:, :8].astype(np.int32)
+        axis = normalize(normalize(p - foot) + np.array([0.35, 0.0, 0.0]))
+        library.append(Bunch(p, radius, axis, foot, rachis, near))
+    return tuple(library)
+
+
+def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray, ...]:
+    """Loose berries around a rachis: position, foot, radius, rachis; units of the mean berry radius."""
+    g = np.random.default_rng([seed, count])
+    radius = np.clip(g.normal(1.0, _SPREAD, count), 0.8, 1.15)
+    length = g.uniform(11.5, 13.5) * (count / 90.0) ** (1.0 / 3.0)
+    wide = np.sqrt(count * 6.4 * (2.0 * taper + 1.0) / (np.pi * length) / (1.0 + 0.12 * wings))
+    lines = [(np.zeros(3), np.array([length, *g.normal(0.0, 0.05 * length, 2)]), wide)]
+    turn = g.uniform(0.0, 2.0 * np.pi)
+    for wing in range(wings):
+        angle = turn + np.pi * wing + g.normal(0.0, 0.3)
+        tip = np.array([0.34 * length, 1.35 * wide * np.cos(angle), 1.35 * wide * np.sin(angle)])
+        lines.append((np.array([1.0 + wing, 0.0, 0.0]), tip, 0.55 * wide))
+    which = g.choice(len(lines), count, p=np.array([1.0] + [0.2] * wings) / (1.0 + 0.2 * wings))
+    start, end, spread = (np.array([line[k] for line in lines])[which] for k in range(3))
+    along = 0.03 + 0.97 * (1.0 - (1.0 - g.uniform(0.0, 0.985, count)) ** (1.0 / (2.0 * taper + 1.0)))
+    foot = start + (end - start) * along[:, None]
+    around = g.uniform(0.0, 2.0 * np.pi, count)
+    out = normalize(np.stack([g.uniform(-0.25, 0.7, count), np.cos(around), np.sin(around)], 1))
+    pedicel = 0.9 * spread * (1.0 - along) ** taper * np.sqrt(g.uniform(0.15, 1.0, count)) + 0.6 * radius
+    share = np.linspace(0.0, 0.8, 5)[:, None]
+    rachis = np.stack([a + (b - a) * share for a, b, _ in lines])
+    return foot + out * pedicel[:, None], foot, radius, rachis
+
+
+def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: list[int]) -> np.ndarray:
+    """Pack several bunches at once: pedicels pull for three quarters of the time, neighbours push all the time."""
+    p, total = position.copy(), len(position)
+    first, second = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    for iteration in range(_ITERATIONS):
+        if iteration % 8 == 0:
+            first, second = _near(p, sizes, 2.9)
+        if iteration < 0.75 * _ITERATIONS:
+            pedicel = p - foot
+            long = np.linalg.norm(pedicel, axis=1, keepdims=True) + 1e-9
+            p = p - pedicel / long * np.maximum(long - 1.25 * radius[:, None], 0.0) * 0.035
+            p[:, 0] += 0.005
+        for _ in range(2):
+            apart = p[first] - p[second]
+            distance = np.sqrt((apart * apart).sum(1)) + 1e-9
+            overlap = np.maximum(0.985 * (radius[first] + radius[second]) - distance, 0.0)
+            push = apart * (0.275 * overlap / distance)[:, None]
+            for axis in range(3):
+                p[:, axis] += np.bincount(first, push[:, axis], total) - np.bincount(second, push[:, axis], total)
+    return p
+
+
+def _near(p: np.ndarray, sizes: list[int], reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of one bunch closer than ``reach``."""
+    firsts, seconds, start = [], [], 0
+    for size in sizes:
+        own = p[start : start + size]
+        square = (own * own).sum(1)
+        distance = square[:, None] + square[None] - 2.0 * own @ own.T
+        a, b = np.nonzero(np.triu(distance < reach * reach, 1))
+        firsts.append(a + start)
+        seconds.append(b + start)
+        start += size
+    return np.concatenate(firsts), np.concatenate(seconds)

@@ -1,0 +1,364 @@
+"""Beams to bodies: how a piece of wood becomes mass, inertia and joint springs, and pieces become a :class:`Model`.
+
+A piece of length h bends by half on either side of its middle, each half a spring 2EI/h. A joint is the two halves that
+meet there, one after the other: EI/h in a rod, 2EI/h at a clamp, which has no half (with EI/h the tip is 12.8 % off),
+and where unlike pieces meet what lies between.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene import berries, plant_parameters
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+"""[m/s^2], world axes."""
+
+
+CLUSTERS = 8
+"""Most berry clusters of a bunch."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Wood:
+    """Material of a rod."""
+
+    modulus: float
+    """Flexural modulus E [Pa]."""
+    density: float
+    """[kg/m^3]"""
+    damping: float = 0.0
+    """Stiffness-proportional damping beta [s]: joint damping = beta * joint stiffness."""
+    shear: float | None = None
+    """Shear modulus G [Pa]; E / 2.6 (Poisson 0.3) unless given."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Pieces:
+    """Bunches [n] cut across their rachis into a chain of pieces of equal length: the head first, then clusters.
+
+    Frames stand on the rachis where a piece begins, axes as the bunch's.
+    """
+
+    count: np.ndarray
+    """[n] pieces; fields are zero behind the last."""
+    length: np.ndarray
+    """[n] of one piece [m]"""
+    mass: np.ndarray
+    """[n, most]"""
+    com: np.ndarray
+    """[n, most, 3]"""
+    inertia: np.ndarray
+    """[n, most, 3]"""
+    radius: np.ndarray
+    """[n, most, 2] of the bunch's hull where a piece begins and ends."""
+    stiffness: np.ndarray
+    """[n, most, 3] of the joint where a piece begins; the head's is the peduncle's."""
+
+    def compound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mass [n], centre of mass [n, 3] and moments of inertia [n, 3] of whole bunches, in the head's frame."""
+        along = self.length[:, None] * np.arange(self.mass.shape[1])
+        centre = self.com + along[..., None] * [1.0, 0.0, 0.0]
+        mass = self.mass.sum(1)
+        com = (self.mass[..., None] * centre).sum(1) / mass[:, None]
+        arm = centre - com[:, None]
+        square = arm * arm
+        inertia = self.inertia + self.mass[..., None] * (square.sum(-1, keepdims=True) - square)
+        return mass, com, inertia.sum(1)
+
+
+def bunch_pieces(
+    mass: np.ndarray, length: np.ndarray, radius: np.ndarray, berry_count: np.ndarray, seed: np.ndarray,
+    rachis: plant_parameters.Rachis, stem_share: float,
+) -> Pieces:  # fmt: skip
+    """Cut bunches [n] into pieces that weigh what their own berries and stems weigh; four clusters to eight."""
+    count = np.clip(np.round(length / rachis.piece.value).astype(int), 5, 1 + CLUSTERS)
+    share, com, inertia = berries.spread(berry_count, seed, count)
+    number = np.arange(share.shape[1])
+    here = number < count[:, None]
+    h = length / count
+    juice, stem = mass * (1.0 - stem_share), np.where(here, (mass * stem_share / count)[:, None], 0.0)
+    fruit = juice[:, None] * share
+    com = com * length[:, None, None] - (h[:, None] * number)[..., None] * [1.0, 0.0, 0.0]
+    inertia = juice[:, None, None] * inertia * (length * length)[:, None, None]
+    # a rod along the axis joins the berries
+    middle = np.where(here, 0.5 * h[:, None], 0.0)[..., None] * [1.0, 0.0, 0.0]
+    total = np.where(here, fruit + stem, 1.0)[..., None]
+    both = np.where(here[..., None], (fruit[..., None] * com + stem[..., None] * middle) / total, 0.0)
+    for m, at in ((fruit, com), (stem, middle)):
+        square = (at - both) ** 2
+        inertia = inertia + m[..., None] * (square.sum(-1, keepdims=True) - square)
+    inertia = inertia + (stem * (h * h / 12.0)[:, None])[..., None] * [0.0, 1.0, 1.0]
+    half = 0.5 * length[:, None]
+    edges = np.stack([number, number + 1], -1) * h[:, None, None]
+    hull = radius[:, None, None] * np.sqrt(np.maximum(1.0 - (edges / half[..., None] - 1.0) ** 2, 0.0))
+    thick = 0.5 * rachis.diameter.at(number / count[:, None])
+    stiffness = 0.5 * section(h[:, None], thick, thick, rachis.modulus.value, 1.0)[2]
+    return Pieces(
+        count, h, np.where(here, fruit + stem, 0.0), both, np.where(here[..., None], inertia, 0.0),
+        np.where(here[..., None], hull, 0.0), np.where(here[..., None], stiffness, 0.0),
+    )  # fmt: skip
+
+
+class Tree:
+    """One tree while it grows: a list of bodies, parents before children. Bodies are numbered from 0, the root.
+
+    Berry clusters stand apart: :func:`assemble` numbers them behind all other bodies of their tree.
+    """
+
+    def __init__(self, pose: np.ndarray, vine: int = -1) -> None:
+        """``pose`` [7]: where the root's joint frame sits in the world."""
+        self.pose = np.asarray(pose, float)
+        self.vine = vine
+        self.bodies: list[dict[str, Any]] = []
+        self.clusters: list[dict[str, Any]] = []
+        """Bodies behind the core, bunch by bunch; ``parent`` None is the cluster before."""
+        self.bunches: list[dict[str, Any]] = []
+        self.leaves: list[dict[str, Any]] = []
+
+    def add(self, parent: int, *, offset: Any = (0.0, 0.0, 0.0), rest: Any = frames.IDENTITY, **fields: Any) -> int:
+        """Append one body with explicit :class:`Model` fields (names without prefix); returns its number."""
+        if not -1 <= parent < len(self.bodies):
+            raise ValueError(f"body {len(self.bodies)} names parent {parent}, which does not stand before it")
+        self.bodies.append(
+            {"parent": parent, "offset": np.asarray(offset, float), "rest": np.asarray(rest, float), **fields}
+        )
+        return len(self.bodies) - 1
+
+    def rod(
+        self,
+        parent: int,
+        length: float,
+        radius: tuple[float, float],
+        wood: Wood,
+        pieces: int,
+        *,
+        organ: Organ = Organ.CANE,
+        offset: Any = None,
+        rest: Any = frames.IDENTITY,
+        bends: np.ndarray | None = None,
+    ) -> list[int]:
+        """Grow a (tapered) rod of ``pieces`` bodies and return their numbers.
+
+        ``rest`` turns the first piece against the parent, ``bends`` [pieces, 4] each piece against the one before.
+        ``offset`` is the joint in the parent's frame, the parent's tip unless given. The first joint is half a piece
+        of this rod and what of the parent, if that is a piece of a rod, lies between its middle and the joint; damping
+        is each wood's in its share.
+        """
+        if length <= 0.0 or min(radius) <= 0.0 or pieces < 1 or wood.modulus <= 0.0 or wood.density <= 0.0:
+            raise ValueError(
+                f"rod of length {length} m, radius {radius} m, {pieces} pieces, {wood}: all must be positive"
+            )
+        h = length / pieces
+        edges = radius[0] + (radius[1] - radius[0]) * np.arange(pieces + 1) / pieces
+        masses, inertias, near, far = section(h, edges[:-1], edges[1:], wood.modulus, wood.density, wood.shear)
+        above = self.bodies[parent] if 0 <= parent < len(self.bodies) else {}
+        if offset is None:
+            offset = (above.get("length", 0.0), 0.0, 0.0)
+        slack, damped = 1.0 / near, wood.damping / near  # [rad/N m] of the lower halves, and with the wood's damping
+        slack[1:] += 1.0 / far[:-1]
+        damped[1:] += wood.damping / far[:-1]
+        if "far" in above:
+            reach = np.clip(2.0 * offset[0] / above["length"] - 1.0, 0.0, 1.0)
+            share = reach * (1.0 / above["far"]) @ frames.matrix(np.asarray(rest, float)) ** 2
+            slack[0] += share
+            damped[0] += above["beta"] * share
+        stiffnesses = 1.0 / slack
+        dampings = stiffnesses**2 * damped
+        numbers = []
+        for i in range(pieces):
+            turn = frames.IDENTITY if bends is None else bends[i]
+            if i == 0:
+                at = offset
+                turn = frames.multiply(rest, turn)
+            else:
+                at = (h, 0.0, 0.0)
+            parent = self.add(
+                parent, offset=at, rest=turn, organ=int(organ), mass=masses[i], com=(h / 2, 0, 0), length=h,
+                radius=(edges[i], edges[i + 1]), inertia=inertias[i], stiffness=stiffnesses[i],
+                damping=dampings[i], far=far[i], beta=wood.damping,
+            )  # fmt: skip
+            numbers.append(parent)
+        return numbers
+
+    def bunch(
+        self,
+        parent: int,
+        mass: float,
+        *,
+        count: int = 90,
+        seed: int = 0,
+        variety: int = 0,
+        rest: Any = frames.IDENTITY,
+        offset: Any = None,
+        stiffness: Any = None,
+        damping: Any = None,
+        clusters: bool = True,
+        parts: plant_parameters.Vine | None = None,
+        **fields: Any,
+    ) -> int:
+        """Hang a bunch of ``count`` berries on a piece of peduncle and return its body's number.
+
+        It has the size that its berries need, and unless told otherwise clusters, and the joint of the piece it hangs
+        on. ``parts`` gives the rachis (``data/plants/vine.toml`` unless given); ``fields`` are further ``bunch_``
+        fields of the :class:`Model`.
+        """
+        parts = plant_parameters.load("vine") if parts is None else parts
+        above = self.bodies[parent]
+        berry = berries.VARIETIES[variety]
+        share = parts.bunch.stem_share.value
+        size = berry.volume_radius * np.cbrt(mass * (1.0 - share) / (count * berry.mass))
+        length, radius = berries.hull(np.array(count), np.array(seed)) * size
+        one = bunch_pieces(*(np.array([value]) for value in (mass, length, radius, count, seed)), parts.rachis, share)
+        whole, com, inertia = (value[0] for value in one.compound())
+        offset = (above["length"], 0.0, 0.0) if offset is None else offset
+        body = self.add(
+            parent, offset=offset, rest=rest, organ=int(Organ.BUNCH), mass=whole, com=com, inertia=inertia,
+            length=length, radius=(radius, radius),
+            stiffness=above["stiffness"] if stiffness is None else stiffness,
+            damping=above["damping"] if damping is None else damping,
+        )  # fmt: skip
+        bunch = {
+            "body": body, "length": length, "radius": radius, "berries": count, "seed": seed, "variety": variety,
+            **fields,
+        }  # fmt: skip
+        if clusters:
+            n = int(one.count[0]) - 1
+            bunch |= {
+                "clusters": n, "head_mass": one.mass[0, 0], "head_com": one.com[0, 0],
+                "head_inertia": one.inertia[0, 0],
+            }  # fmt: skip
+            for i in range(1, n + 1):
+                self.clusters.append({
+                    "parent": None if i > 1 else body, "offset": np.array([one.length[0], 0.0, 0.0]),
+                    "rest": frames.IDENTITY, "organ": int(Organ.BUNCH), "mass": one.mass[0, i], "com": one.com[0, i],
+                    "inertia": one.inertia[0, i], "length": one.length[0], "radius": one.radius[0, i],
+                    "stiffness": one.stiffness[0, i], "damping": parts.rachis.damping.value * one.stiffness[0, i],
+                })  # fmt: skip
+        self.bunches.append(bunch)
+        return body
+
+    def settle(self) -> None:
+        """Choose rest rotations so that the shape drawn so far is the equilibrium under gravity: see :func:`settle`."""
+        model = settle(assemble([self]))
+        for body, rest, settled in zip(
+            [*self.bodies, *self.clusters], model.body_rest, model.joint_settled, strict=True
+        ):
+            body["rest"], body["settled"] = rest.astype(float), settled.astype(float)
+
+
+def section(
+    length: np.ndarray | float,
+    start: np.ndarray | float,
+    end: np.ndarray | float,
+    modulus: np.ndarray | float,
+    density: float,
+    shear: float | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Mass [...] and moments of inertia [..., 3] of rod pieces with radii start and end [m], and the springs [..., 3]
+    N m/rad of their halves near the start and far from it: twist, and bending by two axes.
+
+    Each half is taken to have the section at its end of the piece, where joints sit.
+    """
+    length, start, end, modulus = np.broadcast_arrays(length, start, end, modulus)
+    middle = 0.5 * (start + end)
+    mass = density * np.pi * length * (start * start + start * end + end * end) / 3.0
+    across = mass * (length * length / 12.0 + middle * middle / 4.0)
+    inertia = np.stack([0.5 * mass * middle * middle, across, across], -1)
+    halves = []
+    for radius in (start, end):
+        area_moment = np.pi * radius**4 / 2.0 / length
+        bend = modulus * area_moment
+        twist = (modulus / 2.6 if shear is None else shear) * 2.0 * area_moment
+        halves.append(np.stack([twist, bend, bend], -1))
+    return mass, inertia, halves[0], halves[1]
+
+
+def settle(model: Model) -> Model:
+    """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is the equilibrium.
+
+    The spring must carry the weight hanging below each joint, so it is turned by theta = torque / stiffness (in joint
+    axes), and ``joint_settled`` turns it back: drawn = rest * settled. Writes both fields and returns the model.
+    A bunch with clusters weighs what its head and they weigh.
+    """
+    if not (model.joint_stiffness > 0.0).all():
+        body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
+        raise ValueError(
+            f"body {body} has joint stiffness {model.joint_stiffness[body]}; all must be positive to carry weight"
+        )
+    drawn = frames.normalize(model.body_rest.astype(float))
+    world = model.forward(np.broadcast_to(frames.IDENTITY, drawn.shape))
+    depth, parent = model.depth(), model.body_parent
+    mass, com = model.body_mass.astype(float), model.body_com.astype(float)
+    fine = model.bunch_clusters > 0
+    mass[model.bunch_body[fine]] = model.bunch_head_mass[fine]
+    com[model.bunch_body[fine]] = model.bunch_head_com[fine]
+    force = mass[:, None] * GRAVITY
+    moment = np.cross(frames.rotate(world[:, 3:], com), force)
+    for level in range(int(depth.max(initial=0)), 0, -1):
+        here = np.flatnonzero(depth == level)
+        above = parent[here]
+        np.add.at(force, above, force[here])
+        np.add.at(moment, above, moment[here] + np.cross(world[here, :3] - world[above, :3], force[here]))
+    settled = np.broadcast_to(frames.IDENTITY, drawn.shape)
+    local = frames.rotate(frames.conjugate(world[:, 3:]), moment)
+    for _ in range(60):  # the joint's axes depend on the answer; the map contracts for theta below ~1 rad
+        before = settled
+        settled = frames.exp(frames.rotate(settled, local) / model.joint_stiffness)
+        if np.abs(settled - before).max(initial=0.0) < 1e-12:
+            break
+    model.body_rest[:] = frames.multiply(drawn, frames.conjugate(settled))
+    model.joint_settled[:] = settled
+    return model
+
+
+def assemble(trees: list[Tree], **others: np.ndarray) -> Model:
+    """One :class:`Model` of all trees; ``others`` are whole arrays of the rest (``fixed_start=...``)."""
+    counts = {
+        "tree": len(trees),
+        "body": sum(len(t.bodies) + len(t.clusters) for t in trees),
+        "bunch": sum(len(t.bunches) for t in trees),
+        "leaf": sum(len(t.leaves) for t in trees),
+        "fixed": len(others.get("fixed_start", ())),
+        "tie": len(others.get("tie_body", ())),
+        "box": len(others.get("box_pose", ())),
+    }
+    model = Model.allocate(**counts)
+    first = bunch = leaf = 0
+    for number, tree in enumerate(trees):
+        size, core = len(tree.bodies) + len(tree.clusters), len(tree.bodies)
+        model.tree_first[number], model.tree_size[number], model.tree_core[number] = first, size, core
+        model.tree_pose[number], model.tree_vine[number] = tree.pose, tree.vine
+        for i, body in enumerate([*tree.bodies, *tree.clusters]):
+            at = first + i
+            parent = i - 1 if body["parent"] is None else body["parent"]
+            model.body_tree[at] = number
+            model.body_parent[at] = first + parent if parent >= 0 else -1
+            for key in ("organ", "offset", "rest", "mass", "com", "inertia", "length", "radius"):
+                if key in body:
+                    getattr(model, f"body_{key}")[at] = body[key]
+            for key in ("stiffness", "damping", "settled"):
+                if key in body:
+                    getattr(model, f"joint_{key}")[at] = body[key]
+        for fields in tree.bunches:
+            for key, value in fields.items():
+                getattr(model, f"bunch_{key}")[bunch] = value + first if key == "body" else value
+            if fields.get("clusters", 0):
+                model.bunch_cluster[bunch] = first + core
+                core += fields["clusters"]
+            bunch += 1
+        for fields in tree.leaves:
+            for key, value in fields.items():
+                getattr(model, f"leaf_{key}")[leaf] = value + first if key == "body" else value
+            leaf += 1
+        first += size
+    for name, value in others.items():
+        target = getattr(model, name)
+        target[:] = np.asarray(value).reshape(target.shape)
+    return model.check()

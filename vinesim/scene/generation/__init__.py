@@ -1,0 +1,1 @@
+"""From a scene file to a model: old wood, wires, shoots, leaves and bunches."""

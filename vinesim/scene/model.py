@@ -1,0 +1,173 @@
+"""The constants of one generated vineyard: flat arrays, written once, shared by every room.
+
+Plants are *trees* of rigid *bodies* (Featherstone's word; a body is a piece of cane, of peduncle, or a bunch).
+The bodies of a tree lie together and in topological order: a parent always stands before its children.
+Every organ grows along its body's +x axis, from the joint at the body's origin.
+
+Body ``b`` hangs on a ball joint. Its joint frame is fixed in the parent: origin ``body_offset``, axes ``body_rest``;
+``State.joint_q`` turns the body against that frame, and at ``joint_q`` = identity the spring is slack.
+So ``world pose of b = pose of parent * (body_offset, body_rest) * (0, joint_q)``. Roots hang on ``tree_pose``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.arrays import Arrays, array
+from vinesim.scene.ids import Organ
+
+_UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+_UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclasses.dataclass
+class Model(Arrays):
+    """Constants of a vineyard (units in the declarations; frames in the module's text)."""
+
+    # trees: the smallest thing that wakes, sleeps, is owned and is transmitted
+    tree_first: np.ndarray = array("tree", unit="1", dtype=np.int32)
+    """Index of the tree's root body."""
+    tree_size: np.ndarray = array("tree", unit="1", dtype=np.int32)
+    """How many bodies follow from ``tree_first`` on."""
+    tree_pose: np.ndarray = array("tree", 7, unit="m, 1", fill=_UNIT_POSE)
+    """Pose in the world of the frame on which the root's joint sits."""
+    tree_vine: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
+    tree_core: np.ndarray = array("tree", unit="1", dtype=np.int32)
+    """How many of its bodies move while nobody is close; the rest are the berry clusters of its bunches, which then
+    ride on their bunch as one *compound*. A tree without clusters is all core."""
+
+    # bodies
+    body_tree: np.ndarray = array("body", unit="1", dtype=np.int32)
+    body_parent: np.ndarray = array("body", unit="1", dtype=np.int32, fill=-1)
+    """Index of the parent body in the whole model, -1 for a root."""
+    body_organ: np.ndarray = array("body", unit="1", dtype=np.int32, fill=int(Organ.CANE))
+    body_offset: np.ndarray = array("body", 3, unit="m")
+    """The joint, in the parent body's frame (in the frame of ``tree_pose`` for a root)."""
+    body_rest: np.ndarray = array("body", 4, unit="1", fill=_UNIT_QUAT)
+    """Rest rotation: axes of the joint frame in the parent body's frame."""
+    body_mass: np.ndarray = array("body", unit="kg")
+    body_com: np.ndarray = array("body", 3, unit="m")
+    """Centre of mass in the body's frame."""
+    body_inertia: np.ndarray = array("body", 3, unit="kg m^2")
+    """Principal moments about the centre of mass, along the body's axes."""
+    body_length: np.ndarray = array("body", unit="m")
+    body_radius: np.ndarray = array("body", 2, unit="m")
+    """Radius at the origin and at the tip."""
+    body_drag: np.ndarray = array("body", unit="m^2")
+    """Drag area Cd A of leaves and wood in the wind, acting at the centre of mass."""
+    joint_stiffness: np.ndarray = array("body", 3, unit="N m/rad")
+    """About the joint frame's axes: torsion, bending, bending."""
+    joint_damping: np.ndarray = array("body", 3, unit="N m s/rad")
+    joint_settled: np.ndarray = array("body", 4, unit="1", fill=_UNIT_QUAT)
+    """``joint_q`` of the equilibrium under gravity: the shape the author drew."""
+
+    # bunches: bodies of organ BUNCH, the last of their peduncle; one compound each, filled with berries
+    bunch_body: np.ndarray = array("bunch", unit="1", dtype=np.int32)
+    bunch_variety: np.ndarray = array("bunch", unit="1", dtype=np.int32)
+    """Index into ``world.berries.VARIETIES``."""
+    bunch_seed: np.ndarray = array("bunch", unit="1", dtype=np.uint32)
+    bunch_length: np.ndarray = array("bunch", unit="m")
+    bunch_radius: np.ndarray = array("bunch", unit="m")
+    """Largest radius of the ellipsoid-like hull; its axis is the body's +x."""
+    bunch_berries: np.ndarray = array("bunch", unit="1", dtype=np.int32)
+    bunch_pull: np.ndarray = array("bunch", unit="N", fill=60.0)
+    """Pulling force that parts the peduncle."""
+    bunch_bend: np.ndarray = array("bunch", unit="N m", fill=2.0)
+    """Moment that breaks the peduncle."""
+    bunch_cluster: np.ndarray = array("bunch", unit="1", dtype=np.int32, fill=-1)
+    """First body of its berry clusters (Organ.BUNCH, behind the core of the tree), -1 if it has none: then the bunch is
+    always one compound. ``body_mass``, ``body_com`` and ``body_inertia`` of ``bunch_body`` are the compound's."""
+    bunch_clusters: np.ndarray = array("bunch", unit="1", dtype=np.int32)
+    """How many clusters follow from ``bunch_cluster`` on."""
+    bunch_head_mass: np.ndarray = array("bunch", unit="kg")
+    """What of ``bunch_body`` is no cluster: the head of the rachis. Compound = head + clusters at ``joint_settled``."""
+    bunch_head_com: np.ndarray = array("bunch", 3, unit="m")
+    bunch_head_inertia: np.ndarray = array("bunch", 3, unit="kg m^2")
+
+    # ties: canes bound to wires; springs between a point of a body and a point of the world, slack as drawn
+    tie_body: np.ndarray = array("tie", unit="1", dtype=np.int32)
+    """Sorted."""
+    tie_point: np.ndarray = array("tie", 3, unit="m")
+    """In the body's frame."""
+    tie_anchor: np.ndarray = array("tie", 3, unit="m")
+    """In the world."""
+    tie_stiffness: np.ndarray = array("tie", unit="N/m")
+    tie_damping: np.ndarray = array("tie", unit="N s/m")
+
+    # leaves ride on bodies; seen by sensors, felt as drag and mass only
+    leaf_body: np.ndarray = array("leaf", unit="1", dtype=np.int32)
+    leaf_base: np.ndarray = array("leaf", 3, unit="m")
+    """Where the petiole leaves the cane, in the body's frame."""
+    leaf_pose: np.ndarray = array("leaf", 7, unit="m, 1", fill=_UNIT_POSE)
+    """Blade frame in the body's frame: origin where petiole meets blade, x along the midrib, z the upper side."""
+    leaf_size: np.ndarray = array("leaf", unit="m")
+    """Half of the blade's width: the scale of the outline."""
+    leaf_age: np.ndarray = array("leaf", unit="1")
+    """0 young and green to 1 yellow."""
+
+    # fixed wood, posts and wires: round cones from ``fixed_start`` to ``fixed_end``
+    fixed_start: np.ndarray = array("fixed", 3, unit="m")
+    fixed_end: np.ndarray = array("fixed", 3, unit="m")
+    fixed_radius: np.ndarray = array("fixed", 2, unit="m")
+    fixed_organ: np.ndarray = array("fixed", unit="1", dtype=np.int32, fill=int(Organ.POLE))
+    fixed_index: np.ndarray = array("fixed", unit="1", dtype=np.int32)
+    """Which pole, wire, trunk or arm this piece belongs to."""
+
+    # picking boxes: open crates, dynamic
+    box_pose: np.ndarray = array("box", 7, unit="m, 1", fill=_UNIT_POSE)
+    """Start pose of the centre of the crate's bottom (x along the length)."""
+    box_size: np.ndarray = array("box", 3, unit="m")
+    """Outer length, width, height."""
+    box_mass: np.ndarray = array("box", unit="kg")
+
+    def digest(self) -> str:
+        """Hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
+        h = hashlib.blake2b(digest_size=8)
+        for name in self.dims():
+            h.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        return h.hexdigest()
+
+    def bodies_of(self, tree: int) -> slice:
+        """The bodies of one tree."""
+        first = int(self.tree_first[tree])
+        return slice(first, first + int(self.tree_size[tree]))
+
+    def forward(self, joint_q: np.ndarray) -> np.ndarray:
+        """World poses of all bodies [body, 7] for joint rotations [body, 4] (loops over depth: not for the tick)."""
+        body_q = np.zeros((len(self.body_mass), 7))
+        joint = np.concatenate([self.body_offset, frames.multiply(self.body_rest, joint_q)], -1).astype(float)
+        depth = self.depth()
+        for level in range(int(depth.max(initial=-1)) + 1):
+            here = np.flatnonzero(depth == level)
+            parent = self.body_parent[here]
+            base = np.where((parent < 0)[:, None], self.tree_pose[self.body_tree[here]], body_q[parent])
+            body_q[here] = frames.compose(base, joint[here])
+        return body_q
+
+    def bunch_of(self) -> np.ndarray:
+        """Which bunch a body belongs to [body]: its own body, its clusters and its peduncle; -1 for all others."""
+        owner = np.full(len(self.body_mass), -1, np.int32)
+        owner[self.bunch_body] = bunch = np.arange(len(self.bunch_body), dtype=np.int32)
+        for k in range(int(self.bunch_clusters.max(initial=0))):
+            has = bunch[self.bunch_clusters > k]
+            owner[self.bunch_cluster[has] + k] = has
+        body = self.body_parent[self.bunch_body]
+        while len(body):
+            stalk = (body >= 0) & (self.body_organ[body] == int(Organ.PEDUNCLE))
+            body, bunch = body[stalk], bunch[stalk]
+            owner[body] = bunch
+            body = self.body_parent[body]
+        return owner
+
+    def depth(self) -> np.ndarray:
+        """Number of bodies between each body and its root [body]."""
+        depth = np.zeros(len(self.body_mass), np.int32)
+        above = self.body_parent.copy()
+        while (above >= 0).any():
+            depth += above >= 0
+            above = np.where(above >= 0, self.body_parent[above], -1)
+        return depth

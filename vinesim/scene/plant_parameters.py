@@ -1,0 +1,198 @@
+"""What a grapevine is made of: numbers read from ``data/plants``, each with unit, grade and source."""
+
+from __future__ import annotations
+
+import functools
+import typing
+from typing import Annotated, Literal
+
+import msgspec
+
+from vinesim.scene.data_files import find
+from vinesim.scene.toml_loader import DataError, read
+
+
+class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One sourced number."""
+
+    value: float
+    unit: str
+    grade: Literal["READ", "DERIVED", "GUESSED"]
+    source: str
+
+
+class Range(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Two sourced numbers: from one to the other."""
+
+    value: tuple[float, float]
+    unit: str
+    grade: Literal["READ", "DERIVED", "GUESSED"]
+    source: str
+
+    def at(self, share: typing.Any) -> typing.Any:
+        """The value at ``share`` 0..1 of the way."""
+        return self.value[0] + (self.value[1] - self.value[0]) * share
+
+
+class Colour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sourced linear RGB reflectance."""
+
+    value: tuple[float, float, float]
+    unit: str
+    grade: Literal["READ", "DERIVED", "GUESSED"]
+    source: str
+
+
+class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
+class Cane(_Part, frozen=True, kw_only=True):
+    """A shoot of this year, woody at its base and green at its tip; and the side shoot that may fork from it."""
+
+    length: Annotated[Range, "m"]
+    nodes: Annotated[Range, "1"]
+    base_diameter: Annotated[Range, "m"]
+    tip_diameter: Annotated[Number, "m"]
+    woody_modulus: Annotated[Number, "Pa"]
+    green_modulus: Annotated[Number, "Pa"]
+    woody_share: Annotated[Number, "1"]
+    density: Annotated[Number, "kg/m^3"]
+    damping: Annotated[Number, "s"]
+    first_bunch_node: Annotated[Range, "1"]
+    lateral_share: Annotated[Number, "1"]
+    lateral_length: Annotated[Range, "m"]
+    lateral_diameter: Annotated[Number, "m"]
+    drag: Annotated[Number, "1"]
+
+
+class Peduncle(_Part, frozen=True, kw_only=True):
+    """The stalk on which a bunch hangs."""
+
+    length: Annotated[Range, "m"]
+    diameter: Annotated[Range, "m"]
+    modulus: Annotated[Number, "Pa"]
+    density: Annotated[Number, "kg/m^3"]
+    damping: Annotated[Number, "s"]
+    pull: Annotated[Range, "N"]
+    bend_strength: Annotated[Number, "Pa"]
+
+
+class Bunch(_Part, frozen=True, kw_only=True):
+    """The fruit."""
+
+    mass: Annotated[Number, "kg"]
+    mass_variation: Annotated[Number, "1"]
+    mass_range: Annotated[Range, "kg"]
+    length_range: Annotated[Range, "m"]
+    stem_share: Annotated[Number, "1"]
+    drag: Annotated[Number, "1"]
+
+
+class Rachis(_Part, frozen=True, kw_only=True):
+    """The stem inside a bunch, from the peduncle down, with the berries that lean on each other around it."""
+
+    piece: Annotated[Number, "m"]
+    diameter: Annotated[Range, "m"]
+    modulus: Annotated[Number, "Pa"]
+    damping: Annotated[Number, "s"]
+
+
+class Leaf(_Part, frozen=True, kw_only=True):
+    """Blade and petiole."""
+
+    area: Annotated[Range, "m^2"]
+    young_area: Annotated[Number, "1"]
+    mass_per_area: Annotated[Number, "kg/m^2"]
+    petiole: Annotated[Range, "m"]
+    petiole_mass: Annotated[Number, "kg"]
+    drag: Annotated[Number, "1"]
+
+
+class Arm(_Part, frozen=True, kw_only=True):
+    """Permanent wood on the wires, from which shoots spring."""
+
+    diameter: Annotated[Range, "m"]
+    share: Annotated[Number, "1"]
+    tendone_arms: Annotated[Number, "1"]
+    tendone_shoots: Annotated[Number, "1"]
+    vsp_arms: Annotated[Number, "1"]
+    vsp_shoots: Annotated[Number, "1"]
+
+
+class Trunk(_Part, frozen=True, kw_only=True):
+    """From the ground to the head."""
+
+    diameter: Annotated[Range, "m"]
+    beside_pole: Annotated[Number, "m"]
+
+
+class Trellis(_Part, frozen=True, kw_only=True):
+    """Poles and wires."""
+
+    pole_diameter: Annotated[Number, "m"]
+    wire_diameter: Annotated[Number, "m"]
+    tendone_wire_spacing: Annotated[Number, "m"]
+    vsp_wire_spacing: Annotated[Number, "m"]
+    vsp_wires: Annotated[Number, "1"]
+    wire_tension: Annotated[Number, "N"]
+    tie_reach: Annotated[Number, "m"]
+    tie_string: Annotated[Number, "m"]
+    tie_damping: Annotated[Number, "s"]
+
+
+class Vine(_Part, frozen=True, kw_only=True):
+    """All parameters of a vine and its trellis."""
+
+    cane: Cane
+    peduncle: Peduncle
+    bunch: Bunch
+    rachis: Rachis
+    leaf: Leaf
+    arm: Arm
+    trunk: Trunk
+    trellis: Trellis
+
+
+class Berry(_Part, frozen=True, kw_only=True):
+    """Berries of one variety."""
+
+    name: str
+    colour: Annotated[Colour, "1"]
+    radius: Annotated[Number, "m"]
+    elongation: Annotated[Number, "1"]
+
+
+class Varieties(_Part, frozen=True, kw_only=True):
+    """The file of varieties."""
+
+    varieties: tuple[Berry, ...]
+
+
+@functools.cache
+def load(name: str) -> Vine:
+    """Parameters from a file, or from the one of that name in ``data/plants``; :class:`DataError` if a unit is off."""
+    path = find("plants", name, ".toml")
+    vine = read(path, Vine)
+    _check_units(vine, str(path))
+    return vine
+
+
+def load_varieties() -> tuple[Berry, ...]:
+    """The varieties that ship with vinesim, in the order of ``Model.bunch_variety``."""
+    path = find("plants", "varieties", ".toml")
+    varieties = read(path, Varieties).varieties
+    for i, berry in enumerate(varieties):
+        _check_units(berry, f"{path}: varieties[{i}]")
+    return varieties
+
+
+def _check_units(part: msgspec.Struct, place: str) -> None:
+    hints = typing.get_type_hints(type(part), include_extras=True)
+    for name in part.__struct_fields__:
+        value, unit = getattr(part, name), getattr(hints[name], "__metadata__", None)
+        if isinstance(value, _Part):
+            _check_units(value, f"{place}: {name}" if ":" not in place else f"{place}.{name}")
+        elif unit and value.unit != unit[0]:
+            joint = "." if ": " in place else ": "
+            raise DataError(f"{place}{joint}{name}.unit is {value.unit!r}; give the value in {unit[0]!r}")

@@ -1,0 +1,192 @@
+"""What a scene file says: a vineyard's layout, season, fruit, boxes, sun, and where robots start.
+
+Lengths in metres, angles in radians, axes as in :mod:`vinesim.frames`. The first vine of the first row stands at the
+origin; vines follow along +x, rows along +y, so that a longer row or one row more moves nobody.
+"""
+
+from __future__ import annotations
+
+import math
+import pathlib
+from typing import Annotated, Literal
+
+import msgspec
+
+from vinesim.scene import plant_parameters
+from vinesim.scene.berries import VARIETIES
+from vinesim.scene.data_files import NotFoundInData, find
+from vinesim.scene.toml_loader import DataError, read
+
+MOST_ROBOTS = 10
+"""Robots that may meet in one vineyard (CANOPIES D6.4 section 2.3)."""
+
+Length = Annotated[float, msgspec.Meta(gt=0.0)]
+"""[m]"""
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+"""[1]"""
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class SceneError(DataError):
+    """A scene that cannot be used; one line with file, place, finding and remedy."""
+
+
+class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
+class Layout(_Part, frozen=True, kw_only=True):
+    """Where the vines stand."""
+
+    rows: Count
+    vines: Count
+    """Vines in each row."""
+    row_spacing: Length
+    vine_spacing: Length
+    height: Length
+    """Of the wire net (tendone) or of the fruiting wire (vsp)."""
+
+
+class Season(_Part, frozen=True, kw_only=True):
+    """How the canopy looks on that day."""
+
+    leafiness: Share = 1.0
+    """Share of the nodes that still carry their leaf."""
+    yellow: Share = 0.05
+    """Share of the leaves that have turned."""
+
+
+class Fruit(_Part, frozen=True, kw_only=True):
+    """What hangs on the vines."""
+
+    bunches: tuple[int, int]
+    """Fewest and most bunches on a vine."""
+    varieties: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    """Names of :data:`vinesim.scene.berries.VARIETIES`; the rows take them in turn."""
+
+
+class Box(_Part, frozen=True, kw_only=True):
+    """A picking box standing on the ground."""
+
+    x: float
+    y: float
+    yaw: float = 0.0
+    size: tuple[Length, Length, Length] = (0.6, 0.4, 0.24)
+    """Outer length, width, height [m]."""
+    mass: Annotated[float, msgspec.Meta(gt=0.0)] = 1.6
+    """[kg], empty"""
+
+
+class Sun(_Part, frozen=True, kw_only=True):
+    """Where the sun stands: fixed by two angles, or on its path from an hour on."""
+
+    azimuth: float = 0.9
+    """[rad] from +x, counter-clockwise seen from above."""
+    elevation: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.9
+    """[rad] above the horizon."""
+    hour: Annotated[float, msgspec.Meta(ge=0.0, le=24.0)] | None = None
+    """Solar time at the start [h]; from there the sun moves, x is east and y north, and the angles do not count."""
+    day: Annotated[int, msgspec.Meta(ge=1, le=366)] = 258
+    """Of the year; 258 is the middle of September, the season of table grapes."""
+    latitude: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.726
+    """[rad] north; 41.6 degrees is Aprilia, Italy, where CANOPIES picks."""
+
+    def direction(self, time: float = 0.0) -> tuple[float, float, float]:
+        """Unit vector from the ground to the sun, world axes, at a simulated time [s]."""
+        if self.hour is not None:
+            # Cooper (1969), to 0.4 degrees
+            declination = math.radians(23.45) * math.sin(2.0 * math.pi * (284 + self.day) / 365.0)
+            return sun_at(self.hour + time / 3600.0, declination, self.latitude)
+        level = math.cos(self.elevation)
+        return level * math.cos(self.azimuth), level * math.sin(self.azimuth), math.sin(self.elevation)
+
+
+def sun_at(hour: float, declination: float, latitude: float) -> tuple[float, float, float]:
+    """Unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude [rad]."""
+    turn = math.radians(15.0) * (hour - 12.0)
+    east = -math.cos(declination) * math.sin(turn)
+    north = math.cos(latitude) * math.sin(declination) - math.sin(latitude) * math.cos(declination) * math.cos(turn)
+    up = math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * math.cos(turn)
+    return east, north, up
+
+
+class Wind(_Part, frozen=True, kw_only=True):
+    """How the air moves; see :class:`vinesim.physics.plants.wind.Wind`. Calm unless said."""
+
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[m/s] world axes"""
+    gusts: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
+    """Standard deviation of each component about the mean [m/s]."""
+    scale: Length = 4.0
+    """Of the gusts [m]."""
+
+
+class Spawn(_Part, frozen=True, kw_only=True):
+    """A named place where a robot or a person starts, on the ground."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1)]
+    x: float
+    y: float
+    yaw: float = 0.0
+
+
+class Scene(_Part, frozen=True, kw_only=True):
+    """One vineyard as its file describes it."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1)]
+    seed: Annotated[int, msgspec.Meta(ge=0)]
+    training: Literal["tendone", "vsp"]
+    """Overhead net (tendone) or vertical shoot positioning (vsp)."""
+    plants: str = "vine"
+    """File of plant parameters in ``data/plants``."""
+    layout: Layout
+    season: Season = Season()
+    fruit: Fruit
+    boxes: tuple[Box, ...] = ()
+    sun: Sun = Sun()
+    wind: Wind = Wind()
+    spawns: tuple[Spawn, ...] = ()
+
+
+def load(path_or_name: str | pathlib.Path) -> Scene:
+    """The scene in a file, or the one of that name in ``data/scenes``; :class:`SceneError` in one line otherwise."""
+    try:
+        path = find("scenes", str(path_or_name), ".toml")
+    except NotFoundInData as missing:
+        raise SceneError(str(missing)) from None
+    scene = read(path, Scene, SceneError)
+    trouble = _trouble(scene)
+    if trouble:
+        raise SceneError(f"{path}: {trouble}")
+    return scene
+
+
+def _trouble(scene: Scene) -> str:
+    """What the types cannot say: place, finding, remedy; empty if all is well."""
+    low, high = scene.fruit.bunches
+    if not 0 <= low <= high:
+        return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
+    known = [v.name for v in VARIETIES]
+    for i, name in enumerate(scene.fruit.varieties):
+        if name not in known:
+            return f"fruit.varieties[{i}] is {name!r}; give one of: {', '.join(known)}"
+    if len(scene.spawns) > MOST_ROBOTS:
+        return f"spawns has {len(scene.spawns)} entries; give at most {MOST_ROBOTS}"
+    try:
+        plant_parameters.load(scene.plants)
+    except (NotFoundInData, DataError) as bad:
+        return f"plants is {scene.plants!r}; {bad}"
+    names = [s.name for s in scene.spawns]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            return f"spawns[{i}].name is {name!r}, as spawns[{names.index(name)}].name; give each its own name"
+    return ""
+
+
+def reseeded(scene: Scene, seed: int | None) -> Scene:
+    """The same scene grown from another seed; None keeps its own."""
+    if seed is None:
+        return scene
+    if seed < 0:
+        raise SceneError(f"seed is {seed}: give 0 or more")
+    return msgspec.structs.replace(scene, seed=seed)

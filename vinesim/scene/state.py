@@ -1,0 +1,44 @@
+"""What changes: joint rotations and rates, who is awake, what is attached; poses derived from them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.arrays import Arrays, array
+from vinesim.scene.model import Model
+
+
+@dataclasses.dataclass
+class State(Arrays):
+    """State of all plants. Rigid things (robots, boxes, hands) keep theirs in MuJoCo."""
+
+    joint_q: np.ndarray = array("body", 4, unit="1", fill=(0.0, 0.0, 0.0, 1.0))
+    """Rotation of the body in its joint frame, xyzw."""
+    joint_qd: np.ndarray = array("body", 3, unit="rad/s")
+    """Angular velocity of the body against its parent, in joint-frame axes."""
+    body_q: np.ndarray = array("body", 7, unit="m, 1", fill=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    """World pose (position, quaternion xyzw), derived from ``joint_q``."""
+    body_qd: np.ndarray = array("body", 6, unit="m/s, rad/s")
+    """World velocity of the body's origin, then angular velocity, derived from ``joint_qd``."""
+    body_cut: np.ndarray = array("body", unit="1", dtype=np.bool_)
+    """Whether the body has been cut off its parent: then it is a floating root of what grows on it, ``joint_q`` its
+    rotation in the world and ``joint_qd`` its angular velocity in world axes."""
+    joint_x: np.ndarray = array("body", 3, unit="m")
+    """World position of a body that has been cut off; of no meaning for others."""
+    joint_xd: np.ndarray = array("body", 3, unit="m/s")
+    """World velocity of its origin."""
+    tree_fine: np.ndarray = array("tree", unit="1", dtype=np.bool_)
+    """Whether the berry clusters of the tree's bunches move, each for itself; else each bunch is one compound."""
+    tree_awake: np.ndarray = array("tree", unit="1", dtype=np.bool_)
+    bunch_attached: np.ndarray = array("bunch", unit="1", dtype=np.bool_, fill=1)
+
+    @classmethod
+    def at_rest(cls, model: Model) -> State:
+        """Everything asleep in the authored shape."""
+        counts = model.counts()
+        state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
+        state.joint_q[:] = model.joint_settled
+        state.body_q[:] = model.forward(state.joint_q)
+        return state

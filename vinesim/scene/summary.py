@@ -1,0 +1,45 @@
+"""What a generated vineyard holds, as a table."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene import leaves
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene
+
+
+def table(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
+    """Rows of (quantity, value, unit)."""
+    counts, layout = model.counts(), scene.layout
+    vines = layout.rows * layout.vines
+    ground = vines * layout.row_spacing * layout.vine_spacing
+    bent = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)
+    memory = sum(getattr(model, name).nbytes for name in model.dims())
+    fruit = model.body_mass[model.bunch_body].sum()
+    return [
+        ("scene", f"{scene.name}, {scene.training}, seed {scene.seed}", ""),
+        ("ground", f"{ground:.0f}", "m^2"),
+        ("vines", f"{vines}", ""),
+        ("trees (shoots)", f"{counts['tree']}", ""),
+        ("bodies", f"{counts['body']}", ""),
+        ("bodies of the largest tree", f"{model.tree_size.max(initial=0)}", ""),
+        ("bunches", f"{counts['bunch']}", ""),
+        ("berries", f"{model.bunch_berries.sum()}", ""),
+        ("fruit per vine", f"{fruit / vines:.1f}", "kg"),
+        ("leaves", f"{counts['leaf']}", ""),
+        ("leaf area index", f"{leaf_area(model) / ground:.2f}", "m^2/m^2"),
+        ("poles, wires, old wood", f"{counts['fixed']}", "pieces"),
+        ("boxes", f"{counts['box']}", ""),
+        ("start places", ", ".join(s.name for s in scene.spawns) or "none", ""),
+        ("largest settled angle", f"{bent.max(initial=0.0):.2f}", "rad"),
+        ("memory", f"{memory / 1e6:.1f}", "MB"),
+        ("digest", model.digest(), ""),
+    ]
+
+
+def leaf_area(model: Model) -> float:
+    """One side of all blades, flat [m^2]."""
+    unit = np.array([leaves.area(shape) for shape in range(leaves.SHAPES)])
+    return float((unit[leaves.shape_of(np.arange(len(model.leaf_size)))] * model.leaf_size.astype(float) ** 2).sum())

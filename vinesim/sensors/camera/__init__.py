@@ -1,0 +1,1 @@
+"""RGB-D cameras: rasterisers, light, exposure, stereo depth, point clouds."""

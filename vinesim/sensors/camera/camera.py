@@ -1,0 +1,340 @@
+"""RGB-D cameras: a picture, labels, exact depth, and depth as the sensor measures it.
+
+Depth follows REP-118: metres along the optical axis; -Inf nearer than the sensor can measure, +Inf farther than it can,
+which includes the open sky; NaN for a pixel that should have measured and did not (:mod:`vinesim.sensors.camera.stereo`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import warp as wp
+
+from vinesim import frames
+from vinesim.kernels.raster import camera_raster
+from vinesim.kernels.raster import primitives as shapes
+from vinesim.kernels.shading import deferred
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.plant_parameters import Number
+from vinesim.scene.values import CameraFrame, CameraInfo
+from vinesim.sensors import spec_file
+from vinesim.sensors.camera.exposure import Exposure
+from vinesim.sensors.camera.stereo import Stereo, StereoSpec
+from vinesim.sensors.camera.sunlight import DEFAULT_SUN, Sunlight, SunPath
+from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
+from vinesim.sensors.scene.primitives import Primitives
+
+REACH = 500.0
+"""Nothing is drawn beyond this depth [m]."""
+_RASTER = (
+    (camera_raster.raster_cones, (CONE,)),
+    (camera_raster.raster_spheroids, (SPHEROID,)),
+    (camera_raster.raster_triangles, (TRIANGLE,)),
+    (camera_raster.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
+    (camera_raster.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
+)
+_STAGE = np.array([next(i for i, (_, kinds) in enumerate(_RASTER) if kind in kinds) for kind in range(TRIANGLE + 1)])
+"""Which of these draws a kind."""
+
+
+class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One kind of camera (``data/cameras``)."""
+
+    model: str
+    width: Annotated[Number, "px", (1.0, 8192.0)]
+    height: Annotated[Number, "px", (1.0, 8192.0)]
+    fx: Annotated[Number, "px", (1.0, 1e6)]
+    fy: Annotated[Number, "px", (1.0, 1e6)]
+    nearest: Annotated[Number, "m", (0.0, 1000.0)]
+    """Smallest depth that is measured."""
+    farthest: Annotated[Number, "m", (0.0, 1000.0)]
+    """Largest depth that is measured."""
+    rate: Annotated[Number, "Hz", (0.01, 1000.0)]
+    stereo: StereoSpec | None = None
+    """How depth is measured; exactly unless given."""
+
+    @classmethod
+    def load(cls, name: str) -> CameraSpec:
+        """The spec in a file, or the one of that name in ``data/cameras``."""
+        spec = spec_file.load("cameras", name, cls)
+        if not 0.0 <= spec.nearest.value < spec.farthest.value:
+            raise spec_file.SensorError(
+                f"camera {name!r} measures from {spec.nearest.value} to {spec.farthest.value} m, which is no range; "
+                "give 0 <= nearest < farthest"
+            )
+        return spec
+
+    def ideal(self) -> CameraSpec:
+        """The same camera if it measured exactly and from anywhere."""
+        number = msgspec.structs.replace
+        near, far = number(self.nearest, value=0.0), number(self.farthest, value=1000.0)
+        return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None)
+
+    def info(self, frame_id: str, scale: float = 1.0) -> CameraInfo:
+        """Intrinsics with the principal point in the middle; ``scale`` enlarges the picture."""
+        width, height = round(self.width.value * scale), round(self.height.value * scale)
+        return CameraInfo(
+            width,
+            height,
+            self.fx.value * scale,
+            self.fy.value * scale,
+            0.5 * (width - 1),
+            0.5 * (height - 1),
+            frame_id,
+        )
+
+
+def pinhole(info: CameraInfo, pose: np.ndarray) -> camera_raster.Pinhole:
+    """Intrinsics and pose [7] of the optical frame as kernels need them."""
+    if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
+        raise ValueError(
+            f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; give positive ones"
+        )
+    pose = np.asarray(pose, float)
+    if not np.isfinite(pose).all():
+        raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
+    lens = camera_raster.Pinhole()
+    lens.eye = wp.vec3(*map(float, pose[:3]))
+    lens.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+    lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
+    lens.width, lens.height, lens.reach = int(info.width), int(info.height), REACH
+    wide = max(info.cx, info.width - info.cx) / info.fx
+    high = max(info.cy, info.height - info.cy) / info.fy
+    lens.close = float(camera_raster.CLOSE) * float(np.sqrt(1.0 + wide * wide + high * high))
+    return lens
+
+
+def finer(info: CameraInfo, samples: int) -> CameraInfo:
+    """Intrinsics of the same view with ``samples`` squared pixels for each one."""
+    return dataclasses.replace(
+        info,
+        width=info.width * samples,
+        height=info.height * samples,
+        fx=info.fx * samples,
+        fy=info.fy * samples,
+        cx=samples * (info.cx + 0.5) - 0.5,
+        cy=samples * (info.cy + 0.5) - 0.5,
+    )
+
+
+class Visibility:
+    """Nearest primitive of every pixel; the buffers of one camera."""
+
+    def __init__(self, width: int, height: int, device: str = "cpu") -> None:
+        count = width * height
+        self.width, self.height, self.device = width, height, device
+        self.keys = wp.empty(count, dtype=wp.int64, device=device)
+        self._keys = self.keys.numpy() if device == "cpu" else None
+        self.primitive = wp.empty(count, dtype=wp.int32, device=device)
+        self.depth = wp.empty(count, dtype=float, device=device)
+        self.labels = wp.empty(count, dtype=wp.int32, device=device)
+        self._distance = wp.empty(0, dtype=float, device=device)
+
+    def draw(
+        self, primitives: Primitives, lens: camera_raster.Pinhole, nearest: float = 0.0, farthest: float = REACH
+    ) -> None:
+        """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
+        if primitives.raster is None:
+            distance = self.distances(primitives, lens)
+            seen = np.flatnonzero(distance < float(shapes.FAR))
+            self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        else:
+            primitives.raster.fill(primitives, lens, None, self.keys)
+        run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        wp.launch(
+            camera_raster.resolve,
+            self.width * self.height // run,
+            inputs=[
+                primitives.labels,
+                self.keys,
+                lens,
+                label(Organ.GROUND, 0),
+                float(nearest),
+                float(farthest),
+                -float("inf"),
+                float("inf"),
+                run,
+            ],
+            outputs=[self.primitive, self.depth, self.labels],
+            device=self.device,
+        )
+
+    def distances(self, primitives: Primitives, lens: camera_raster.Pinhole) -> np.ndarray:
+        """How near each cluster may come to the eye [cluster] m; :data:`shapes.FAR` if no pixel can see it."""
+        clusters = len(primitives.cluster_first)
+        if len(self._distance) != clusters:
+            self._distance = wp.empty(clusters, dtype=float, device=self.device)
+        wp.launch(
+            camera_raster.cull, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
+        )
+        return self._distance.numpy()
+
+    def alone(self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray) -> np.ndarray:
+        """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
+        if primitives.raster is None:
+            self._raster(primitives, lens, clusters)
+        else:
+            primitives.raster.fill(primitives, lens, clusters, self.keys)
+        return self.keys.numpy().reshape(self.height, self.width) < int(camera_raster.EMPTY)
+
+    def _raster(self, primitives: Primitives, lens: camera_raster.Pinhole, seen: np.ndarray) -> None:
+        """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
+        self._keys.fill(int(camera_raster.EMPTY))  # numpy's fill of the same memory: five times as fast
+        seen = np.asarray(seen, np.int32)
+        kind = primitives.cluster_kind[seen]
+        stage = _STAGE[kind]
+        for number, (kernel, _) in enumerate(_RASTER):
+            mine = seen[stage == number]
+            if len(mine):
+                wp.launch(
+                    kernel,
+                    (len(mine), 1),
+                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, 1],
+                    outputs=[self.keys],
+                    device=self.device,
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """How much a picture may cost. Depth and labels are the same in all."""
+
+    taps: int
+    """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""
+    block: int
+    """Pixels, squared, in which one primitive is lit once."""
+    samples: int
+    """Samples, squared, of one pixel's colour."""
+    fine: int
+    """Divides the texels of the shadow map nearby."""
+
+
+QUALITIES = {
+    "fast": Quality(taps=-1, block=2, samples=1, fine=1),
+    "full": Quality(taps=0, block=1, samples=1, fine=1),
+    "still": Quality(taps=12, block=2, samples=2, fine=2),
+}
+"""``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
+
+
+@dataclasses.dataclass
+class Camera:
+    """One RGB-D camera."""
+
+    spec: CameraSpec
+    info: CameraInfo
+    name: str = "camera"
+    sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
+    """Towards the sun, or where it is when."""
+    quality: str = "full"
+    """One of :data:`QUALITIES`."""
+    shadow_period: float | None = None
+    """Moving things get new shadows this often [s]; 0 for every frame; 0.2 unless given, 0 for stills."""
+    exposure: float | None = None
+    """Fixed; automatic unless given. 0.75 suits a sunny noon."""
+    device: str = "cpu"
+    seed: int = 0
+    image: int = 0
+    """Number of the next image. What the sensor measures follows from (seed, name, this)."""
+
+    def __post_init__(self) -> None:
+        if self.quality not in QUALITIES:
+            raise ValueError(f"camera {self.name!r} has the quality {self.quality!r}; give {', '.join(QUALITIES)}")
+        self._quality = quality = QUALITIES[self.quality]
+        width, height, samples = self.info.width, self.info.height, quality.samples
+        period = self.shadow_period
+        if period is None:
+            period = 0.0 if self.quality == "still" else 0.2
+        self.visibility = Visibility(width, height, self.device)
+        self._samples = self.visibility
+        if samples > 1:
+            self._samples = Visibility(width * samples, height * samples, self.device)
+        self._sunlight = Sunlight(self.sun, taps=quality.taps, period=period, fine=quality.fine, device=self.device)
+        self._exposure = Exposure(width, height, samples, self.exposure, self.device)
+        self._landing: list[wp.array] = []
+        reach = self.spec.nearest.value, self.spec.farthest.value
+        self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, Visibility, self.device)
+
+    @property
+    def rate(self) -> float:
+        """Frames a second [Hz]."""
+        return self.spec.rate.value
+
+    def render(
+        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, measure: bool = True
+    ) -> CameraFrame:
+        """The frame seen from ``pose`` [7], the optical frame in the world.
+
+        Who looks at colours only saves the second view by ``measure=False``: depth is then exact, where in range.
+        """
+        pose = np.array(pose, float)
+        picture = self.expose(primitives, pose, time)
+        shape = (self.info.height, self.info.width)
+        rgb, exact, labels = self._fetch(picture, self.visibility.depth, self.visibility.labels)
+        rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
+        if self._stereo and measure:
+            lens, dice = pinhole(self.info, pose), spec_file.dice(self.seed, self.name, self.image)
+            depth = self._stereo.measure(primitives, lens, exact, rgb, dice)
+        else:
+            too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
+            depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
+        self.image += 1
+        return CameraFrame(
+            time=float(time),
+            name=self.name,
+            info=self.info,
+            pose=pose,
+            rgb=rgb,
+            depth=depth,
+            labels=labels.reshape(shape),
+            exact_depth=exact,
+        )
+
+    def _fetch(self, *arrays: wp.array) -> list[np.ndarray]:
+        """Copies for the host: from a GPU through memory that it can write to, all at once."""
+        if self.device != "cpu":
+            if not self._landing:
+                self._landing = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
+            for array, place in zip(arrays, self._landing, strict=True):
+                wp.copy(place, array)
+            wp.synchronize_stream(self.device)
+            arrays = tuple(self._landing)
+        return [a.numpy().copy() for a in arrays]
+
+    def expose(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> wp.array:
+        """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for."""
+        pose = np.array(pose, float)
+        lens = pinhole(self.info, pose)
+        seen = self.visibility
+        seen.draw(primitives, lens)
+        seen, quality = self._samples, self._quality
+        if quality.samples > 1:
+            lens = pinhole(finer(self.info, quality.samples), pose)
+            seen.draw(primitives, lens)
+        forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
+        near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
+        across, down = (-(-n // quality.block) for n in (seen.width, seen.height))
+        run = across if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        wp.launch(
+            deferred.shade,
+            across * down // run,
+            inputs=[
+                primitives.shapes,
+                primitives.looks,
+                self._sunlight.light,
+                near,
+                far,
+                lens,
+                seen.primitive,
+                seen.keys,
+                quality.block,
+                run,
+            ],
+            outputs=[self._exposure.radiance],
+            device=self.device,
+        )
+        self._exposure.halo(primitives, seen.primitive)
+        return self._exposure.develop(self._sunlight.balance, time, self._sunlight.brightness)

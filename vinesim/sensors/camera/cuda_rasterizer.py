@@ -1,0 +1,68 @@
+"""The rasteriser on a GPU: where its lists of pieces live, and how many threads draw them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.raster import camera_raster, cuda_raster
+
+if TYPE_CHECKING:
+    from vinesim.sensors.scene.primitives import Primitives
+
+_LISTS = int(cuda_raster.LISTS)
+
+
+class Tiles:
+    """Fills the keys of pictures of any size; no host waits for a GPU.
+
+    Args:
+        groups: how many pieces are drawn at once, of each list.
+        lanes: threads that draw one piece together.
+        listers: threads that list the pieces of one cluster.
+        block: CUDA threads a block that draw pieces.
+        room: pieces for which each list has room. What finds none is drawn too, only slowly.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        *,
+        groups: int = 1024,
+        lanes: int = 32,
+        listers: int = 8,
+        block: int = 64,
+        room: int = 16384,
+    ) -> None:
+        self.device, self._groups, self._lanes, self._listers = device, groups, lanes, listers
+        self._block = block
+        self._count = wp.zeros(_LISTS, dtype=wp.int32, device=device)
+        self._pieces = wp.empty((_LISTS, room), dtype=wp.vec4i, device=device)
+        self._all = wp.empty(0, dtype=wp.int32, device=device)
+
+    def fill(
+        self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
+    ) -> None:
+        """The nearest primitive of every pixel, of all clusters or of some [k]."""
+        if len(self._all) != len(primitives.cluster_first):
+            self._all = wp.array(np.arange(len(primitives.cluster_first), dtype=np.int32), device=self.device)
+        which = self._all if clusters is None else wp.array(np.asarray(clusters, np.int32), device=self.device)
+        keys.fill_(int(camera_raster.EMPTY))
+        self._count.zero_()
+        wp.launch(
+            cuda_raster.list_pieces,
+            (len(which), self._listers),
+            inputs=[primitives.shapes, primitives.clusters, primitives.ball, which, lens, self._listers],
+            outputs=[self._count, self._pieces, keys],
+            device=self.device,
+        )
+        wp.launch(
+            cuda_raster.draw_pieces,
+            _LISTS * self._groups * self._lanes,
+            inputs=[primitives.shapes, self._count, self._pieces, lens, self._groups, self._lanes],
+            outputs=[keys],
+            device=self.device,
+            block_dim=self._block,
+        )

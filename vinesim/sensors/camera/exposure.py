@@ -1,0 +1,107 @@
+"""From light to pixels: metering, white balance, the halo of lamps, tone."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.shading import deferred
+from vinesim.sensors.scene import textures
+from vinesim.sensors.scene.primitives import Primitives
+
+USUAL = 0.75
+"""Exposure that suits a sunny noon."""
+KEY = 0.13
+"""Exposed light of the usual picture's geometric mean; white is 1."""
+SHARE = 0.5
+"""Of the stops that would bring any picture to the key: what is dark stays darker than what is bright."""
+DUSK = 0.7
+"""Share of the stops by which a low sun gives less light that exposure makes up beforehand."""
+LEAST, MOST = 0.25, 8.0
+"""Exposure stays within these."""
+SETTLING = 0.25
+"""Time in which exposure comes within a factor e, in stops, of what it should be [s]."""
+_STEP = 8
+"""One of so many pixels, squared, is metered."""
+_HALO = ((2.0, 0.5), (9.0, 0.12))
+"""Widths [share of a hundredth of the picture's height] and strengths of the light that a lens scatters."""
+
+
+class Exposure:
+    """The exposure of one camera: automatic, unless ``fixed``."""
+
+    def __init__(
+        self, width: int, height: int, samples: int = 1, fixed: float | None = None, device: str = "cpu"
+    ) -> None:
+        """``width`` and ``height`` of the picture [px], each pixel of ``samples`` squared samples."""
+        self.width, self.height, self.samples, self.fixed, self.device = width, height, samples, fixed, device
+        self.radiance = wp.empty(width * height * samples * samples, dtype=wp.vec3, device=device)
+        self._rgb = wp.empty((width * height, 3), dtype=wp.uint8, device=device)
+        self._sum = wp.zeros(2, dtype=wp.int64, device=device)
+        self._exposure = wp.array([fixed or 0.0], dtype=float, device=device)
+        self._tone = wp.array(textures.tone_curve(), dtype=wp.uint8, device=device)
+        self._time: float | None = None
+
+    def develop(self, balance: np.ndarray, time: float, brightness: float = 1.0) -> wp.array:
+        """The picture [pixel, 3] uint8 of :attr:`radiance`, taken at ``time`` [s]: it stays on the device.
+
+        ``balance`` are factors [3] on linear light; ``brightness`` is that of the daylight beside a sunny noon.
+        """
+        if self.fixed is None:
+            since = np.inf if self._time is None else time - self._time
+            keep = float(np.exp(-since / SETTLING)) if since >= 0.0 else 0.0
+            self._time = time
+            step = _STEP * self.samples
+            across, down = self.width * self.samples, self.height * self.samples
+            if min(across, down) < step:
+                step = 1
+            wp.launch(
+                deferred.meter,
+                (across // step) * (down // step),
+                inputs=[self.radiance, across, down, step],
+                outputs=[self._sum],
+                device=self.device,
+            )
+            wp.launch(
+                deferred.expose,
+                1,
+                inputs=[USUAL * max(brightness, 0.01) ** -DUSK, KEY, SHARE, LEAST, MOST, keep],
+                outputs=[self._sum, self._exposure],
+                device=self.device,
+            )
+        run = self.width if self.device == "cpu" else 1
+        wp.launch(
+            deferred.develop,
+            self.width * self.height // run,
+            inputs=[
+                self.radiance,
+                self.width,
+                self.samples,
+                wp.vec3(*map(float, balance)),
+                self._exposure,
+                self._tone,
+                run,
+            ],
+            outputs=[self._rgb],
+            device=self.device,
+        )
+        return self._rgb
+
+    def halo(self, primitives: Primitives, seen: wp.array) -> None:
+        """Spread some light of the lamps among the seen primitives [sample] around them, as a lens does."""
+        lamps = primitives.lamps
+        if not len(lamps):
+            return
+        lit = np.isin(seen.numpy(), lamps)
+        if not lit.any():
+            return
+        shape = self.height * self.samples, self.width * self.samples
+        radiance = self.radiance.numpy()
+        lamp = (radiance * lit[:, None]).reshape(*shape, 3)
+        spread = np.zeros_like(lamp)
+        for width, strength in _HALO:
+            spread += strength * cv2.GaussianBlur(lamp, (0, 0), width * shape[0] / 100.0)
+        radiance += spread.reshape(-1, 3)
+        if self.device != "cpu":
+            self.radiance.assign(radiance)

@@ -1,0 +1,159 @@
+"""Depth as a stereo camera measures it: RealSense D400 and its kind.
+
+Noise follows sigma_z = z^2 sigma_d / (f B), where sigma_d is the error of disparity. The first imager is taken to sit
+where the picture is taken, the second a baseline to its right: what that one cannot see (to the left of near things)
+has no depth. A window of the matcher sees one surface: it smooths what is uneven, loses what is thin, and lets near
+edges grow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Protocol
+
+import cv2
+import msgspec
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.raster import camera_raster
+from vinesim.kernels.sensing import stereo_depth
+from vinesim.scene.plant_parameters import Number
+from vinesim.scene.values import CameraInfo
+from vinesim.sensors.scene.primitives import Primitives
+
+
+class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How a stereo camera measures (table ``[stereo]`` in ``data/cameras``); pixels are those of its imagers."""
+
+    baseline: Annotated[Number, "m", (0.001, 2.0)]
+    """Between both imagers."""
+    focal: Annotated[Number, "px", (10.0, 10000.0)]
+    """Of the imagers, at the resolution at which they are matched."""
+    field: Annotated[Number, "deg", (10.0, 170.0)]
+    """What the imagers see horizontally."""
+    noise: Annotated[Number, "px", (0.0, 10.0)]
+    """Standard deviation of disparity on a well-textured plane."""
+    step: Annotated[Number, "px", (0.0, 10.0)]
+    """Between two disparities that can be told; 0 for none."""
+    window: Annotated[Number, "px", (1.0, 63.0)]
+    """Side of the matching window: noise is alike within it, and it sees one surface."""
+    fattening: Annotated[Number, "1", (0.1, 10.0)]
+    """How much more the nearest surface in a window weighs than others: above 1 near edges grow."""
+    support: Annotated[Number, "1", (0.0, 1.0)]
+    """Share of a window that must show one surface."""
+    slant_kept: Annotated[Number, "deg", (0.0, 90.0)]
+    """Up to this angle between ray and normal every surface is measured."""
+    slant_lost: Annotated[Number, "deg", (0.0, 90.0)]
+    """From this angle on none is."""
+    contrast: Annotated[Number, "1", (0.0, 255.0)]
+    """Grey levels within a window below which there is no texture but the projector's."""
+    projector: Annotated[Number, "m", (0.0, 100.0)]
+    """How far the projector's texture is seen; nothing of it from twice as far on."""
+    saturation: Annotated[Number, "1", (0.0, 256.0)]
+    """Grey level from which on a window is overexposed."""
+
+
+class View(Protocol):
+    """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.Visibility`)."""
+
+    depth: wp.array
+
+    def draw(self, primitives: Primitives, lens: camera_raster.Pinhole) -> None:
+        """Fill ``depth`` [pixel] m."""
+
+
+class Stereo:
+    """The depth sensor of one camera: its second view, and its luck."""
+
+    def __init__(
+        self,
+        spec: StereoSpec,
+        info: CameraInfo,
+        reach: tuple[float, float],
+        viewer: Callable[[int, int, str], View],
+        device: str = "cpu",
+    ) -> None:
+        """``reach``: nearest and farthest depth [m]; ``viewer`` makes what draws a view of some width and height."""
+        self.info, self.device = info, device
+        s = self._struct = stereo_depth.Stereo()
+        s.baseline, s.reach = spec.baseline.value, spec.focal.value * spec.baseline.value
+        s.scale = min(spec.focal.value / info.fx, 1.0)
+        s.stride = max(1, round(spec.window.value / 5.0 / s.scale))
+        s.sigma, s.step = spec.noise.value, spec.step.value
+        s.nearest, s.farthest = reach
+        s.fattening, s.support = spec.fattening.value, spec.support.value
+        s.slant_kept, s.slant_lost = (float(np.cos(np.radians(a.value))) for a in (spec.slant_kept, spec.slant_lost))
+        reach_of_window = np.sqrt(8.0) * s.stride * s.scale / spec.focal.value
+        s.slope = float(reach_of_window * np.tan(np.radians(min(spec.slant_kept.value, 85.0))))
+        s.contrast, s.projector, s.saturation = spec.contrast.value, spec.projector.value, spec.saturation.value
+        # the second imager must look as far left as the first sees the nearest things, or to the end of its field
+        left, right = -info.cx / info.fx, (info.width - 1 - info.cx) / info.fx
+        edge = max(-float(np.tan(np.radians(0.5 * spec.field.value))), left - s.baseline / max(reach[0], 1e-3))
+        focal = spec.focal.value
+        self._columns = int(np.ceil((right - edge) * focal)) + 1
+        self._rows = int(np.ceil(info.height * focal / info.fy)) + 1
+        self._centre = -edge * focal, info.cy / info.fy * focal
+        self._focal = focal
+        self._second = viewer(self._columns, self._rows, device)
+        self._window = max(1, round(spec.window.value))
+        cells = int(np.ceil(info.height * s.scale)), int(np.ceil(info.width * s.scale))
+        self._luck = wp.empty((2, *cells), dtype=float, device=device)
+        self._depth = wp.empty(info.width * info.height, dtype=float, device=device)
+
+    def measure(
+        self,
+        primitives: Primitives,
+        lens: camera_raster.Pinhole,
+        depth: np.ndarray,
+        rgb: np.ndarray,
+        dice: np.random.Generator,
+    ) -> np.ndarray:
+        """Measured depth [height, width] m where ``depth`` [height, width] m is true and ``rgb`` what it looks like."""
+        second = self._view(lens)
+        self._second.draw(primitives, second)
+        self._luck.assign(self._throw(dice))
+        _, rows, columns = self._luck.shape
+        run = columns if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        wp.launch(
+            stereo_depth.measure,
+            rows * columns // run,
+            inputs=[
+                self._struct,
+                lens,
+                second,
+                wp.array((np.float32(self._struct.reach) / depth).ravel(), dtype=float, device=self.device),
+                wp.array(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel(), dtype=wp.uint8, device=self.device),
+                self._second.depth,
+                self._luck,
+                run,
+            ],
+            outputs=[self._depth],
+            device=self.device,
+        )
+        return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
+
+    def _view(self, lens: camera_raster.Pinhole) -> camera_raster.Pinhole:
+        """The second imager: parallel to the first, a baseline to its right."""
+        other = camera_raster.Pinhole()
+        turn = np.array(lens.turn).reshape(3, 3)
+        other.eye = wp.vec3(*map(float, np.array(lens.eye) + self._struct.baseline * turn[0]))
+        other.turn = lens.turn
+        other.fx = other.fy = float(self._focal)
+        other.cx, other.cy = map(float, self._centre)
+        other.width, other.height, other.reach = self._columns, self._rows, lens.reach
+        wide = max(other.cx, other.width - other.cx) / other.fx
+        high = max(other.cy, other.height - other.cy) / other.fy
+        other.close = float(camera_raster.CLOSE) * float(np.sqrt(1.0 + wide * wide + high * high))
+        return other
+
+    def _throw(self, dice: np.random.Generator) -> np.ndarray:
+        """Two fields [2, row, column] of normal numbers with variance 1, alike within a window."""
+        _, rows, columns = self._luck.shape
+        wide = self._window - 1
+        raw = dice.standard_normal((2, rows + wide, columns + wide), np.float32)
+        if not wide:
+            return raw
+        sums = [cv2.boxFilter(field, -1, (self._window, self._window), normalize=False) for field in raw]
+        low = wide // 2
+        return np.stack([s[low : low + rows, low : low + columns] for s in sums]) / np.float32(self._window)

@@ -1,0 +1,204 @@
+"""Sun, sky and the cached shadow maps of one camera.
+
+Two maps follow the camera: a fine one around what it looks at, a coarse one of the plants far around. A map is drawn
+anew only when the camera has left its middle, or when something inside it has moved, and then at a bounded rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.shading import deferred, shadow_maps
+from vinesim.sensors.scene import textures
+from vinesim.sensors.scene.primitives import Primitives
+
+DEFAULT_SUN = (-0.41, -0.52, 0.75)
+"""Towards the sun: south-west, half-way up."""
+
+
+_SPREAD = (8, 16)
+"""Threads that share the primitives of a cluster, and the rows of each of them, on a GPU."""
+
+
+def _vector(v: np.ndarray) -> wp.vec3:
+    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
+
+
+def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
+    return wp.array(np.stack([x, y], 1).astype(np.float32), dtype=wp.vec2, device=device)
+
+
+class _Map:
+    """One square of depths seen from the sun, around a focus that moves in steps."""
+
+    def __init__(self, texel: float, side: int, ahead: float, slack: float, rigid: bool, device: str) -> None:
+        self.ahead, self.slack, self.rigid, self.device = ahead, slack, rigid, device
+        self._every, self._known = wp.empty(0, dtype=wp.int32, device=device), -1
+        self.struct = shadow_maps.ShadowMap()
+        self.struct.depth = wp.empty(side * side, dtype=float, device=device)
+        self.struct.texel, self.struct.side = float(texel), side
+        self.half = 0.5 * texel * side
+
+    def aim(self, sun: np.ndarray) -> None:
+        """Turn to the sun, a unit vector towards it; nothing that was drawn holds any more."""
+        self.right = np.cross(sun, [0.0, 0.0, 1.0]) if abs(sun[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
+        self.right /= np.linalg.norm(self.right)
+        self.up = np.cross(self.right, sun)
+        self.focus = np.full(3, np.inf)
+        self.time, self.version, self.built = -np.inf, -1, -1
+        self.struct.right, self.struct.up, self.struct.sun = _vector(self.right), _vector(self.up), _vector(sun)
+
+    def follow(self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float, period: float) -> None:
+        """Draw the map anew if it no longer holds for this camera at ``time``."""
+        wanted = eye + self.ahead * forward
+        strayed = not np.linalg.norm(wanted - self.focus) <= self.slack
+        other = self.built != primitives.built
+        if not (strayed or other):
+            due = self.rigid and not 0.0 <= time - self.time < period
+            if not due or not (primitives.cluster_version[self._inside(primitives)] > self.version).any():
+                return
+        if strayed:
+            self.focus = wanted
+        self.time, self.version, self.built = time, primitives.version, primitives.built
+        self._draw(primitives)
+
+    def _inside(self, primitives: Primitives) -> np.ndarray:
+        """Clusters whose shadows may fall into the square."""
+        ball = primitives.ball.numpy()
+        apart = ball[:, :3] - self.focus
+        reach = self.half + ball[:, 3]
+        inside = (ball[:, 3] > 0.0) & (np.abs(apart @ self.right) < reach) & (np.abs(apart @ self.up) < reach)
+        if not self.rigid:
+            inside[primitives.rigid_clusters] = False
+        return np.flatnonzero(inside)
+
+    def _casting(self, primitives: Primitives) -> wp.array:
+        """Clusters that this map shows, wherever they are."""
+        if self._known != primitives.built:
+            every = np.arange(len(primitives.cluster_first), dtype=np.int32)
+            mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
+            self._every, self._known = wp.array(mine, device=self.device), primitives.built
+        return self._every
+
+    def _draw(self, primitives: Primitives) -> None:
+        self.struct.corner = _vector(self.focus - self.half * (self.right + self.up))
+        self.struct.depth.fill_(1.0e9)
+        if self.device == "cpu":
+            which, lanes, slices = wp.array(self._inside(primitives).astype(np.int32), device="cpu"), 1, 1
+        else:  # a GPU culls faster than it can be told what to draw, and wants a thread for every row
+            which, (lanes, slices) = self._casting(primitives), _SPREAD
+        if len(which):
+            wp.launch(
+                shadow_maps.cast_shadows,
+                (len(which), lanes, slices),
+                inputs=[
+                    primitives.shapes,
+                    primitives.clusters,
+                    primitives.ball,
+                    which,
+                    self.struct,
+                    0.25,
+                    lanes,
+                    slices,
+                ],
+                outputs=[self.struct.depth],
+                device=self.device,
+            )
+
+
+SunPath = Callable[[float], tuple[float, float, float]]
+"""Unit vector towards the sun at a simulated time [s]."""
+_STEP = np.cos(np.radians(0.25))
+"""The light is made anew when the sun has moved by a quarter of a degree: once a minute."""
+_NOON = np.array([3.3, 2.95, 2.35])
+"""Light of a sun with :data:`_HIGH` for the sine of its elevation; white is 1 for a sheet in full light."""
+_HIGH = 0.75
+_DEPTH = np.array([0.10, 0.15, 0.27])
+"""Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh's and some haze."""
+_SKY, _HAZE = np.array([0.52, 0.70, 1.0]), np.array([0.50, 0.60, 0.72])
+_BOUNCE, _LEAVES = np.array([0.26, 0.21, 0.13]), np.array([0.14, 0.19, 0.075])
+_ADAPTED = 0.6
+"""Share of the colour of the light that a camera's white balance takes out."""
+
+
+def air_mass(height: float) -> float:
+    """Air on the way of sunlight, 1 from the zenith, by the sine of the sun's elevation (Kasten and Young 1989)."""
+    degrees = np.degrees(np.arcsin(np.clip(height, 0.0, 1.0)))
+    return float(1.0 / (max(height, 0.0) + 0.50572 * (degrees + 6.07995) ** -1.6364))
+
+
+def daylight(height: float) -> tuple[np.ndarray, float]:
+    """Colour [3] of direct sunlight, and how bright the sky is beside its usual self, by the sine of the elevation."""
+    sun = _NOON * np.exp(-_DEPTH * (air_mass(height) - air_mass(_HIGH))) * np.clip(height / 0.02 + 0.5, 0.0, 1.0)
+    return sun, 0.04 + 0.96 * float(np.clip((height + 0.1) / (_HIGH + 0.1), 0.0, 1.0) ** 0.8)
+
+
+class Sunlight:
+    """Light of one camera's surroundings."""
+
+    def __init__(
+        self,
+        sun: tuple[float, float, float] | SunPath = DEFAULT_SUN,
+        *,
+        taps: int = 4,
+        period: float = 0.2,
+        fine: int = 1,
+        device: str = "cpu",
+    ) -> None:
+        """``sun`` points towards the sun, or says where it is when.
+
+        ``taps`` are as in :class:`vinesim.kernels.shading.deferred.Light`; ``period`` [s] as in :class:`Camera`;
+        ``fine`` divides the texels of the shadow map nearby.
+        """
+        self._path: SunPath = sun if callable(sun) else lambda time: sun
+        self.period, self._device = period, device
+        self._stands = np.zeros(3)
+        self.balance = np.ones(3)
+        """White balance: factors [3] on linear light."""
+        self.brightness = 1.0
+        """Light that falls on the ground, beside that of a high sun."""
+        light = deferred.Light()
+        light.taps = taps
+        k = np.arange(max(taps, 1))
+        angle, radius = 2.399963 * k, np.sqrt((k + 0.5) / len(k))
+        light.spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
+        turn = np.arange(64) * (2.0 * np.pi / 64)
+        light.turns = _pairs(np.cos(turn), np.sin(turn), device)
+        self.light = light
+        self._near = _Map(0.007 / fine, 1024 * fine, 2.5, 0.8, True, device)
+        self._far = _Map(0.035, 1024, 12.0, 4.0, False, device)
+
+    def _shine(self, time: float) -> None:
+        """Take the light from where the sun is now, if it has moved."""
+        direction = np.asarray(self._path(time), float)
+        direction = direction / np.linalg.norm(direction)
+        if direction @ self._stands > _STEP:
+            return
+        self._stands, light = direction, self.light
+        sun, dim = daylight(direction[2])
+        light.sun = _vector(direction)
+        light.sun_colour = _vector(sun)
+        light.sky_colour, light.haze = _vector(_SKY * dim), _vector(_HAZE * dim)
+        table = textures.sky(tuple(direction), tuple(sun)) * np.float32(dim)
+        light.table = wp.array(table, dtype=wp.vec3, device=self._device)
+        falls = sun * max(direction[2], 0.05) + _SKY * dim
+        usual = _NOON * _HIGH + _SKY
+        self.brightness = float(falls.mean() / usual.mean())
+        light.bounce, light.leaves = _vector(_BOUNCE * self.brightness), _vector(_LEAVES * self.brightness)
+        self.balance = (usual / usual.mean() / (falls / falls.mean())) ** _ADAPTED
+        raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])
+        raised /= np.linalg.norm(raised)
+        self._near.aim(raised)
+        self._far.aim(raised)
+
+    def follow(
+        self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
+    ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
+        """The fine and the coarse shadow map for a camera at ``eye`` that looks along ``forward``."""
+        self._shine(time)
+        for one in (self._near, self._far):
+            one.follow(primitives, eye, forward, time, self.period)
+        return self._near.struct, self._far.struct

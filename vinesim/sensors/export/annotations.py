@@ -1,0 +1,201 @@
+"""Truth as files: JSON records, COCO with run-length masks, YOLO boxes, images of ids, and an overlay for people."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vinesim.scene.berries import VARIETIES
+from vinesim.scene.ids import Kind, Organ, thing, thing_name
+from vinesim.scene.values import CameraInfo
+from vinesim.sensors.truth.truth import BERRY_PIXELS, Box, BunchTruth, Look
+
+_FURTHER = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
+"""What annotations tell of a bunch beside what COCO asks for."""
+LEAST_PIXELS = 16
+"""A bunch is annotated (COCO, YOLO) if at least so many pixels show it; records name all."""
+
+CATEGORIES = [{"id": int(Organ.BUNCH), "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
+"""The categories of COCO: numbers of :class:`Organ`."""
+
+
+def run_lengths(mask: np.ndarray) -> dict[str, Any]:
+    """A mask [height, width] as COCO's compressed run lengths."""
+    from pycocotools import mask as coco
+
+    encoded = coco.encode(np.asfortranarray(mask, np.uint8))
+    return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}
+
+
+def camera(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
+    """Intrinsics as sensor_msgs/CameraInfo names them [px], and the pose of the optical frame in the world."""
+    return {
+        "model": model,
+        "width": info.width,
+        "height": info.height,
+        "distortion_model": "plumb_bob",
+        "d": [0.0] * 5,
+        "k": [info.fx, 0.0, info.cx, 0.0, info.fy, info.cy, 0.0, 0.0, 1.0],
+        "frame": "optical (REP-103): x right, y down, z forward",
+        "position": pose[:3].tolist(),
+        "quaternion_xyzw": pose[3:].tolist(),
+    }
+
+
+def record(truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray | None = None) -> list[dict[str, Any]]:
+    """Bunches of one picture as JSON: metres in world axes; boxes are [column, row, width, height] px.
+
+    ``ripeness`` [bunch], 0 green to 1 ripe; all are ripe unless given.
+    """
+    return [
+        {
+            "bunch": one.bunch,
+            "name": thing_name(thing(Kind.BUNCH, one.bunch)),
+            "label": one.label,
+            "tree": one.tree,
+            "variety": VARIETIES[one.variety].name,
+            "ripeness": 1.0 if ripeness is None else float(ripeness[one.bunch]),
+            "attached": one.attached,
+            "pixels": one.pixels,
+            "amodal_pixels": one.amodal_pixels,
+            "occlusion": one.occlusion,
+            "box": _xywh(one.visible_box),
+            "amodal_box": _xywh(one.amodal_box),
+            "mask": run_lengths(one.mask(one.visible, info)),
+            "amodal_mask": run_lengths(one.mask(one.amodal, info)),
+            "berries": one.berries,
+            "berries_seen": one.berries_seen,
+            "box_3d": {
+                "position": one.frame[:3].tolist(),
+                "quaternion_xyzw": one.frame[3:].tolist(),
+                "size": one.size.tolist(),
+            },
+            "cut": None if one.cut is None else one.cut.tolist(),
+            "cut_pixel": None if one.cut_pixel is None else one.cut_pixel.tolist(),
+            "cut_seen": one.cut_seen,
+        }
+        for one in truths
+    ]
+
+
+def actors(told: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
+    """What else was set down in a picture of these ``labels`` [height, width]: with its pixels and its visible box."""
+    found = []
+    for one in told:
+        rows, columns = np.nonzero(labels == one["label"])
+        box = (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())) if len(rows) else None
+        found.append({**one, "pixels": len(rows), "box": _xywh(box)})
+    return found
+
+
+def _xywh(box: Box | None) -> list[int] | None:
+    """COCO's way to write a box."""
+    return None if box is None else [box[0], box[1], box[2] - box[0] + 1, box[3] - box[1] + 1]
+
+
+def yolo(bunches: list[dict[str, Any]], width: int, height: int) -> str:
+    """One line for each annotated bunch: class 0, middle and size of its visible box in shares of the picture."""
+    lines = []
+    for one in annotated(bunches):
+        x, y, w, h = one["box"]
+        share = (x + 0.5 * w) / width, (y + 0.5 * h) / height, w / width, h / height
+        lines.append("0 " + " ".join(f"{s:.6f}" for s in share))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def annotated(bunches: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those of a record that are large enough to be annotated."""
+    return [one for one in bunches if one["pixels"] >= LEAST_PIXELS]
+
+
+def coco(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
+    """The text of a COCO instances (and keypoints) file, piece by piece, from the records of its images.
+
+    ``read`` gives the records of all images, in order; it is called twice, so that never more than one is in memory.
+    """
+    info = {"description": "vinesim", "berry_pixels": BERRY_PIXELS, "least_pixels": LEAST_PIXELS}
+    yield f'{{"info": {json.dumps(info)}, "licenses": [], "categories": {json.dumps(CATEGORIES)},\n"images": ['
+    for number, one in enumerate(read()):
+        image = {
+            "id": one["image"],
+            "file_name": one["file"],
+            "width": one["camera"]["width"],
+            "height": one["camera"]["height"],
+            "camera": one["camera"],
+        }
+        yield (",\n" if number else "\n") + json.dumps(image)
+    yield '],\n"annotations": ['
+    number = 0
+    for one in read():
+        for bunch in annotated(one["bunches"]):
+            yield (",\n" if number else "\n") + json.dumps(_annotation(number + 1, one, bunch))
+            number += 1
+    yield "]}\n"
+
+
+def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> dict[str, Any]:
+    cut = bunch["cut_pixel"] or [-1.0, -1.0]
+    within = -0.5 <= cut[0] < image["camera"]["width"] - 0.5 and -0.5 <= cut[1] < image["camera"]["height"] - 0.5
+    point = [*cut, 2 if bunch["cut_seen"] else 1] if within else [0, 0, 0]
+    return {
+        "id": number,
+        "image_id": image["image"],
+        "category_id": int(Organ.BUNCH),
+        "iscrowd": 0,
+        "bbox": bunch["box"],
+        "area": bunch["pixels"],
+        "segmentation": bunch["mask"],
+        "keypoints": point,
+        "num_keypoints": int(within),
+        "amodal_bbox": bunch["amodal_box"],
+        "amodal_segmentation": bunch["amodal_mask"],
+        **{name: bunch[name] for name in _FURTHER},
+    }
+
+
+def ids(labels: np.ndarray) -> np.ndarray:
+    """Labels [height, width] as RGB, ``id = R + 256 G + 65536 B``, which is how COCO's panoptic images write ids."""
+    return np.stack([labels & 255, labels >> 8 & 255, labels >> 16 & 255], -1).astype(np.uint8)
+
+
+def berry_ids(seen: Look) -> np.ndarray:
+    """Number of the berry in its bunch plus one [height, width] uint16; 0 where none is seen."""
+    return (seen.berries + 1).astype(np.uint16)
+
+
+def overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
+    """A picture with what is true of it: visible boxes green, amodal boxes where they differ white, cut points yellow
+    discs (rings where hidden), and of each bunch its number, berries seen and share that is hidden.
+    """
+    scale = max(1, round(1280 / rgb.shape[1]))
+    image = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    truths = [one for one in truths if one.visible_box is not None]
+
+    def corner(column: float, row: float) -> tuple[int, int]:
+        return round((column + 0.5) * scale), round((row + 0.5) * scale)
+
+    for one in sorted(truths, key=lambda t: t.pixels):  # what is large comes last, on top
+        if one.amodal_box != one.visible_box:
+            cv2.rectangle(image, corner(*one.amodal_box[:2]), corner(*one.amodal_box[2:]), (255, 255, 255), 1)
+        assert one.visible_box is not None
+        left, top = corner(*one.visible_box[:2])
+        cv2.rectangle(image, (left, top), corner(*one.visible_box[2:]), (60, 255, 60), 1)
+        if one.cut_pixel is not None and np.abs(one.cut_pixel).max() < 20000:
+            cv2.circle(image, corner(*one.cut_pixel), 5, (255, 230, 0), -1 if one.cut_seen else 1)
+        if one.amodal_pixels * scale * scale > 1500:  # a smaller one would vanish under its words
+            words = f"{one.bunch}: {one.berries_seen}/{one.berries}, {100.0 * one.occlusion:.0f}% hidden"
+            for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+                cv2.putText(image, words, (left, max(top - 4, 12)), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, thick)
+    return image
+
+
+def write_json(path: pathlib.Path, value: Any) -> pathlib.Path:
+    """Write a value as JSON, one line for each entry of the outermost object."""
+    lines = ",\n".join(f"  {json.dumps(k)}: {json.dumps(v)}" for k, v in value.items())
+    path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+    return path

@@ -1,0 +1,141 @@
+"""Pictures as files: colour, depth (colours, and raw millimetres), label colours; and portraits of a scene."""
+
+from __future__ import annotations
+
+import pathlib
+
+import cv2
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.ids import LABEL_STRIDE, Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import CameraFrame, CameraInfo, View
+from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.camera.sunlight import DEFAULT_SUN
+from vinesim.sensors.scene.primitives import Primitives
+
+
+def looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Pose [7] of an optical frame at ``eye`` that looks ``at`` a point, level."""
+    eye, at = np.asarray(eye, float), np.asarray(at, float)
+    forward = frames.normalize(at - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = frames.normalize(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    turn = frames.from_matrix(np.stack([right, np.cross(forward, right), forward], -1))
+    return frames.pose(eye, turn)
+
+
+def depth_colours(depth: np.ndarray, farthest: float = 6.0) -> np.ndarray:
+    """Depth [height, width] m as RGB: near is red, ``farthest`` [m] blue; unmeasured black, too far white."""
+    with np.errstate(invalid="ignore"):
+        share = np.clip(1.0 - depth / farthest, 0.0, 1.0)
+    tone = np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0) * 255.0
+    colours = cv2.applyColorMap(tone.astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    colours[~np.isfinite(depth)] = 0
+    colours[np.isposinf(depth)] = 255
+    return colours
+
+
+def depth_millimetres(depth: np.ndarray) -> np.ndarray:
+    """Depth [height, width] m as the 16UC1 of REP-118: millimetres, 0 where nothing was measured."""
+    millimetres = np.where(np.isfinite(depth), depth * 1000.0, 0.0)
+    return np.where(millimetres < 65535.5, np.round(millimetres), 0.0).astype(np.uint16)
+
+
+_ORGAN_COLOUR = {
+    Organ.NOTHING: (0, 0, 0),
+    Organ.GROUND: (110, 85, 60),
+    Organ.POLE: (160, 160, 160),
+    Organ.WIRE: (220, 220, 220),
+    Organ.TRUNK: (105, 60, 25),
+    Organ.ARM: (150, 90, 40),
+    Organ.CANE: (205, 140, 70),
+    Organ.LEAF: (60, 150, 50),
+    Organ.PEDUNCLE: (255, 255, 0),
+    Organ.BUNCH: (190, 30, 140),
+    Organ.BOX: (40, 90, 230),
+    Organ.ROBOT: (235, 235, 235),
+    Organ.HUMAN: (250, 120, 40),
+}
+
+
+def label_colours(labels: np.ndarray) -> np.ndarray:
+    """Labels [height, width] as RGB: one colour for each organ, its brightness (hue for bunches) by instance."""
+    organ, index = labels // LABEL_STRIDE, labels % LABEL_STRIDE
+    table = np.array([_ORGAN_COLOUR[o] for o in Organ], np.float32)
+    bright = 0.7 + 0.3 * ((index * 0.618034) % 1.0)
+    colours = table[organ] * bright[..., None]
+    bunch = organ == int(Organ.BUNCH)
+    hue = (index[bunch] * 0.618034 * 180.0 % 180.0).astype(np.uint8)
+    hsv = np.stack([hue, np.full_like(hue, 200), np.full_like(hue, 255)], -1)[None]
+    if bunch.any():
+        colours[bunch] = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0]
+    return colours.astype(np.uint8)
+
+
+def write_png(path: str | pathlib.Path, image: np.ndarray) -> pathlib.Path:
+    """Write RGB uint8 or grey uint16; :class:`OSError` names a path that cannot be written."""
+    path = pathlib.Path(path)
+    data = image[..., ::-1] if image.ndim == 3 else image
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(data))
+    if not done:
+        raise ValueError(
+            f"an image of shape {image.shape}, {image.dtype}, cannot be a PNG; give uint8 RGB or uint16 grey"
+        )
+    path.write_bytes(encoded.tobytes())
+    return path
+
+
+def save(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "frame") -> list[pathlib.Path]:
+    """Write ``<stem>_rgb``, ``_depth`` (colours), ``_depth_mm`` (16UC1) and ``_labels`` PNGs; returns their paths.
+
+    An empty ``stem`` leaves plain names: ``rgb.png`` and so on.
+    """
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    images = {
+        "rgb": frame.rgb,
+        "depth": depth_colours(frame.depth),
+        "depth_mm": depth_millimetres(frame.depth),
+        "labels": label_colours(frame.labels),
+    }
+    prefix = f"{stem}_" if stem else ""
+    return [write_png(folder / f"{prefix}{name}.png", image) for name, image in images.items()]
+
+
+def standpoint(model: Model) -> np.ndarray:
+    """Pose [7] of an optical frame from which a scene shows itself: in the alley, at eye height, along the rows."""
+    spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2], np.zeros((1, 2))])
+    low, high = spots.min(0), spots.max(0)
+    middle = 0.5 * (low + high)
+    eye = np.array([low[0] - 0.6, middle[1] - 0.25, 1.45])
+    return looking(eye, np.array([high[0], middle[1] + 0.1, 1.40]))
+
+
+def portrait(
+    model: Model,
+    view: View,
+    out: str | pathlib.Path | None = None,
+    *,
+    pose: np.ndarray | None = None,
+    width: int = 960,
+    height: int = 640,
+    view_angle: float = 1.2,
+    sun: tuple[float, float, float] = DEFAULT_SUN,
+    quality: str = "still",
+    primitives: Primitives | None = None,
+) -> np.ndarray:
+    """A picture of a scene [height, width, 3]; written to ``out`` if given.
+
+    ``pose`` [7] is the optical frame (default :func:`standpoint`), ``view_angle`` the horizontal field of view [rad].
+    """
+    primitives = primitives or Primitives(model)
+    primitives.update(view)
+    focal = 0.5 * width / np.tan(0.5 * view_angle)
+    info = CameraInfo(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), "portrait")
+    camera = Camera(CameraSpec.load("pinhole"), info, "portrait", sun, quality=quality)
+    image = camera.render(primitives, standpoint(model) if pose is None else pose, view.time).rgb
+    if out is not None:
+        write_png(out, image)
+    return image

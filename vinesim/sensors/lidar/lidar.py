@@ -1,0 +1,289 @@
+"""Spinning lidars: firing times and angles from a table, beams with a width, echoes, and what is reported.
+
+Each shot is a handful of rays over the beam's footprint. What they meet closer together along the beam than the pulse
+is long comes back as one echo, whose range lies in between: mixed returns at the edges of leaves. Points are raw, as
+drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
+
+Two halves, so that either can be exchanged: a :class:`Grid` tells what rays meet, a :class:`Lidar` what is reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal, Protocol
+
+import msgspec
+import numpy as np
+import warp as wp
+
+from vinesim import frames
+from vinesim.kernels.sensing import lidar_echoes
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.plant_parameters import Number
+from vinesim.scene.values import LidarScan
+from vinesim.sensors import spec_file
+from vinesim.sensors.lidar.lidar_rasterizer import Sweep
+from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.spec_file import Numbers
+
+MOST_RAYS = 8
+"""Of one shot."""
+FOOTPRINT_AT = 3.0
+"""All rays leave from one point; beams are as wide as in life at this range [m], thinner nearer, wider beyond."""
+NEARLY_STILL, NEARLY_STRAIGHT = 4e-3, 3.5e-3
+"""Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place, their middle one.
+
+That is at most half a step of the head aside, and saves the finding of what is near for every few firings.
+"""
+_RETURNS = {"strongest": 0, "last": 1, "dual": 2}
+
+
+class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One kind of lidar (``data/lidars``)."""
+
+    model: str
+    elevation: Annotated[Numbers, "deg", (-90.0, 90.0)]
+    """By laser, in the order of firing."""
+    azimuth: Annotated[Numbers, "deg", (-180.0, 180.0)] | None = None
+    """By laser: how far it looks counter-clockwise of the head."""
+    laser_period: Annotated[Number, "s", (0.0, 0.01)]
+    """Between two lasers."""
+    firing_period: Annotated[Number, "s", (1e-6, 0.1)]
+    """Between two firings of all lasers."""
+    rate: Annotated[Number, "Hz", (0.1, 200.0)]
+    """Revolutions a second."""
+    nearest: Annotated[Number, "m", (0.0, 100.0)]
+    farthest: Annotated[Number, "m", (0.1, 500.0)]
+    rays: Annotated[Number, "1", (1, MOST_RAYS)]
+    """Of one shot."""
+    aperture: Annotated[Numbers, "m", (0.0, 0.1)]
+    """Width and height of the beam where it leaves."""
+    divergence: Annotated[Numbers, "mrad", (0.0, 50.0)]
+    """How fast they grow: full angles, to 1/e^2 of the middle's power."""
+    merge: Annotated[Number, "m", (0.0, 10.0)]
+    """Surfaces closer than this along the beam come back as one echo."""
+    separation: Annotated[Number, "m", (0.0, 10.0)]
+    """Two returns of one shot lie at least so far apart."""
+    returns: Literal["strongest", "last", "dual"] = "strongest"
+    """Which echoes of a shot are reported; ``dual``: the strongest and the last, or the two strongest."""
+    noise: Annotated[Number, "m", (0.0, 1.0)]
+    """Standard deviation of the range of a strong echo."""
+    weak_noise: Annotated[Number, "m", (0.0, 1.0)]
+    """The same of the weakest echo; between them it falls with the root of the signal."""
+    step: Annotated[Number, "m", (0.0, 1.0)]
+    """Between two ranges that can be told."""
+    weakest: Annotated[Number, "1/m^2", (0.0, 1.0)]
+    """Signal from which on an echo is noticed: reflectance, times the cosine, over the square of the range."""
+    flicker: Annotated[Number, "1", (0.0, 2.0)]
+    """Standard deviation of the signal's logarithm from shot to shot."""
+    reflectance: dict[str, Annotated[Number, "1"]]
+    """Diffuse, by organ in lower case."""
+
+    @classmethod
+    def load(cls, name: str) -> LidarSpec:
+        """The spec in a file, or the one of that name in ``data/lidars``."""
+        spec = spec_file.load("lidars", name, cls)
+        organs = {o.name.lower() for o in Organ if o != Organ.NOTHING}
+        if set(spec.reflectance) != organs:
+            wrong = sorted(set(spec.reflectance) ^ organs)[0]
+            raise spec_file.SensorError(
+                f"{name}: reflectance.{wrong} is missing or unknown; give one for each of {', '.join(sorted(organs))}"
+            )
+        for what, organ in spec.reflectance.items():
+            if not 0.0 <= organ.value <= 10.0:
+                raise spec_file.SensorError(f"{name}: reflectance.{what} is {organ.value:g}; give 0 to 10")
+        if not spec.nearest.value < spec.farthest.value:
+            raise spec_file.SensorError(
+                f"{name}: measures from {spec.nearest.value} to {spec.farthest.value} m, which is no range; "
+                "give nearest < farthest"
+            )
+        lasers = len(spec.elevation.value)
+        for field, needed in (("azimuth", lasers), ("aperture", 2), ("divergence", 2)):
+            found = getattr(spec, field)
+            if found is not None and len(found.value) != needed:
+                raise spec_file.SensorError(f"{name}: {field} has {len(found.value)} values; give {needed}")
+        if not lasers or spec.firing_period.value * spec.rate.value > 0.5:
+            raise spec_file.SensorError(
+                f"{name}: fires {lasers} lasers less than twice a turn; give a shorter firing_period"
+            )
+        return spec
+
+    def ideal(self) -> LidarSpec:
+        """The same table of firings with thin beams that measure exactly, however weak the echo."""
+
+        def but(number: Number, value: float) -> Number:
+            return msgspec.structs.replace(number, value=value)
+
+        thin = {
+            name: msgspec.structs.replace(getattr(self, name), value=(0.0, 0.0)) for name in ("aperture", "divergence")
+        }
+        exact = {name: but(getattr(self, name), 0.0) for name in ("noise", "weak_noise", "step", "weakest", "flicker")}
+        return msgspec.structs.replace(self, rays=but(self.rays, 1), returns="strongest", **thin, **exact)
+
+
+class Grid(Protocol):
+    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.Sweep` unless another one is given."""
+
+    direction: wp.array
+    """[column * row] unit vectors in the head's frame."""
+    distance: wp.array
+    """[column * row] m"""
+    primitive: wp.array
+    """[column * row], -2 the ground, -1 nothing."""
+
+    def hits(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
+        """Fill distances and primitives of ``count`` columns from ``first`` on, with the head at ``pose`` [7]."""
+        ...
+
+
+class Lidar:
+    """One lidar: a table of firings, and what it reports of one revolution."""
+
+    def __init__(
+        self,
+        spec: LidarSpec,
+        name: str = "lidar",
+        frame_id: str = "lidar",
+        device: str = "cpu",
+        *,
+        seed: int = 0,
+        grid: Callable[[np.ndarray, np.ndarray, float, int, str], Grid] = Sweep,
+    ) -> None:
+        """Noise follows from (``seed``, ``name``, number of the revolution).
+
+        ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits: see :class:`Sweep`.
+        """
+        self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
+        self.number = 0
+        """Of the present revolution."""
+        self.lasers = len(spec.elevation.value)
+        self.firings = round(1.0 / (spec.rate.value * spec.firing_period.value))
+        """Of one revolution."""
+        within = np.arange(self.lasers) * spec.laser_period.value
+        offset = np.arange(self.firings)[:, None] * spec.firing_period.value + within
+        self.offset = offset.ravel().astype(np.float32)
+        """Time of each shot after the first [shot] s."""
+        elevation = np.radians(spec.elevation.value)
+        order = np.argsort(np.argsort(elevation, kind="stable"), kind="stable")
+        self.ring = np.tile(order, self.firings).astype(np.uint16)
+        """[shot], 0 for the lowest laser."""
+        # the head turns clockwise seen from above; the first shot looks forward
+        beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
+        azimuth = beside - 2.0 * np.pi * spec.rate.value * within
+        across, up = self._footprint()
+        self.grid = grid(
+            (elevation[:, None] + up).ravel(),
+            (azimuth[:, None] + across / np.maximum(np.cos(elevation[:, None]), 0.01)).ravel(),
+            -2.0 * np.pi * spec.rate.value * spec.firing_period.value,
+            self.firings,
+            device,
+        )
+        """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
+        self._receiver = self._made_of()
+        kept = 2 if spec.returns == "dual" else 1
+        self._luck = wp.zeros((len(self.offset), 3), dtype=float, device=device)
+        self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
+        self._intensity = wp.zeros((len(self.offset), kept), dtype=float, device=device)
+        self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
+
+    def _footprint(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where in its beam each ray of a shot lies, across and up [ray] rad: one in the middle, the others on a ring.
+
+        Each stands for an equal share of a Gaussian beam's energy.
+        """
+        count = round(self.spec.rays.value)
+        ring = np.sqrt(-0.5 * np.log(0.5 * (1.0 - 1.0 / count))) if count > 1 else 0.0
+        turn = (np.arange(count - 1) + 0.5) * 2.0 * np.pi / max(count - 1, 1)
+        sizes = zip(self.spec.aperture.value, self.spec.divergence.value, strict=True)
+        wide, high = (0.5 * leaving / FOOTPRINT_AT + 0.5e-3 * growing for leaving, growing in sizes)
+        return tuple(np.append(0.0, ring * size * wave(turn)) for size, wave in ((wide, np.cos), (high, np.sin)))
+
+    def _made_of(self) -> lidar_echoes.Receiver:
+        spec, receiver = self.spec, lidar_echoes.Receiver()
+        reflectance = np.zeros(len(Organ), np.float32)
+        for organ, number in spec.reflectance.items():
+            reflectance[Organ[organ.upper()]] = number.value
+        receiver.reflectance = wp.array(reflectance, dtype=float, device=self.device)
+        receiver.rays, receiver.returns = round(spec.rays.value), _RETURNS[spec.returns]
+        for name in ("nearest", "farthest", "merge", "separation", "noise", "weak_noise", "step", "weakest", "flicker"):
+            setattr(receiver, name, float(getattr(spec, name).value))
+        return receiver
+
+    @property
+    def rate(self) -> float:
+        """Revolutions a second [Hz]."""
+        return self.spec.rate.value
+
+    def scan(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> LidarScan:
+        """One revolution from ``pose`` [7], the lidar in the world (x forward, z up), while nothing moves."""
+        pose = np.array(pose, float)
+        self.begin()
+        self.fire(primitives, 0, np.broadcast_to(pose, (self.firings, 7)))
+        return self.finish(pose, time)
+
+    def begin(self) -> None:
+        """A new revolution."""
+        luck = spec_file.dice(self.seed, self.name, self.number).standard_normal((len(self.offset), 3), np.float32)
+        self._luck.assign(luck)
+
+    def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
+        """Firings from ``first`` on, one for each pose [firing, 7] of the lidar."""
+        poses = np.array(poses, float)
+        if not np.isfinite(poses).all():
+            wrong = poses[~np.isfinite(poses).all(1)][0]
+            raise ValueError(f"lidar {self.name!r} has the pose {wrong.tolist()}; give finite numbers")
+        poses[:, 3:] = frames.normalize(poses[:, 3:])
+        together = self._together(poses)
+        for start in range(0, len(poses), together):
+            part = poses[start : start + together]
+            self._fire(primitives, first + start, len(part), part[len(part) // 2])
+
+    def _together(self, poses: np.ndarray) -> int:
+        """How many firings may be taken from one place, so slowly does the lidar move."""
+        if len(poses) < 2:
+            return 1
+        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / NEARLY_STILL
+        turn = 2.0 * np.linalg.norm(np.diff(poses[:, 3:], axis=0), axis=1).max() / NEARLY_STRAIGHT
+        return max(int(1.0 / max(way, turn, 1e-6)), 1)
+
+    def _fire(self, primitives: Primitives, first: int, count: int, pose: np.ndarray) -> None:
+        grid = self.grid
+        grid.hits(primitives, pose, first, count, self.spec.farthest.value)
+        wp.launch(
+            lidar_echoes.receive,
+            count * self.lasers,
+            inputs=[
+                primitives.shapes,
+                primitives.labels,
+                primitives.organs,
+                self._receiver,
+                first * self.lasers,
+                wp.transform(*map(float, pose)),
+                grid.direction,
+                grid.distance,
+                grid.primitive,
+                label(Organ.GROUND, 0),
+                int(Organ.GROUND),
+                self._luck,
+            ],
+            outputs=[self._xyz, self._intensity, self._label],
+            device=self.device,
+        )
+
+    def finish(self, pose: np.ndarray, time: float) -> LidarScan:
+        """What was reported since :meth:`begin`; ``pose`` [7] and ``time`` [s] of the first firing."""
+        labels = self._label.numpy()
+        shot, which = np.nonzero(labels >= 0)
+        self.number += 1
+        return LidarScan(
+            time=float(time),
+            name=self.name,
+            frame_id=self.frame_id,
+            pose=np.array(pose, float),
+            xyz=self._xyz.numpy()[shot, which],
+            intensity=self._intensity.numpy()[shot, which],
+            ring=self.ring[shot],
+            offset=self.offset[shot],
+            labels=labels[shot, which],
+            returned=(which + 1).astype(np.uint8) if self.spec.returns == "dual" else None,
+        )

@@ -1,0 +1,114 @@
+"""A spinning head's rays, rasterised: the nearest primitive along each ray of a grid of azimuths and elevations.
+
+Rows are rays of one elevation, columns follow each other in even steps of azimuth; each row has an azimuth of its own
+to start from, as lasers that fire in turn have, or the sub-rays of one beam. The oracle is
+:class:`~vinesim.sensors.scene.ray_caster.RayCaster`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from vinesim import frames
+from vinesim.kernels.raster import camera_raster, lidar_raster
+from vinesim.kernels.raster import primitives as shapes
+from vinesim.sensors.camera.camera import REACH
+from vinesim.sensors.scene.primitives import Primitives
+
+
+def _numbers(vectors: wp.array) -> wp.array:
+    """The same memory [n, 3] as numbers."""
+    return wp.array(ptr=vectors.ptr, shape=(len(vectors), 3), dtype=float, device=vectors.device, copy=False)
+
+
+class Sweep:
+    """The rays of one revolution, and what they met when they were fired last."""
+
+    def __init__(
+        self, elevation: np.ndarray, azimuth: np.ndarray, step: float, columns: int, device: str = "cpu"
+    ) -> None:
+        """Ray (column k, row r) leaves at ``elevation[r]`` and ``azimuth[r] + k * step`` [rad], in the head's frame:
+        x forward, z up, azimuth counter-clockwise seen from above.
+        """
+        elevation, azimuth = np.asarray(elevation, float), np.asarray(azimuth, float)
+        self.rows, self.columns, self.step, self.device = len(elevation), columns, float(step), device
+        e, a = np.tile(elevation, columns), (azimuth + step * np.arange(columns)[:, None]).ravel()
+        rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1).astype(np.float32)
+        self.direction = wp.array(rays, dtype=wp.vec3, device=device)
+        """Unit vectors in the head's frame [column * row]: column by column, as shots are fired."""
+        self.distance = wp.zeros(columns * self.rows, dtype=float, device=device)
+        """To the nearest hit [column * row] m; 1e30 where nothing is met."""
+        self.primitive = wp.full(columns * self.rows, -1, dtype=wp.int32, device=device)
+        """What was met [column * row]: -2 the ground, -1 nothing."""
+        self._keys = wp.empty(columns * self.rows, dtype=wp.int64, device=device)
+        self._distance = wp.empty(0, dtype=float, device=device)
+        order = np.argsort(elevation, kind="stable")
+        tangent = np.clip(np.tan(elevation[order]), -1.0e6, 1.0e6).astype(np.float32)
+        slot = ((tangent / (1.0 + np.abs(tangent)) + 1.0) * (0.5 * lidar_raster.SLOTS - 0.01)).astype(int)
+        head = lidar_raster.Head()
+        head.tangent, head.azimuth = (
+            wp.array(v.astype(np.float32), dtype=float, device=device) for v in (tangent, azimuth[order])
+        )
+        head.number = wp.array(order.astype(np.int32), device=device)
+        # one slot early: the division above may round otherwise than a kernel's
+        slots = np.searchsorted(slot, np.arange(lidar_raster.SLOTS + 3) - 1).astype(np.int32)
+        head.slots = wp.array(slots, device=device)
+        head.direction, head.step = _numbers(self.direction), self.step
+        self._head = head
+        self._fan = azimuth.min(), azimuth.max()
+
+    def hits(
+        self, primitives: Primitives, pose: np.ndarray, first: int = 0, count: int | None = None, reach: float = REACH
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Fire ``count`` columns from ``first`` on (all that follow), with the head at ``pose`` [7] in the world.
+
+        Fills that part of :attr:`distance` and :attr:`primitive`, and returns it [count, row].
+        """
+        count = self.columns - first if count is None else count
+        part = slice(first * self.rows, (first + count) * self.rows)
+        head = self._head
+        head.eye = wp.vec3(*map(float, pose[:3]))
+        head.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+        head.first, head.end, head.reach = first, first + count, float(reach)
+        low, high = self._fan
+        turn = 0.5 * (low + high) + (first + 0.5 * (count - 1)) * self.step
+        reaches = 0.5 * (high - low + abs(self.step) * count) + 1e-4
+        head.middle = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
+        head.within = wp.vec2(float(np.cos(reaches)), float(np.sin(reaches))) if reaches < 1.5 else wp.vec2(-1.0, 0.0)
+        self._keys[part].fill_(int(camera_raster.EMPTY))
+        clusters = len(primitives.cluster_first)
+        if len(self._distance) != clusters:
+            self._distance = wp.empty(clusters, dtype=float, device=self.device)
+        wp.launch(
+            lidar_raster.cull, clusters, inputs=[primitives.ball, head], outputs=[self._distance], device=self.device
+        )
+        distance = self._distance.numpy()
+        seen = np.flatnonzero(distance < float(shapes.FAR))
+        seen = seen[np.argsort(distance[seen], kind="stable")].astype(np.int32)
+        lanes = 1 if self.device == "cpu" else 24
+        wp.launch(
+            lidar_raster.raster,
+            (len(seen), lanes),
+            inputs=[
+                primitives.shapes,
+                primitives.clusters,
+                _numbers(primitives.lower),
+                _numbers(primitives.upper),
+                wp.array(seen, device=self.device),
+                head,
+                lanes,
+            ],
+            outputs=[self._keys],
+            device=self.device,
+        )
+        run = self.rows if self.device == "cpu" else 1
+        wp.launch(
+            lidar_raster.resolve,
+            count * self.rows // run,
+            inputs=[self._keys, head, run],
+            outputs=[self.distance, self.primitive],
+            device=self.device,
+        )
+        shape = (count, self.rows)
+        return self.distance[part].numpy().reshape(shape), self.primitive[part].numpy().reshape(shape)

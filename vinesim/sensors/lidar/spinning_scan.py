@@ -1,0 +1,99 @@
+"""A lidar's head turns while the world moves: each sector is fired when its time has come, from where it then is.
+
+What moves is sheared in a scan as it is in life, and so is everything if the robot moves. Poses of the lidar are kept
+and interpolated to each firing, however late it is computed; plants and things are where the newest view has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.values import LidarScan
+from vinesim.sensors.lidar.lidar import Lidar
+from vinesim.sensors.scene.primitives import Primitives
+
+
+class Track:
+    """Where a sensor was lately."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+        self._poses: list[np.ndarray] = []
+
+    def add(self, time: float, pose: np.ndarray) -> None:
+        """The sensor was at ``pose`` [7] at ``time`` [s]; where time was set back, what came later is forgotten."""
+        kept = int(np.searchsorted(self._times, time))
+        del self._times[kept:], self._poses[kept:]
+        self._times.append(time)
+        self._poses.append(np.array(pose, float))
+
+    def forget(self, before: float) -> None:
+        """What is not needed for times from ``before`` on [s]."""
+        old = max(int(np.searchsorted(self._times, before, side="right")) - 1, 0)
+        del self._times[:old], self._poses[:old]
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """Poses [k, 7] at ``times`` [k] s, straight between those that are known; the nearest one beyond them."""
+        known = np.asarray(self._times)
+        poses = np.stack(self._poses)
+        after = np.clip(np.searchsorted(known, times), 1, max(len(known) - 1, 1))
+        if len(known) == 1:
+            return np.repeat(poses, len(times), 0)
+        share = np.clip((times - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)[:, None]
+        first, second = poses[after - 1], poses[after].copy()
+        second[(first[:, 3:] * second[:, 3:]).sum(1) < 0.0, 3:] *= -1.0
+        between = first + share * (second - first)
+        between[:, 3:] = frames.normalize(between[:, 3:])
+        return between
+
+
+class Rolling:
+    """One lidar, fired bit by bit."""
+
+    def __init__(self, lidar: Lidar, rate: float | None = None) -> None:
+        """``rate``: revolutions a second that are wanted [Hz]; as fast as the head turns unless given, never faster."""
+        self.lidar = lidar
+        self.track = Track()
+        self.dropped = 0
+        """Revolutions that were over before they were begun."""
+        self._turn = 1.0 / lidar.rate
+        self._period = max(self._turn, 1.0 / rate if rate else 0.0)
+        self._start: float | None = None
+        self._fired = 0
+
+    def stop(self, now: float) -> None:
+        """Forget the present revolution: at ``now`` [s] nobody wants it."""
+        self._start = None
+        self.track.forget(now)
+
+    def due(self, now: float) -> bool:
+        """Whether there is something to fire at ``now`` [s]: a head that waits for its next revolution has nothing."""
+        return self._start is None or now >= self._start - 1e-9 or now < self._start - self._period
+
+    def go(self, primitives: Primitives, now: float) -> Iterator[LidarScan]:
+        """Fire what is due at ``now`` [s] of simulation time; yields the revolutions that are complete with it."""
+        if self._start is None or now < self._start - self._period:
+            self._begin(now)
+        while self._start is not None:
+            lidar, start, step = self.lidar, self._start, self.lidar.spec.firing_period.value
+            due = min(int((now - start) / step + 1e-6) + 1, lidar.firings) if now >= start - 1e-9 else 0
+            if due > self._fired:
+                times = start + step * np.arange(self._fired, due)
+                lidar.fire(primitives, self._fired, self.track.at(times))
+                self._fired = due
+            if due < lidar.firings:
+                return
+            yield lidar.finish(self.track.at(np.array([start]))[0], start)
+            start += self._period
+            late = max(int((now - start) / self._period + 1e-6), 0)
+            self.dropped += late
+            lidar.number += late
+            self._begin(start + late * self._period)
+
+    def _begin(self, start: float) -> None:
+        self._start, self._fired = start, 0
+        self.track.forget(start)
+        self.lidar.begin()

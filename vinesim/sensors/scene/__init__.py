@@ -1,0 +1,1 @@
+"""The vineyard as analytic primitives, and rays through them."""

@@ -1,0 +1,153 @@
+"""What stands still as primitives: posts, wires, trunks and arms; grass and herbs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.kernels.shading import materials
+from vinesim.scene import leaves
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.model import Model
+from vinesim.sensors.scene import textures
+from vinesim.sensors.scene.primitive_batches import CONE, LEAF, Batch, batch, columns
+
+_CELL = 2.5
+"""Side of the squares in which things that stand still are clustered [m]."""
+_PIECE = 0.5
+"""Longest piece of a post or wire [m]."""
+_WOOD = {
+    Organ.POLE: (int(materials.POST), (0.36, 0.33, 0.29)),
+    Organ.WIRE: (int(materials.WIRE), (0.33, 0.34, 0.35)),
+    Organ.TRUNK: (int(materials.BARK), (0.20, 0.15, 0.10)),
+    Organ.ARM: (int(materials.BARK), (0.20, 0.14, 0.09)),
+}
+
+
+def _cell_of(position: np.ndarray, first: int) -> np.ndarray:
+    """A group number for each square of the ground [n]."""
+    cell = np.floor(position[:, :2] / _CELL).astype(np.int64)
+    cell -= cell.min(0, initial=0)
+    return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
+
+
+def fixed(model: Model, still: int) -> Batch | None:
+    if not len(model.fixed_organ):
+        return None
+    # long wires in pieces: a box around a whole one holds half of the vineyard
+    length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)
+    pieces = np.maximum(np.ceil(length / _PIECE), 1).astype(int)
+    whole = np.repeat(np.arange(len(pieces)), pieces)
+    share = np.arange(len(whole)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    ends = [(share + k)[:, None] / pieces[whole][:, None] for k in (0, 1)]
+    start, end = (model.fixed_start[whole] * (1.0 - s) + model.fixed_end[whole] * s for s in ends)
+    thick, thin = (model.fixed_radius[whole, :1] * (1.0 - s) + model.fixed_radius[whole, 1:] * s for s in ends)
+    organ, index = model.fixed_organ[whole], model.fixed_index[whole]
+    table = {o: _WOOD[Organ(int(o))] for o in np.unique(organ)}
+    material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
+    rng = np.random.default_rng(3)
+    seed = rng.uniform(size=int(index.max()) + 1)[index] * 7.0
+    # bark runs through from piece to piece: distances count from the foot of a post, along a wire
+    along = np.where(
+        np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1),
+        start[:, 2],
+        length[whole] * ends[0][:, 0],
+    )
+    return batch(
+        CONE,
+        columns(start, thick),
+        b=columns(end, thin),
+        c=columns(along, seed, 0.0, 0.0),
+        material=material,
+        tint=tint,
+        organ=organ,
+        label=organ * label(Organ(1), 0) + index,
+        carrier=still,
+        group=_cell_of((start + end) * 0.5, 0),
+    )
+
+
+def rows_of(model: Model) -> tuple[float, float]:
+    """Where the first row of vines stands, and the spacing of the rows [m], both along y."""
+    y = np.unique(np.round(model.fixed_start[model.fixed_organ == int(Organ.TRUNK), 1], 1))
+    if len(y) == 0:
+        return 0.0, 2.5
+    return float(y[0]), float(np.median(np.diff(y))) if len(y) > 1 else 2.5
+
+
+def _sown(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
+    """As :func:`vinesim.kernels.shading.materials.sown`, which colours the ground."""
+    lane = (y - rows[0]) / rows[1]
+    away = np.abs(lane - np.round(lane)) * rows[1]
+    track = np.abs(away - 0.5 * rows[1] + 0.7)
+    return 0.16 - 0.26 * textures.smoothstep(0.65, 0.25, away) - 0.14 * textures.smoothstep(0.22, 0.08, track)
+
+
+def litter(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch | None:
+    """Fallen leaves, more of them when many leaves are old: ``age`` is the mean of :attr:`Model.leaf_age`."""
+    low, high = low - 1.0, high + 1.0
+    n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
+    if n == 0:
+        return None
+    rng = np.random.default_rng(29)
+    spot = low + (high - low) * rng.uniform(size=(n, 2))
+    turn, tilt = rng.uniform(0.0, 2.0 * np.pi, n), rng.normal(0.0, 0.15, n)
+    rib = np.stack([np.cos(turn), np.sin(turn), tilt], 1) / np.hypot(1.0, tilt)[:, None]
+    up = np.cross(rib, np.stack([np.sin(turn), -np.cos(turn), rng.normal(0.0, 0.15, n)], 1))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    dry = rng.uniform(size=(n, 1))
+    tint = (1.0 - dry) * np.array([0.30, 0.24, 0.05]) + dry * np.array([0.17, 0.10, 0.045])
+    bend = columns(
+        rng.normal(0.0, 0.25, n), rng.normal(0.0, 0.25, n), rng.uniform(-0.2, 0.4, n), rng.uniform(0.8, 1.0, n)
+    )
+    return batch(
+        LEAF,
+        columns(spot, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
+        b=columns(rib, leaves.shape_of(np.arange(n))),
+        c=columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(materials.FOLIAGE),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=still,
+        group=_cell_of(spot, 0),
+    )
+
+
+def meadow(rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, still: int) -> Batch | None:
+    """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
+    low, high = low - 3.0, high + 3.0
+    count = int(min(density * np.prod(high - low), 60_000))
+    if count == 0:
+        return None
+    rng = np.random.default_rng(23)
+    spot = low + (high - low) * rng.uniform(size=(count, 2))
+    noise = textures.sample(spot[:, 0] * 0.21, spot[:, 1] * 0.21)
+    # as the ground is coloured
+    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + _sown(rows, spot[:, 1])
+    spot = spot[green > 0.40 + 0.24 * rng.uniform(size=count)]
+    n = len(spot)
+    herb = rng.uniform(size=n) < 0.12
+    size = np.where(herb, rng.uniform(0.03, 0.06, n), 0.06 + 0.17 * rng.uniform(size=n) ** 1.5)
+    yaw = rng.uniform(0.0, 2.0 * np.pi, n)
+    lean = np.where(herb, rng.uniform(0.5, 1.1, n), rng.normal(0.0, 0.2, n))
+    out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
+    rib = np.sin(lean)[:, None] * out + np.cos(lean)[:, None] * np.array([0.0, 0.0, 1.0])
+    up = np.cos(lean)[:, None] * out - np.sin(lean)[:, None] * np.array([0.0, 0.0, 1.0])
+    root = columns(spot, np.zeros(n)) + 0.74 * size[:, None] * rib
+    tint = np.array([0.075, 0.12, 0.022]) * rng.uniform(0.6, 1.35, (n, 1))
+    tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
+    bend = columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
+    return batch(
+        LEAF,
+        columns(root, size),
+        b=columns(rib, np.where(herb, textures.HERB, textures.GRASS)),
+        c=columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(materials.GRASS),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=still,
+        group=_cell_of(spot, 0),
+    )

@@ -1,0 +1,247 @@
+"""Baked tables that make analytic primitives look like plants: leaf outlines and veins, noise, soil, sky.
+
+All are computed once per process from fixed seeds, tile without seams where they repeat, and hold linear values.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import cv2
+import numpy as np
+
+from vinesim.scene import leaves
+
+GRASS, HERB = leaves.SHAPES, leaves.SHAPES + 1
+"""Numbers of the outlines that are not vine leaves: a tuft of grass, a broad weed."""
+OUTLINES = leaves.SHAPES + 2
+SIDE = 256
+"""Texels along each side of the tables."""
+_EDGE_SCALE = 400.0
+_SUPER = 4
+
+
+def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Leaf coordinates u in [-1, 1], v in [-0.75, 1.25] of texel centres; the unit reaches from petiole to tip."""
+    step = (np.arange(side) + 0.5) / side * 2.0
+    u, v = np.meshgrid(step - 1.0, step - 0.75)
+    return u, v
+
+
+def leaf_scale(shape: np.ndarray) -> np.ndarray:
+    """Length from petiole to tip in units of ``Model.leaf_size``, by outline [shape]."""
+    tips = np.array([leaves.outline(np.zeros(1), i)[0] for i in range(leaves.SHAPES)])
+    return tips[shape]
+
+
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """Signed distance to the edge of a finely sampled mask, positive inside [leaf units], [SIDE, SIDE]."""
+    inside = mask.astype(np.uint8)
+    pixels = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+    return cv2.resize(pixels, (SIDE, SIDE), interpolation=cv2.INTER_AREA) * (2.0 / (SIDE * _SUPER))
+
+
+def _tuft() -> np.ndarray:
+    """Mask of a tuft of grass: bent blades that taper, rooted along the lower edge."""
+    rng = np.random.default_rng(31)
+    side = SIDE * _SUPER
+    mask = np.zeros((side, side), np.uint8)
+    along = np.linspace(0.0, 1.0, 20)
+    for _ in range(30):
+        root = rng.uniform(-0.4, 0.4)
+        lean = rng.normal(0.6 * root, 0.4)
+        height = rng.uniform(0.5, 1.8)
+        half = rng.uniform(0.018, 0.036) * (1.0 - along**1.6)
+        x = root + lean * along**2
+        y = -0.75 + height * along * (1.0 - 0.15 * abs(lean) * along)
+        blade = np.concatenate([np.stack([x - half, y], 1), np.stack([x + half, y], 1)[::-1]])
+        cv2.fillPoly(mask, [np.round((blade + np.array([1.0, 0.75])) * 0.5 * side).astype(np.int32)], 1)
+    return mask
+
+
+@functools.cache
+def outlines() -> tuple[np.ndarray, np.ndarray]:
+    """Signed distances [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and octagons around them [outline, 8, 2]."""
+    u, v = _grid(SIDE * _SUPER)
+    theta, radius = np.arctan2(u, v), np.hypot(u, v)
+    table = np.zeros((OUTLINES, SIDE, SIDE))
+    knots = np.linspace(-np.pi, np.pi, 8193)
+    for shape in range(leaves.SHAPES):
+        edge = leaves.outline(knots, shape) / leaf_scale(shape)
+        table[shape] = _distance(radius < np.interp(theta, knots, edge))
+    table[GRASS] = _distance(_tuft())
+    table[HERB] = _distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
+    table = np.clip(table * _EDGE_SCALE, -127, 127).astype(np.int8)
+    angle = (np.arange(8) + 0.5) * np.pi / 4.0
+    normal = np.stack([np.sin(angle), np.cos(angle)], 1)
+    hull = np.zeros((OUTLINES, 8, 2), np.float32)
+    u, v = _grid(SIDE)
+    for shape in range(OUTLINES):
+        inside = table[shape] > -4
+        reach = (np.stack([u[inside], v[inside]], 1) @ normal.T).max(0) + 0.012
+        for k in range(8):
+            sides = [k, (k + 1) % 8]
+            hull[shape, k] = np.linalg.solve(normal[sides], reach[sides])
+    return table, hull
+
+
+def _blurred(rng: np.random.Generator, sigma: float) -> np.ndarray:
+    """Smooth noise of unit variance [SIDE, SIDE]."""
+    noise = cv2.GaussianBlur(rng.normal(size=(SIDE, SIDE)).astype(np.float32), (0, 0), sigma)
+    return noise / noise.std()
+
+
+@functools.cache
+def blades() -> np.ndarray:
+    """Vein strength, relief slope along u and v, tone: [outline, SIDE/2, SIDE/2, 4] float32."""
+    u, v = _grid(SIDE)
+    table = np.zeros((OUTLINES, SIDE, SIDE, 4), np.float32)
+    for shape in range(leaves.SHAPES):
+        rng = np.random.default_rng(71 + shape)
+        vein, crease = np.zeros_like(u), np.zeros_like(u)
+        for angle, length in ((0.0, 1.0), (54.0, 0.86), (-54.0, 0.86), (112.0, 0.62), (-112.0, 0.62)):
+            turn = np.radians(angle)
+            tip = length * np.array([np.sin(turn), np.cos(turn)])
+            away, along = _segment(u, v, np.zeros(2), tip)
+            vein = np.maximum(vein, np.exp(-((away / (0.021 * (1.0 - 0.7 * along))) ** 2)))
+            crease += 0.03 * np.exp(-((away / 0.05) ** 2))
+            for start in np.linspace(0.15, 0.88, 7):
+                for side in (1.0, -1.0):
+                    root = (start + 0.04 * side) * tip
+                    out = turn + side * np.radians(50.0)
+                    reach = 0.55 * length * (1.0 - 0.7 * abs(start - 0.35))
+                    away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
+                    vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
+                    crease += 0.009 * np.exp(-((away / 0.03) ** 2))
+        fine, wide = _blurred(rng, 3.0), _blurred(rng, 8.0)
+        net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
+        slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / SIDE)
+        table[shape] = np.stack([np.maximum(vein, 0.25 * net), slope_u, slope_v, 0.5 + 0.2 * wide + 0.12 * fine], -1)
+    table[GRASS, ..., 3] = 0.5 + 0.5 * v
+    table[HERB, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
+    table[HERB, ..., 3] = 0.5
+    half = table.reshape(OUTLINES, SIDE // 2, 2, SIDE // 2, 2, 4).mean((2, 4))
+    return np.ascontiguousarray(half, np.float32)
+
+
+def _segment(u: np.ndarray, v: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance to a segment and position along it, 0 to 1."""
+    d = b - a
+    along = np.clip(((u - a[0]) * d[0] + (v - a[1]) * d[1]) / (d @ d), 0.0, 1.0)
+    return np.hypot(u - a[0] - along * d[0], v - a[1] - along * d[1]), along
+
+
+def _tileable(rng: np.random.Generator, lowest: float, power: float) -> np.ndarray:
+    """Periodic noise with a 1/f^power spectrum above a lowest frequency; zero mean, unit variance."""
+    cycles = np.fft.fftfreq(SIDE) * SIDE
+    f = np.hypot(*np.meshgrid(cycles, cycles))
+    gain = np.where(f >= lowest, 1.0 / np.maximum(f, lowest) ** power, 0.0)
+    field = np.fft.ifft2(np.fft.fft2(rng.normal(size=(SIDE, SIDE))) * gain).real
+    return field / field.std()
+
+
+@functools.cache
+def noise() -> np.ndarray:
+    """Four octaves of periodic noise around 0.5, coarse to fine: [SIDE, SIDE, 4] float32 in 0..1."""
+    rng = np.random.default_rng(17)
+    bands = [_tileable(rng, low, power) for low, power in ((1, 1.6), (3, 1.4), (10, 1.1), (30, 0.4))]
+    return np.clip(0.5 + 0.2 * np.stack(bands, -1), 0.0, 1.0).astype(np.float32)
+
+
+@functools.cache
+def soil() -> np.ndarray:
+    """Clods, sod, slope along x and y of 1.25 m of ground: [SIDE, SIDE, 4] float32."""
+    rng = np.random.default_rng(43)
+    clods = 0.55 * _tileable(rng, 3, 1.5) + 0.6 * np.abs(_tileable(rng, 4, 1.5)) + 0.35 * _tileable(rng, 20, 1.0)
+    sod = _tileable(rng, 25, 0.7)
+    straw = np.zeros((SIDE, SIDE), np.float32)
+    for x, y, turn, length in zip(*rng.uniform(size=(4, 90)), strict=True):
+        start = np.array([x, y]) * SIDE
+        step = (6.0 + 14.0 * length) * np.array([np.cos(np.pi * turn), np.sin(np.pi * turn)])
+        cv2.line(straw, *(tuple(map(int, p)) for p in (start, start + step)), 1.0, 1, cv2.LINE_AA)
+    height = 0.5 * clods + 0.35 * sod
+    slope_y, slope_x = (0.5 * (np.roll(height, -1, axis) - np.roll(height, 1, axis)) for axis in (0, 1))
+    tone = np.clip(0.45 + 0.17 * clods + 0.5 * straw, 0.0, 1.0)
+    green = np.clip(0.5 + 0.22 * sod + 0.3 * straw, 0.0, 1.0)
+    return np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)
+
+
+SKY_ROWS, SKY_COLUMNS = 512, 1024
+
+
+@functools.cache
+def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
+    """What of the sky no sun changes: the share of cloud, and layers in front of it, each a colour and a share."""
+    height, azimuth = _directions()
+    flat = np.sqrt(1.0 - height**2)
+    far = 0.22 / (height + 0.12)
+    cover = sample(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
+    cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55
+    turns = azimuth / (2.0 * np.pi)
+    layers = []
+    for tone, base, rise, count in (
+        (np.array([0.36, 0.47, 0.62]), 0.045, 0.085, 2.0),
+        (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
+    ):
+        ridge = base + rise * (sample(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35)
+        layers.append((tone, smoothstep(0.004, -0.004, height - ridge)))
+    crowns = 0.014 + 0.020 * sample(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
+    leafy = sample(turns * 20.0, height * 8.0, slice(2, 3))
+    trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
+    layers.append((trees, smoothstep(0.004, -0.004, height - crowns)))
+    return cloud, tuple(layers)
+
+
+def _directions() -> tuple[np.ndarray, np.ndarray]:
+    """Sine of elevation and azimuth [rad] of the sky's table."""
+    height = (np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2) * np.ones((1, SKY_COLUMNS))
+    return height, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
+
+
+@functools.lru_cache(maxsize=4)
+def sky(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
+    """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
+
+    Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
+    hills in the haze.
+    """
+    (height, azimuth), (cloud, layers) = _directions(), _scenery()
+    flat = np.sqrt(1.0 - height**2)
+    x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
+    horizon = np.exp(-5.5 * height)[..., None]
+    colour = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
+    away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
+    halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
+    colour = colour + halo[..., None] * np.array(colour_of_sun)
+    colour = _mix(colour, np.array([1.35, 1.33, 1.30]), cloud)
+    for tone, share in layers:
+        colour = _mix(colour, tone, share)
+    return colour.astype(np.float32)
+
+
+def sample(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
+    """Noise at positions of period 1, bilinear [..., 4], or some octaves of it."""
+    table, fx, fy = noise()[..., octaves], (x % 1.0) * SIDE, (y % 1.0) * SIDE
+    i, j = fx.astype(int) % SIDE, fy.astype(int) % SIDE
+    ax, ay = (fx % 1.0)[..., None], (fy % 1.0)[..., None]
+    upper = table[j, i] * (1.0 - ax) + table[j, (i + 1) % SIDE] * ax
+    lower = table[(j + 1) % SIDE, i] * (1.0 - ax) + table[(j + 1) % SIDE, (i + 1) % SIDE] * ax
+    return upper * (1.0 - ay) + lower * ay
+
+
+def smoothstep(a: float, b: float, x: np.ndarray) -> np.ndarray:
+    t = np.clip((x - a) / (b - a), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
+    return a * (1.0 - t[..., None]) + b * t[..., None]
+
+
+@functools.cache
+def tone_curve() -> np.ndarray:
+    """8-bit sRGB of sqrt(linear) in 0..4, 4096 entries: the filmic curve of Narkowicz (2015), then IEC 61966-2-1."""
+    x = (np.arange(4096) / 1024.0) ** 2
+    film = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
+    srgb = np.where(film <= 0.0031308, 12.92 * film, 1.055 * film ** (1.0 / 2.4) - 0.055)
+    return np.round(srgb * 255.0).astype(np.uint8)

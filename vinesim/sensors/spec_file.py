@@ -1,0 +1,61 @@
+"""Sensor data files: every number with unit, grade and source; wrong units, absurd values: refused in one line."""
+
+from __future__ import annotations
+
+import pathlib
+import typing
+import zlib
+from typing import Literal, TypeVar
+
+import msgspec
+import numpy as np
+
+from vinesim.scene.data_files import find
+from vinesim.scene.toml_loader import DataError, read
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sourced list of numbers."""
+
+    value: tuple[float, ...]
+    unit: str
+    grade: Literal["READ", "DERIVED", "GUESSED"]
+    source: str
+
+
+class SensorError(DataError):
+    """A camera or lidar file that cannot be used. The text is one line."""
+
+
+def load(folder: str, name: str, kind: type[T]) -> T:
+    """The file ``name``, or the one of that name in ``data/<folder>``, as a ``kind``.
+
+    Its fields say what is checked: ``Annotated[Number, unit, (lowest, highest)]``.
+    """
+    path = find(folder, name, ".toml")
+    spec = read(path, kind, SensorError)
+    _check(path, spec)
+    return spec
+
+
+def _check(path: pathlib.Path, spec: msgspec.Struct, place: str = "") -> None:
+    for field, hint in typing.get_type_hints(type(spec), include_extras=True).items():
+        found = getattr(spec, field)
+        unit, *bounds = getattr(hint, "__metadata__", (None,))
+        given = getattr(found, "unit", None)
+        if isinstance(unit, str) and given is not None:
+            if given != unit:
+                raise SensorError(f"{path}: {place}{field}.unit is {given!r}; give the value in {unit!r}")
+            for low, high in bounds:
+                wrong = [v for v in np.atleast_1d(found.value) if not low <= v <= high]
+                if wrong:
+                    raise SensorError(f"{path}: {place}{field} is {wrong[0]:g} {unit}; give {low:g} to {high:g} {unit}")
+        elif isinstance(found, msgspec.Struct):
+            _check(path, found, f"{place}{field}.")
+
+
+def dice(seed: int, name: str, number: int) -> np.random.Generator:
+    """Random numbers of one image or revolution: the same for the same (seed, sensor, number), on every machine."""
+    return np.random.default_rng([seed & 0xFFFFFFFF, zlib.crc32(name.encode()), number & 0xFFFFFFFF])

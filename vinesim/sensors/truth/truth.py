@@ -1,0 +1,338 @@
+"""What a picture truly shows: which bunches, how much of each, where, and how every pixel moves.
+
+All of it follows from the primitives, not from the picture: noise and range limits of a camera change nothing here.
+Everything is tied to ids that are the same on every client: bunch numbers of the model, and berry numbers as
+:func:`vinesim.scene.berries.berries` counts them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.kernels.raster.primitives import FAR
+from vinesim.scene.ids import LABEL_STRIDE, Organ, label
+from vinesim.scene.model import Model
+from vinesim.scene.values import CameraFrame, CameraInfo, View
+from vinesim.sensors.camera import point_cloud
+from vinesim.sensors.camera.camera import Visibility, pinhole
+from vinesim.sensors.scene.primitive_batches import CONE, SPHEROID
+from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.scene.ray_caster import RayCaster
+
+BERRY_PIXELS = 4
+"""A berry is seen if at least so many pixels show it."""
+
+Box = tuple[int, int, int, int]
+"""First column, first row, last column, last row (inclusive)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Sighting:
+    """One bunch in one picture."""
+
+    bunch: int
+    """Index in the model."""
+    pixels: int
+    """How many pixels show it."""
+    box: Box
+    """Of those pixels."""
+    distance: float
+    """Median depth [m] of the pixels that measured; NaN if none did."""
+
+
+def bunches(frame: CameraFrame) -> tuple[Sighting, ...]:
+    """Every bunch of which at least one pixel is seen, by index."""
+    rows, columns = np.nonzero(frame.labels // LABEL_STRIDE == int(Organ.BUNCH))
+    index = frame.labels[rows, columns] % LABEL_STRIDE
+    order = np.argsort(index, kind="stable")
+    index, rows, columns = index[order], rows[order], columns[order]
+    edges = np.flatnonzero(np.diff(index, prepend=-1, append=-1))
+    sightings = []
+    for first, last in itertools.pairwise(edges):
+        r, c = rows[first:last], columns[first:last]
+        depth = frame.depth[r, c]
+        depth = depth[np.isfinite(depth)]
+        sightings.append(
+            Sighting(
+                int(index[first]),
+                int(last - first),
+                (int(c.min()), int(r.min()), int(c.max()), int(r.max())),
+                float(np.median(depth)) if len(depth) else float("nan"),
+            )
+        )
+    return tuple(sightings)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Look:
+    """What every pixel of an ideal pinhole camera sees at one instant."""
+
+    info: CameraInfo
+    pose: np.ndarray
+    """[7] optical frame in the world."""
+    primitive: np.ndarray
+    """[height, width] int32; -1 the sky, -2 the ground."""
+    depth: np.ndarray
+    """[height, width] float32 m along the axis, exact to 2 um; +Inf for the sky."""
+    labels: np.ndarray
+    """[height, width] int32, :func:`vinesim.scene.ids.label`."""
+    berries: np.ndarray
+    """[height, width] int32, number of the berry in its bunch; -1 where none is seen."""
+    carriers: np.ndarray
+    """[primitive, 7] poses of what carries the primitives, for :func:`flow`."""
+    built: int
+    """:attr:`Primitives.built`: only numbers of the same set of primitives mean the same."""
+
+
+def look(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -> Look:
+    """Look from ``pose`` [7] (optical frame) through a pinhole."""
+    seen = Visibility(info.width, info.height, primitives.device)
+    seen.draw(primitives, pinhole(info, pose))
+    primitive, depth, labels = (
+        a.numpy().reshape(info.height, info.width).copy() for a in (seen.primitive, seen.depth, seen.labels)
+    )
+    depth[primitive == -1] = np.inf
+    numbers = np.append(_berry_numbers(primitives), [-1, -1])  # so that -1 and -2 find no berry
+    everything = primitives.carriers(np.arange(primitives.count))
+    return Look(info, np.array(pose, float), primitive, depth, labels, numbers[primitive], everything, primitives.built)
+
+
+def _shown(primitives: Primitives) -> np.ndarray:
+    """Whether each primitive is there [primitive]."""
+    return np.repeat(primitives.shown(), primitives.cluster_size)
+
+
+def _berry_numbers(primitives: Primitives) -> np.ndarray:
+    """Number of the berry in its bunch [primitive], -1 for all that is no berry."""
+    kind = np.repeat(primitives.cluster_kind, primitives.cluster_size)
+    fruit = np.flatnonzero((kind == SPHEROID) & (primitives.organ == int(Organ.BUNCH)) & _shown(primitives))
+    bunch = primitives.label[fruit]
+    starts = np.flatnonzero(np.diff(bunch, prepend=-1))
+    numbers = np.full(primitives.count, -1, np.int32)
+    numbers[fruit] = np.arange(len(fruit)) - np.repeat(starts, np.diff(np.append(starts, len(fruit))))
+    return numbers
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class BunchTruth:
+    """One bunch in one picture, be it seen or hidden. Berries, rachis and pedicels belong to it, the peduncle not.
+
+    What lies outside the picture counts nowhere but in ``berries``, ``frame`` and ``size``.
+    """
+
+    bunch: int
+    """Index in the model."""
+    variety: int
+    """Index into :data:`vinesim.scene.berries.VARIETIES`."""
+    tree: int
+    """The tree on which it grew."""
+    attached: bool
+    """Whether it still hangs there."""
+    amodal_box: Box
+    """Of the pixels that would show it if there were nothing else."""
+    amodal: np.ndarray
+    """Those pixels, bool [rows, columns] of ``amodal_box``."""
+    visible: np.ndarray
+    """The pixels that do show it, bool, in the same window."""
+    visible_box: Box | None
+    """Of the pixels that show it; None if none does."""
+    berries_seen: int
+    """Berries of which at least :data:`BERRY_PIXELS` pixels are seen."""
+    berries: int
+    """All its berries."""
+    frame: np.ndarray
+    """[7] pose of the 3D box's middle in the world; x runs down the rachis."""
+    size: np.ndarray
+    """[3] m, edges of the 3D box around all its parts, in that frame."""
+    cut: np.ndarray | None
+    """[3] m, where to cut: the middle of the peduncle, in the world; None for a bunch that has been picked."""
+    cut_pixel: np.ndarray | None
+    """[2] column and row of that point, whether inside the picture or not; None behind the camera."""
+    cut_seen: bool
+    """Whether the point is in the picture and the ray to it meets its own peduncle first."""
+
+    @property
+    def label(self) -> int:
+        """Its value in label images."""
+        return label(Organ.BUNCH, self.bunch)
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels show it."""
+        return int(self.visible.sum())
+
+    @property
+    def amodal_pixels(self) -> int:
+        """How many pixels would show it if there were nothing else."""
+        return int(self.amodal.sum())
+
+    @property
+    def occlusion(self) -> float:
+        """Share of its amodal pixels that show something else, 0..1."""
+        return 1.0 - self.pixels / self.amodal_pixels
+
+    def mask(self, window: np.ndarray, info: CameraInfo) -> np.ndarray:
+        """``visible`` or ``amodal`` as a mask [height, width] of the whole picture."""
+        whole = np.zeros((info.height, info.width), bool)
+        left, top, right, bottom = self.amodal_box
+        whole[top : bottom + 1, left : right + 1] = window
+        return whole
+
+
+def of_bunches(
+    primitives: Primitives, view: View, seen: Look, caster: RayCaster | None = None
+) -> tuple[BunchTruth, ...]:
+    """Every bunch of which some pixel would be seen if it were alone, by index.
+
+    ``primitives`` as they were posed by ``view`` when ``seen`` was taken; ``caster`` saves building one.
+    """
+    model, info = primitives.model, seen.info
+    alone, lens = Visibility(info.width, info.height, primitives.device), pinhole(info, seen.pose)
+    caster = caster or RayCaster(primitives)
+    named = primitives.label[primitives.cluster_first]
+    fruit = np.flatnonzero(named // LABEL_STRIDE == int(Organ.BUNCH))
+    fruit = fruit[np.isin(named[fruit], named[fruit][alone.distances(primitives, lens)[fruit] < float(FAR)])]
+    fruit = fruit[primitives.shown()[fruit]]
+    count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
+    posed = [getattr(primitives.shapes, k).numpy() for k in "ab"]
+    loose = {one.index: k for k, one in enumerate(view.links) if one.organ == Organ.BUNCH}
+    cuts = {
+        int(bunch): cut_point(model, view.body_q, int(bunch))
+        for bunch in np.unique(named[fruit] % LABEL_STRIDE)
+        if view.bunch_attached[bunch]
+    }
+    clear = _unhidden(caster, seen.pose[:3], cuts)
+    found = []
+    for bunch in np.unique(named[fruit] % LABEL_STRIDE).tolist():
+        mine = fruit[named[fruit] % LABEL_STRIDE == bunch]
+        whole = alone.alone(primitives, lens, mine)
+        rows, columns = np.flatnonzero(whole.any(1)), np.flatnonzero(whole.any(0))
+        if not len(rows):
+            continue
+        box = int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
+        window = np.s_[box[1] : box[3] + 1, box[0] : box[2] + 1]
+        visible = seen.labels[window] == label(Organ.BUNCH, bunch)
+        parts = np.concatenate(
+            [
+                np.arange(primitives.cluster_first[k], primitives.cluster_first[k] + primitives.cluster_size[k])
+                for k in mine
+            ]
+        )
+        attached = bool(view.bunch_attached[bunch])
+        turn = (view.body_q[model.bunch_body[bunch]] if attached else view.link_q[loose[bunch]])[3:]
+        frame, size = _box_around(
+            *(p[parts] for p in posed), np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
+        )
+        pixel = None
+        if attached:
+            local = frames.rotate(frames.conjugate(seen.pose[3:]), cuts[bunch] - seen.pose[:3])
+            pixel = point_cloud.project(local, info) if local[2] > 0.0 else None
+        found.append(
+            BunchTruth(
+                bunch=bunch,
+                variety=int(model.bunch_variety[bunch]),
+                tree=int(model.body_tree[model.bunch_body[bunch]]),
+                attached=attached,
+                amodal_box=box,
+                amodal=whole[window].copy(),
+                visible=visible,
+                visible_box=_box_of(visible, box),
+                berries_seen=int((count[parts] >= BERRY_PIXELS).sum()),
+                berries=int(model.bunch_berries[bunch]),
+                frame=frame,
+                size=size,
+                cut=cuts.get(bunch),
+                cut_pixel=pixel,
+                cut_seen=pixel is not None and _inside(pixel, info) and bunch in clear,
+            )
+        )
+    return tuple(found)
+
+
+def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:
+    """Middle of a hanging bunch's peduncle [3] m, along its axis, for world poses of the bodies [body, 7]."""
+    stalk, body = [], int(model.body_parent[model.bunch_body[bunch]])
+    while body >= 0 and model.body_organ[body] == int(Organ.PEDUNCLE):
+        stalk.insert(0, body)
+        body = int(model.body_parent[body])
+    if not stalk:  # it sits on the cane itself
+        return np.asarray(body_q[model.bunch_body[bunch], :3], float)
+    ends = np.cumsum(model.body_length[stalk], dtype=float)
+    half = 0.5 * ends[-1]
+    piece = int(np.searchsorted(ends, half))
+    along = half - (ends[piece - 1] if piece else 0.0)
+    pose = np.asarray(body_q[stalk[piece]], float)
+    return pose[:3] + frames.rotate(pose[3:], np.array([along, 0.0, 0.0]))
+
+
+def flow(first: Look, second: Look) -> tuple[np.ndarray, np.ndarray]:
+    """How the surface points of one picture move to another: of the camera, of the plants, or of both.
+
+    Displacement [height, width, 2] of each pixel's point, columns and rows [px], exact for the point that its ray
+    meets and that then moves with what carries it; NaN for the sky and for what has come behind the camera. And
+    whether the second picture shows the same primitive there [height, width].
+    """
+    if first.built != second.built:
+        raise ValueError("things came or went between the two looks; flow needs the same ones in both")
+    info, other = first.info, second.info
+    v, u = np.nonzero(np.isfinite(first.depth))
+    primitive, z = first.primitive[v, u], first.depth[v, u].astype(float)
+    local = np.stack([(u - info.cx) / info.fx * z, (v - info.cy) / info.fy * z, z], 1)
+    point = first.pose[:3] + frames.rotate(first.pose[3:], local)
+    solid = primitive >= 0  # the ground stays
+    before, after = (one.carriers[primitive[solid]] for one in (first, second))
+    attached = frames.rotate(frames.conjugate(before[:, 3:]), point[solid] - before[:, :3])
+    moved = point.copy()
+    # as a difference, so that what did not move does not move by a rounding either
+    still = frames.rotate(before[:, 3:], attached) + before[:, :3]
+    moved[solid] += frames.rotate(after[:, 3:], attached) + after[:, :3] - still
+    there = point_cloud.project(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
+    shift = np.full((info.height, info.width, 2), np.nan)
+    shift[v, u] = there - np.stack([u, v], 1)
+    shown = np.zeros((info.height, info.width), bool)
+    near = np.nan_to_num(np.round(there), nan=-1.0, posinf=-1.0, neginf=-1.0)
+    inside = (near >= 0).all(1) & (near[:, 0] < other.width) & (near[:, 1] < other.height)
+    column, row = near[inside].astype(int).T
+    shown[v[inside], u[inside]] = second.primitive[row, column] == primitive[inside]
+    return shift, shown
+
+
+def _unhidden(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
+    """Bunches between whose cut point and the eye there is nothing but their own peduncle."""
+    if not points:
+        return set()
+    bunch = np.array(list(points))
+    distance, primitive = caster.cast(eye, np.stack(list(points.values())) - eye)
+    p = caster.primitives
+    own = (primitive >= 0) & (p.label[np.maximum(primitive, 0)] == label(Organ.PEDUNCLE, 0) + bunch)
+    return set(bunch[(own & (distance < 1.0)) | ~(distance < 1.0)].tolist())
+
+
+def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose [7] and edges [3] m of the tightest box of this orientation around spheroids and cones [k]."""
+    back = frames.conjugate(np.asarray(turn, float))
+    start, end = (frames.rotate(back, v[:, :3].astype(float)) for v in (a, b))  # of a spheroid, end is its axis
+    radius, other = a[:, 3:].astype(float), b[:, 3:].astype(float)
+    round_one = (kind == SPHEROID)[:, None]
+    half = radius * np.sqrt(1.0 + np.where(round_one, (other**2 - 1.0) * end**2, 0.0))
+    cone = (kind == CONE)[:, None]
+    low = np.where(cone, np.minimum(start - radius, end - other), start - half).min(0)
+    high = np.where(cone, np.maximum(start + radius, end + other), start + half).max(0)
+    return frames.pose(frames.rotate(np.asarray(turn, float), 0.5 * (low + high)), turn), high - low
+
+
+def _box_of(mask: np.ndarray, window: Box) -> Box | None:
+    """Box in the picture of a mask that lies in a window of it."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return None
+    left, top = window[:2]
+    return left + int(columns[0]), top + int(rows[0]), left + int(columns[-1]), top + int(rows[-1])
+
+
+def _inside(pixel: np.ndarray, info: CameraInfo) -> bool:
+    return bool(-0.5 <= pixel[0] < info.width - 0.5 and -0.5 <= pixel[1] < info.height - 0.5)
