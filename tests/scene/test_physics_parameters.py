@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.support.contact_scenes import rows_of_canes
+from tests.physics.test_contact_solver import rows_of_canes
 from vinesim.physics.parameters import ParameterError, PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene import physics_parameters
