@@ -11,9 +11,9 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import shapes_of
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, furnished
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model

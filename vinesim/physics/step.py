@@ -23,6 +23,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
 
+
 class Physics:
     """A vineyard that moves: plants, rigid bodies, and what passes between them.
 
@@ -230,7 +231,9 @@ class Physics:
     def _blow(self) -> None:
         if self.wind is not None:
             actors = [self.rigid.stands(name) for name in self.rigid.actors]
-            self.wind.update(self.plants, self.time, (np.array(actors), self.parameters.wind_radius) if actors else None)
+            self.wind.update(
+                self.plants, self.time, (np.array(actors), self.parameters.wind_radius) if actors else None
+            )
 
     def _refine(self) -> None:
         self.detail.update(self.touching.near)
