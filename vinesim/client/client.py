@@ -76,7 +76,7 @@ class Client:
         ``executor`` prepares others who join, so that no tick has to; without one they are there at once.
         """
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, device=device, threads=threads, picking=self.picking)
+        self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, picking=self.picking)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
