@@ -16,7 +16,7 @@ from vinesim.cli.replay import run as replay
 from vinesim.client.client import Client
 from vinesim.client.recording.recorder import Recorder
 from vinesim.client.recording.replay import ReplayBus
-from vinesim.client.spectator import FOLLOW_DISTANCE, EYE_HEIGHT, Spectator, follow_view, standing_view
+from vinesim.client.spectator import EYE_HEIGHT, FOLLOW_DISTANCE, Spectator, follow_view, standing_view
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages

@@ -19,7 +19,7 @@ import numpy as np
 
 from vinesim.client.client import Client
 from vinesim.client.sensing.latest_value import LatestValue, poller
-from vinesim.client.sensing.sensor_worker import StepSnapshot, SensorConfig, run_sensor_worker
+from vinesim.client.sensing.sensor_worker import SensorConfig, StepSnapshot, run_sensor_worker
 from vinesim.client.tasks.tasks import Obey
 from vinesim.robot.description.description import Description
 from vinesim.robot.drives import Robot
