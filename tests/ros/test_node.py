@@ -38,7 +38,7 @@ from vinesim.ros.node import Node
 from vinesim.ros.tools.topic_monitor import TopicStats
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
-TIMEOUT = 30.0
+TIMEOUT = 120.0
 """Longest wait for anything [s]; reached only by a failure."""
 
 REST = frames.pose(np.zeros(3))

@@ -15,7 +15,7 @@ class ClockPublisher:
     """There is one clock per ROS domain, so its name is absolute under every namespace."""
 
     def __init__(self, advertise: Advertise) -> None:
-        self._topic = advertise(ClockMessage, "/clock", RELIABLE, urgent=True)
+        self._topic = advertise(ClockMessage, "/clock", RELIABLE, high_priority=True)
 
     def pending(self, time: float) -> Iterator[PendingMessage]:
         """The time [s]."""
