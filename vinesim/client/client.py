@@ -166,12 +166,12 @@ class Client:
             self.arrivals.forget(name)
             if (other := self.others.pop(name, None)) is not None:
                 other.leave()
-                self.physics.touching.copies.discard(name)
+                self.physics.contact_solver.remote_actors.discard(name)
                 log.info("%s left", name)
         for name, update in (*inbox.robots.items(), *inbox.people.items()):
             if name in self.arrivals and (other := self.arrivals.embody(name, update)) is not None:
                 self.others[name] = other
-                self.physics.touching.copies.add(name)
+                self.physics.contact_solver.remote_actors.add(name)
             if name in self.others:
                 self.others[name].follow(update)
         self._pull(inbox)
@@ -283,7 +283,7 @@ class Client:
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
-        things, told = self.things, self.physics.touching.told
+        things, told = self.things, self.physics.contact_solver.remote_trees
         for update in inbox.trees:
             if update.tree not in self._copies:
                 self.physics.plants.wake(update.tree)
