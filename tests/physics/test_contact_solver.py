@@ -291,7 +291,12 @@ def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     physics = Physics(model)
     physics.contact_solver = ContactSolver(model, physics.plants, physics.rigid, capacity=2)
     physics.add_robot(gripper(middle))
-    stages = (physics.rigid.prep, physics.contact_solver.wake_near_trees, physics.plants.free, physics.contact_solver.solve)
+    stages = (
+        physics.rigid.prep,
+        physics.contact_solver.wake_near_trees,
+        physics.plants.free,
+        physics.contact_solver.solve,
+    )
     for tick in range(250):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         for stage in stages:
@@ -526,7 +531,12 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         physics.add_robot(bar(at, damping=200.0))
         physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
         seen = set()
-        stages = (physics.rigid.prep, physics.contact_solver.wake_near_trees, physics.plants.free, physics.contact_solver.solve)
+        stages = (
+            physics.rigid.prep,
+            physics.contact_solver.wake_near_trees,
+            physics.plants.free,
+            physics.contact_solver.solve,
+        )
         for _ in range(40):
             for stage in stages:
                 stage()
@@ -643,14 +653,28 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
 
     def run() -> tuple:
         physics = Physics(model)
-        ContactSolver.__init__(physics.contact_solver, model, physics.plants, physics.rigid, capacity=100, plant_plant_contacts=False)
+        ContactSolver.__init__(
+            physics.contact_solver, model, physics.plants, physics.rigid, capacity=100, plant_plant_contacts=False
+        )
         for i in range(15):
             physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
         physics.plants.wake(np.arange(460))
-        for stage in (physics.rigid.prep, physics.contact_solver.wake_near_trees, physics.plants.free, physics.contact_solver.solve):
+        for stage in (
+            physics.rigid.prep,
+            physics.contact_solver.wake_near_trees,
+            physics.plants.free,
+            physics.contact_solver.solve,
+        ):
             stage()
         t = physics.contact_solver
-        return t.count, t.dropped_contacts, t.overflow_message, t._gap[:100].copy(), t.bodies.tobytes() + t.wrenches.tobytes(), t
+        return (
+            t.count,
+            t.dropped_contacts,
+            t.overflow_message,
+            t._gap[:100].copy(),
+            t.bodies.tobytes() + t.wrenches.tobytes(),
+            t,
+        )
 
     count, dropped, complaint, gap, result, touching = run()
     assert count == 100

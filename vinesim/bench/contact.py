@@ -37,7 +37,10 @@ MEASURED_STEPS, WARM_UP_STEPS = 1000, 100
 
 def contact_measurements() -> Iterator[Measurement]:
     """Canes with their bunches, all awake: a bar lifts twelve, four hands hold a bunch each."""
-    robots = [scenes.bar("bar", 0, LIFTED_CANES), *(scenes.gripper(f"hand{i}", scenes.bunch_center(i)) for i in HELD_CANES)]
+    robots = [
+        scenes.bar("bar", 0, LIFTED_CANES),
+        *(scenes.gripper(f"hand{i}", scenes.bunch_center(i)) for i in HELD_CANES),
+    ]
     for canes, ticks in zip(CANE_COUNTS, (20, 5), strict=True):
         case = f"{canes} canes and bunches, {LIFTED_CANES} lifted, {len(HELD_CANES)} held"
         yield from _compare_with_mujoco(case, "contact", scenes.cane_row(canes), robots, ticks)
@@ -49,7 +52,9 @@ def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurem
     The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
     on the headland. All swing their joints.
     """
-    yield from _compare_with_mujoco("1 hand, 1 held vine", "tick", scenes.cane_row(1), [scenes.gripper("hand", scenes.bunch_center(0))], 100)
+    yield from _compare_with_mujoco(
+        "1 hand, 1 held vine", "tick", scenes.cane_row(1), [scenes.gripper("hand", scenes.bunch_center(0))], 100
+    )
     model = generate(load(SCENE))
     with _one_core():
         for count in ROBOT_COUNTS:
@@ -60,7 +65,11 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
     """Tick by tick, and stage by stage, each with its own clock."""
     physics = Physics(model)
     for i in range(count):
-        pose = frames.pose([*ROBOT_POSITION, 0.0], frames.yaw(0.5 * np.pi)) if i == 0 else frames.pose([4.0 * i, -6.0, 0.0])
+        pose = (
+            frames.pose([*ROBOT_POSITION, 0.0], frames.yaw(0.5 * np.pi))
+            if i == 0
+            else frames.pose([4.0 * i, -6.0, 0.0])
+        )
         home = robot.home if i else raised
         physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
         physics.rigid.drive_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))

@@ -66,7 +66,9 @@ class MujocoScene:
     overlap by centimetres.
     """
 
-    def __init__(self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01, contact_time_constant: float | None = None) -> None:
+    def __init__(
+        self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01, contact_time_constant: float | None = None
+    ) -> None:
         self.rigid = mine = Rigid(model, parameters=PhysicsParameters(dt=dt))
         for robot in robots:
             mine.add_robot(robot)

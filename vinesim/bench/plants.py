@@ -78,7 +78,8 @@ def plant_measurements() -> Iterator[Measurement]:
             mujoco.mj_step(peer, data)
 
     one, two, theirs = (
-        1e3 * seconds / ticks for seconds in interleaved_medians(lambda: run_steps(whole, ticks), together, mujoco_steps)
+        1e3 * seconds / ticks
+        for seconds in interleaved_medians(lambda: run_steps(whole, ticks), together, mujoco_steps)
     )
     name = f"MuJoCo {mujoco.mj_versionString()} discrete"
     yield Measurement("plants", f"{CANE_COUNT} canes awake, one thread", one, "ms/tick", name, theirs, theirs / one)

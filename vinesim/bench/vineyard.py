@@ -33,7 +33,9 @@ def sleeping_measurements(robot: RobotSpec) -> Iterator[Measurement]:
 
     for physics in worlds:
         steps(physics)
-    alone, *among = (1e3 * s / 20 for s in scenes.interleaved_medians(*(lambda p=p: steps(p) for p in worlds), rounds=25))
+    alone, *among = (
+        1e3 * s / 20 for s in scenes.interleaved_medians(*(lambda p=p: steps(p) for p in worlds), rounds=25)
+    )
     for sleepers, value in zip(SLEEPING_TREES, among, strict=True):
         case = f"{AWAKE_TREES} canes awake, 1 hand, {sleepers} bunches asleep: whole tick"
         yield Measurement("asleep", case, value, "ms/tick", f"none asleep, {AWAKE_TREES} awake", alone, alone / value)

@@ -262,4 +262,6 @@ class Physics:
         if not self.parameters.sleep:
             return
         held = self.holding.trees
-        self.sleep.update(np.union1d(self.contact_solver.near_trees, held) if len(held) else self.contact_solver.near_trees)
+        self.sleep.update(
+            np.union1d(self.contact_solver.near_trees, held) if len(held) else self.contact_solver.near_trees
+        )

@@ -443,10 +443,19 @@ class ContactSolver:
         self._room = trees
         self._close = np.zeros((trees, min(len(self._geoms.id), self._movable + MAX_STATIC_GEOMS_PER_TREE)), np.int32)
         self._found, self._slot = np.zeros(trees, np.int32), np.arange(MAX_CONTACTS_PER_TREE)
-        self._hit_shape, self._hit_other = np.zeros((trees, MAX_CONTACTS_PER_TREE), np.int32), np.zeros((trees, MAX_CONTACTS_PER_TREE), np.int32)
+        self._hit_shape, self._hit_other = (
+            np.zeros((trees, MAX_CONTACTS_PER_TREE), np.int32),
+            np.zeros((trees, MAX_CONTACTS_PER_TREE), np.int32),
+        )
         self._onset = np.zeros(trees, np.bool_)
-        self._hit_gap, self._hit_room = np.zeros((trees, MAX_CONTACTS_PER_TREE)), np.zeros((trees, MAX_CONTACTS_PER_TREE))
-        self._hit_normal, self._hit_point = np.zeros((trees, MAX_CONTACTS_PER_TREE, 3)), np.zeros((trees, MAX_CONTACTS_PER_TREE, 3))
+        self._hit_gap, self._hit_room = (
+            np.zeros((trees, MAX_CONTACTS_PER_TREE)),
+            np.zeros((trees, MAX_CONTACTS_PER_TREE)),
+        )
+        self._hit_normal, self._hit_point = (
+            np.zeros((trees, MAX_CONTACTS_PER_TREE, 3)),
+            np.zeros((trees, MAX_CONTACTS_PER_TREE, 3)),
+        )
         self._record()
 
     def _renew(self) -> None:
