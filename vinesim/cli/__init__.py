@@ -74,7 +74,7 @@ def demo(
       vinesim demo --job pick --seed 5
       vinesim demo --job exchange
     """
-    from vinesim.cli.demo import run_job, run
+    from vinesim.cli.demo import run, run_job
 
     if job != "push":
         raise typer.Exit(run_job(job, seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out))

@@ -25,7 +25,7 @@ def run(
 ) -> int:  # fmt: skip
     """Walk, reach for a bunch, hold it and pull at it, let go; until told to stop. Then write report.json."""
     from vinesim.avatar.scripted_human import Walker
-    from vinesim.cli.robot_client import SWITCH_INTERVAL, save_report, report_status, tick_until
+    from vinesim.cli.robot_client import SWITCH_INTERVAL, report_status, save_report, tick_until
     from vinesim.client.client import Client
     from vinesim.client.rate_loop import RateLoop
     from vinesim.client.recording.trace import Trace

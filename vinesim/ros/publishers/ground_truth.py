@@ -11,7 +11,7 @@ from std_msgs.msg import String
 from vinesim.ros.messages import convert
 from vinesim.ros.messages.transforms import SerializedTransforms
 from vinesim.ros.publishers.robot import MAP_FRAME
-from vinesim.ros.topic import TRANSIENT_LOCAL, RELIABLE, Advertise, PendingMessage
+from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
 
 
 class GroundTruthPublisher:

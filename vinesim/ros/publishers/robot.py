@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from vinesim import frames
 from vinesim.ros.messages import convert
 from vinesim.ros.messages.transforms import SerializedTransforms
-from vinesim.ros.topic import TRANSIENT_LOCAL, RELIABLE, TRANSFORMS, Advertise, PendingMessage
+from vinesim.ros.topic import RELIABLE, TRANSFORMS, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import Contact, RobotSample
 
 MAP_FRAME, ODOM_FRAME = "map", "odom"
