@@ -218,7 +218,7 @@ def test_a_whole_arm_gives_way_by_f_over_k(vinebot: Description) -> None:
 def test_a_joint_of_an_arm_swings_as_asked(vinebot: Description, joint: int, stiffness: float, zeta: float) -> None:
     """The robot's own hinge friction (URDF) adds to the damping asked for; inertia from the URDF and the rotor."""
     stand, name = Stand(vinebot), ARM[joint]
-    inertia = inertia_about(vinebot, name) + next(d.rotor for d in vinebot.drives if d.joint == name)
+    inertia = inertia_about(vinebot, name) + next(d.armature for d in vinebot.drives if d.joint == name)
     friction = next(
         float(found.find("dynamics").get("damping"))
         for found in ElementTree.fromstring(vinebot.urdf).iterfind("joint")
@@ -270,7 +270,7 @@ def inertia_about(description: Description, joint: str) -> float:
 
 def test_a_locked_motor_lets_the_gate_swing_on_its_spring(gate: Description) -> None:
     stand, inertia = Stand(gate), GATE_INERTIA + ROTOR
-    stand.robot.command_elastic([0.0])
+    stand.robot.command_motor_position([0.0])
     stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.2]))
     swing = stand.run(3.0)[:, 0]
     found, wanted = decrement(swing), expected(150.0, 3.0, inertia)
@@ -283,7 +283,7 @@ def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: Descri
     stand = Stand(vinebot)
     joints = stand.robot.joint_indices(ARM)
     motor = vinebot.home[joints]
-    stand.robot.command_elastic(motor, joints)
+    stand.robot.command_motor_position(motor, joints)
     force = np.array([0.0, 10.0, -15.0])
     stand.push("arm_left_7_link", force)
     stand.run(4.0)
@@ -293,7 +293,7 @@ def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: Descri
     assert np.abs(load).max() > 10.0
     np.testing.assert_allclose(elements.torque[joints], load, rtol=0.02, atol=0.02)
     position = stand.rigid.read("anna")[0][joints]
-    springs = np.array([d.elastic or d.stiffness for d in vinebot.drives])[joints]
+    springs = np.array([d.series_stiffness or d.stiffness for d in vinebot.drives])[joints]
     np.testing.assert_allclose(springs * (motor - position), load, rtol=0.02, atol=0.02)
     np.testing.assert_allclose(elements.motor[joints], motor, atol=1e-4)
     np.testing.assert_array_equal(elements.torque, elements.stiffness * elements.deflection)
@@ -302,7 +302,7 @@ def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: Descri
 
 def test_motor_command_is_followed_by_the_link(gate: Description) -> None:
     stand = Stand(gate)
-    stand.robot.command_elastic([0.4])
+    stand.robot.command_motor_position([0.4])
     stand.run(12.0)
     elements = stand.robot.sample(stand.time).elements
     assert stand.rigid.read("anna")[0][0] == pytest.approx(0.4, abs=1e-3)

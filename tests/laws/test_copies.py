@@ -10,7 +10,7 @@ import pytest
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.description.description import Description, load
-from vinesim.robot.drives import Embodied, RemoteRobot, Robot
+from vinesim.robot.drives import RobotInstance, RemoteRobot, Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
 
@@ -128,7 +128,7 @@ def test_a_copy_lags_by_speed_times_latency_and_no_more(vinebot, latency):
     assert base < 0.4 * 0.01 * latency + 5e-3
 
 
-def told(copy: Embodied, position: np.ndarray) -> RobotUpdate:
+def told(copy: RobotInstance, position: np.ndarray) -> RobotUpdate:
     return RobotUpdate(copy.name, 0.0, HERE, np.zeros(6), position, np.zeros(len(position)))
 
 

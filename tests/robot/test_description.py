@@ -213,7 +213,7 @@ def test_defaults_without_a_sidecar(tmp_path: pathlib.Path) -> None:
     assert simple.joints == ("shoulder_joint", "turret_joint")
     shoulder, turret = simple.drives
     assert shoulder.stiffness * 0.05 == pytest.approx(shoulder.effort)
-    assert shoulder.rotor == pytest.approx(0.02 * 10.0 / 1.0)
+    assert shoulder.armature == pytest.approx(0.02 * 10.0 / 1.0)
     assert shoulder.damping == pytest.approx(2.0 * np.sqrt(200.0 * (0.1 + 0.2)))
     assert (turret.lower, turret.upper) == (-np.inf, np.inf)
     assert simple.cameras[0].frame == "camera_optical_frame"
@@ -343,13 +343,13 @@ def test_missing_file_lists_what_there_is() -> None:
 
 def test_springs_and_slip_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
     file = write(tmp_path, robot())
-    assert load(file).drives[0].elastic == 0.0
+    assert load(file).drives[0].series_stiffness == 0.0
     file.with_suffix(".toml").write_text(
         "[base]\nslip = [0.1, 0.2]\n"
         "[groups.arm]\njoints = ['shoulder_joint']\nelastic = [800.0]\nelastic_damping = [4.0]\n"
     )
     found = load(file)
-    assert (found.drives[0].elastic, found.drives[0].elastic_damping) == (800.0, 4.0)
+    assert (found.drives[0].series_stiffness, found.drives[0].series_damping) == (800.0, 4.0)
     assert found.base_limits.slip == (0.1, 0.2)
 
 

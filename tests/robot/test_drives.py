@@ -15,7 +15,7 @@ from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import Description, load
-from vinesim.robot.drives import CommandError, Interface, RemoteRobot, Robot
+from vinesim.robot.drives import CommandError, CommandInterface, RemoteRobot, Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
 
@@ -58,7 +58,7 @@ def test_home_is_held_without_sag(yard: Yard, vinebot: Description) -> None:
 
 def test_step_command_ramps_at_the_speed_limit(yard: Yard) -> None:
     joint = yard.robot.joint_indices(["arm_left_4_joint"])[0]
-    limit, start = yard.robot.speed[joint], yard.robot.setpoint[joint]
+    limit, start = yard.robot.max_velocity[joint], yard.robot.setpoint[joint]
     yard.robot.command_position([start - 1.1], ["arm_left_4_joint"])
     position, velocity, _, setpoint = yard.run(1.0)[:, :, joint].T
     steps = np.abs(np.diff(setpoint, prepend=start))
@@ -98,8 +98,8 @@ def test_velocity_command_moves_and_ends_at_the_limit(yard: Yard) -> None:
     np.testing.assert_allclose(rows[30:, 1, joint], 0.5, rtol=0.02)
     yard.robot.command_velocity([50.0], ["arm_right_2_joint"])
     rows = yard.run(2.0)
-    assert np.abs(np.diff(rows[:, 3, joint])).max() <= yard.robot.speed[joint] * yard.rigid.dt * (1.0 + 1e-9)
-    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper[joint], abs=2e-3)
+    assert np.abs(np.diff(rows[:, 3, joint])).max() <= yard.robot.max_velocity[joint] * yard.rigid.dt * (1.0 + 1e-9)
+    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper_limit[joint], abs=2e-3)
 
 
 def test_effort_command_is_the_effort_at_rest(yard: Yard) -> None:
@@ -107,10 +107,10 @@ def test_effort_command_is_the_effort_at_rest(yard: Yard) -> None:
     joint = yard.robot.joint_indices(["head_1_joint"])[0]
     yard.robot.command_effort([2.0], ["head_1_joint"])
     rows = yard.run(3.0)
-    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper[joint], abs=0.02)
+    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper_limit[joint], abs=0.02)
     assert rows[-1, 2, joint] == pytest.approx(2.0, rel=0.01)
     yard.robot.command_effort([100.0], ["head_1_joint"])
-    assert yard.run(1.0)[-1, 2, joint] == pytest.approx(yard.robot.effort[joint], rel=0.01)
+    assert yard.run(1.0)[-1, 2, joint] == pytest.approx(yard.robot.max_effort[joint], rel=0.01)
 
 
 def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
@@ -123,7 +123,7 @@ def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
     yard.robot.command_effort([10.0], ["torso_lift_joint"])
     velocity = np.concatenate([[0.0], yard.run(0.8)[:, 1, joint]])
     acceleration = np.diff(velocity) / yard.rigid.dt
-    expected = (10.0 - 50.0 * velocity[1:]) / (carried + yard.robot.description.drives[joint].rotor)
+    expected = (10.0 - 50.0 * velocity[1:]) / (carried + yard.robot.description.drives[joint].armature)
     assert 0.04 < velocity[-1] < 0.15
     np.testing.assert_allclose(acceleration[5:], expected[5:], rtol=0.02)  # until then the arms sag in their joints
 
@@ -167,7 +167,7 @@ def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yar
     before = yard.run(0.2)[-1, 0]
     yard.rigid.push("anna", "arm_left_4_link", np.array([900.0, 0.0, 0.0]))
     rows = yard.run(0.6)
-    assert (np.abs(rows[:, 2]) <= yard.robot.effort * (1.0 + 1e-9)).all()
+    assert (np.abs(rows[:, 2]) <= yard.robot.max_effort * (1.0 + 1e-9)).all()
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
     yielded = rows[-1, 0, joint] - before[joint]
     assert abs(yielded) > 0.1
@@ -250,11 +250,11 @@ def test_two_runs_are_the_same_to_the_bit(vinebot: Description) -> None:
 
 
 def test_stop_holds_everything_where_it_is(yard: Yard) -> None:
-    yard.robot.command_velocity(0.3 * yard.robot.speed)
+    yard.robot.command_velocity(0.3 * yard.robot.max_velocity)
     yard.robot.command_base(0.5, 0.0, yard.time)
     yard.run(0.3)
     yard.robot.stop()
-    assert (yard.robot.interface == Interface.POSITION).all()
+    assert (yard.robot.interface == CommandInterface.POSITION).all()
     rows = yard.run(1.5)
     np.testing.assert_allclose(rows[-1, 1], 0.0, atol=1e-3)
     assert np.abs(yard.rigid.base("anna")[1]).max() < 0.02
@@ -298,7 +298,7 @@ def test_remote_copy_follows_its_original(vinebot: Description) -> None:
 def test_robots_leave(yard: Yard, vinebot: Description) -> None:
     second = Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
     yard.run(0.05)
-    second.leave()
+    second.remove()
     assert yard.rigid.robots == ("anna",)
     np.testing.assert_allclose(yard.run(0.05)[-1, 0], vinebot.home, atol=1e-9)
 
@@ -358,7 +358,7 @@ def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
     joints = yard.robot.joint_indices(None)
     for command in (
         lambda: yard.robot.command_velocity(np.zeros(len(joints))),
-        lambda: yard.robot.command_elastic(yard.robot.sample(yard.time).elements.motor),
+        lambda: yard.robot.command_motor_position(yard.robot.sample(yard.time).elements.motor),
         lambda: yard.robot.command_position(yard.rigid.read("anna")[0]),
         lambda: yard.robot.command_effort(np.zeros(len(joints))),
         lambda: yard.robot.command_velocity(np.zeros(len(joints))),
@@ -372,12 +372,12 @@ def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
 def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
     """All of the effort is there at rest, as good as none at the largest speed."""
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
-    yard.robot.command_effort([yard.robot.effort[joint]], ["arm_left_1_joint"])
+    yard.robot.command_effort([yard.robot.max_effort[joint]], ["arm_left_1_joint"])
     rows = yard.run(1.5)[:, :, joint]
-    moving = rows[:, 0] < yard.robot.upper[joint] - 0.2
-    assert rows[moving, 1].max() == pytest.approx(yard.robot.speed[joint], rel=0.02)
-    assert rows[0, 2] == pytest.approx(yard.robot.effort[joint], rel=1e-6)
-    assert np.abs(rows[10:40, 2] - yard.rigid.weight("anna")[joint]).max() < 0.2 * yard.robot.effort[joint]
+    moving = rows[:, 0] < yard.robot.upper_limit[joint] - 0.2
+    assert rows[moving, 1].max() == pytest.approx(yard.robot.max_velocity[joint], rel=0.02)
+    assert rows[0, 2] == pytest.approx(yard.robot.max_effort[joint], rel=1e-6)
+    assert np.abs(rows[10:40, 2] - yard.rigid.weight("anna")[joint]).max() < 0.2 * yard.robot.max_effort[joint]
 
 
 # ---------------------------------------------------------------------- what sensors on it feel
@@ -568,7 +568,7 @@ def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: Description)
     assert cut("gripper_right") == ()
     (parting,) = cut("gripper_left")
     assert (parting.bunch, parting.cause, parting.actor) == (0, "blade", "anna")
-    robot.leave()
+    robot.remove()
     assert physics.parting.blades == []
     physics.step()
 

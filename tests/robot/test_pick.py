@@ -81,7 +81,7 @@ def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(
     assert on_vine > 3.0
     assert in_box == pytest.approx(on_vine, rel=0.01)
     # it was cut, not torn: the blade did it, and the hand that held it is empty now
-    assert np.abs(physics.rigid.bunch_pose(task.bunch)[:3] - pick.hand.point).max() > 0.2
+    assert np.abs(physics.rigid.bunch_pose(task.bunch)[:3] - pick.hand.tip_position).max() > 0.2
 
 
 def _next(physics: Physics, robot: Robot, box: int) -> float:

@@ -65,8 +65,8 @@ def test_fingertips_arrive_within_a_centimetre(robot: Robot, target: tuple[float
     assert np.linalg.norm(run.tips[touched - 1] - np.array(target)) < 0.01
     # within the limits of the URDF: what is asked strictly, what happens but for the servos' ringing
     steps = np.abs(np.diff(run.setpoints, axis=0)) / robot.rigid.dt
-    assert (steps <= robot.speed * (1.0 + 1e-6)).all()
-    assert (np.abs(run.speeds) <= 1.5 * robot.speed).all()
+    assert (steps <= robot.max_velocity * (1.0 + 1e-6)).all()
+    assert (np.abs(run.speeds) <= 1.5 * robot.max_velocity).all()
     assert run.reach.cycles == 1
     assert run.reach.missed == 0
 
@@ -136,10 +136,10 @@ def test_what_is_out_of_reach_is_given_up_calmly(robot: Robot, caplog: pytest.Lo
     assert run.reach.missed == 1
     assert Phase.TOUCH not in run.phases
     assert "out of reach" in caplog.text
-    assert (np.abs(run.speeds) <= 2.0 * robot.speed).all()
+    assert (np.abs(run.speeds) <= 2.0 * robot.max_velocity).all()
     position = robot.rigid.read("anna")[0]
-    assert (position >= robot.lower - 0.02).all()
-    assert (position <= robot.upper + 0.02).all()
+    assert (position >= robot.lower_limit - 0.02).all()
+    assert (position <= robot.upper_limit + 0.02).all()
 
 
 def test_two_arms_share_the_robot(vinebot: Description) -> None:

@@ -165,7 +165,7 @@ class Client:
         for name in inbox.left:
             self.arrivals.forget(name)
             if (other := self.others.pop(name, None)) is not None:
-                other.leave()
+                other.remove()
                 self.physics.touching.copies.discard(name)
                 log.info("%s left", name)
         for name, update in (*inbox.robots.items(), *inbox.people.items()):

@@ -67,7 +67,7 @@ class Arrivals:
         self.forget(name)
         if description is None or not isinstance(update, RobotUpdate):
             return RemotePerson(self.rigid, name)
-        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, here=True)
+        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, is_in_world=True)
         self.rigid.place(name, update.base_q, update.position)
         return other
 

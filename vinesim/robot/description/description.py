@@ -768,7 +768,7 @@ def _drive(
         velocity=limit.velocity,
         lower=-math.inf if endless else limit.lower,
         upper=math.inf if endless else limit.upper,
-        rotor=rotor,
-        elastic=spring[0] if spring else 0.0,
-        elastic_damping=spring[1] if spring else 0.0,
+        armature=rotor,
+        series_stiffness=spring[0] if spring else 0.0,
+        series_damping=spring[1] if spring else 0.0,
     )

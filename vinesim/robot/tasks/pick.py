@@ -22,8 +22,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.rigid.static_world import CRATE_WALL
 from vinesim.physics.step import Physics
-from vinesim.robot.control.cartesian_controller import Hand, axes_of
-from vinesim.robot.control.waypoint_follower import Way
+from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
+from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.task import Failed, Script
 
@@ -82,7 +82,7 @@ class Pick(Script):
         """``robot`` has been fitted with its cutters (:meth:`Robot.fit_cutters`)."""
         super().__init__(robot, seconds=seconds)
         self.physics, self.task = physics, task
-        self.hand = Hand(robot, task.side)
+        self.hand = CartesianController(robot, task.side)
         cutter = next((c for c in robot.description.cutters if c.group == self.hand.gripper), None)
         if cutter is None:
             raise CommandError(f"{robot.name} has no gripper with a cutter on its {task.side} arm; give one that has")
@@ -141,13 +141,13 @@ class Pick(Script):
     def steps(self) -> Iterator[str]:
         """See :class:`Script`."""
         ahead = frames.rotate(self._base()[3:], np.array([1.0, 0.0, 0.0]))
-        self.hand.start()
+        self.hand.reset()
         self._open(2.0 * (self._radius + SLACK))
         yield from self._lead("reach", lambda: self._grip() - AWAY * ahead, ahead, patience=12.0)
         yield from self._lead("advance", self._grip, ahead, speed=0.10, patience=8.0, near=0.003)
         yield from self._close(ahead)
         yield from self._part()
-        back = self.hand.point - AWAY * ahead + [0.0, 0.0, -0.03]
+        back = self.hand.tip_position - AWAY * ahead + [0.0, 0.0, -0.03]
         yield from self._lead("back", lambda: back, ahead, speed=0.15, patience=6.0)
         yield from self._lead("tuck", lambda: self._of_base(CARRY), ahead, speed=CALM, patience=10.0, near=0.03)
         yield from self._drive()
@@ -184,11 +184,11 @@ class Pick(Script):
 
     def _drive(self) -> Iterator[str]:
         """Take the bunch to where the box is in reach."""
-        way = Way(self.robot, self.task.way, self.task.heading, turn=0.3)
-        while not way.done:
-            self.hand.hold()
+        way = WaypointFollower(self.robot, self.task.way, self.task.heading, turn_rate=0.3)
+        while not way.is_done:
+            self.hand.hold_position()
             way.control(self.time)
-            if way.stuck:
+            if way.is_stuck:
                 raise Failed("something keeps the base from going on")
             self._holding()
             yield "drive"
@@ -218,26 +218,26 @@ class Pick(Script):
     ) -> Iterator[str]:  # fmt: skip
         """Lead the hand to ``goal`` [3] in the world, pointing ``ahead`` [3]; :class:`Failed` if it does not come."""
         end = self.time + patience
-        self.hand.start()
+        self.hand.reset()
         while True:
             there = goal()
-            axes = axes_of(self.robot.frame_pose(self.hand.tool))
+            axes = axes_of_pose(self.robot.frame_pose(self.hand.tool))
             off = np.arccos(np.clip((axes[0] @ ahead + axes[2] @ self._up) / 2.0, -1.0, 1.0))
-            if self.hand.distance(there) < near and off < FACING:
+            if self.hand.distance_to(there) < near and off < FACING:
                 return
             if self.time > end:
                 raise Failed(
-                    f"the hand is {self.hand.distance(there):.2f} m and {off:.2f} rad off: out of reach, or held"
+                    f"the hand is {self.hand.distance_to(there):.2f} m and {off:.2f} rad off: out of reach, or held"
                 )
             if phase not in ("rise",):
                 self._holding()
-            self.hand.lead(there, ahead, self._up, speed=speed, height=float(there[2]))
+            self.hand.move_towards(there, ahead, self._up, speed=speed, shoulder_height=float(there[2]))
             yield phase
 
     def _holding(self) -> None:
         """:class:`Failed` if the bunch has left its vine and not come along."""
         if not self.physics.state.bunch_attached[self.task.bunch]:
-            off = float(np.linalg.norm(self._grip() - self.hand.point))
+            off = float(np.linalg.norm(self._grip() - self.hand.tip_position))
             if off > LOST:
                 raise Failed(f"the bunch slipped out of the fingers, it is {off:.2f} m from them")
 
@@ -246,7 +246,7 @@ class Pick(Script):
         return frames.compose(self.bunch_pose, frames.pose([self._depth, 0.0, 0.0]))[:3]
 
     def _open(self, opening: float) -> None:
-        widest = float(self.robot.upper[self._fingers].sum())
+        widest = float(self.robot.upper_limit[self._fingers].sum())
         self.robot.command_gripper(self.hand.gripper, min(opening, widest))
 
     def _base(self) -> np.ndarray:

@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.robot.control.cartesian_controller import Hand
+from vinesim.robot.control.cartesian_controller import CartesianController
 from vinesim.robot.drives import Robot
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ class ReachAndPush:
         """
         self.robot = robot
         self.target = target
-        self.hand = Hand(robot, side, tip=TIP, acceleration=acceleration, lift=lift)
+        self.hand = CartesianController(robot, side, tip_offset=TIP, acceleration=acceleration, use_lift=lift)
         self.tool = self.hand.tool
         self.radius, self.depth, self.clearance, self.hold = radius, depth, clearance, hold
         self.speed, self.touch_speed = speed, touch_speed
@@ -91,12 +91,12 @@ class ReachAndPush:
     @property
     def tip(self) -> np.ndarray:
         """Fingertips in the world [3] m."""
-        return self.hand.point
+        return self.hand.tip_position
 
     @property
     def goal(self) -> np.ndarray:
         """Where the fingertips are to be at the end of the present phase [3] m; where they are, if there is none."""
-        return self._way.get(self.phase, self.hand.place)
+        return self._way.get(self.phase, self.hand.reference)
 
     @property
     def error(self) -> float:
@@ -113,14 +113,14 @@ class ReachAndPush:
         if self._ended(time):
             self._advance(time)
         if self.phase is not Phase.DONE:
-            self.hand.lead(self.goal, self._axis, speed=self._fastest, height=self._height)
+            self.hand.move_towards(self.goal, self._axis, speed=self._fastest, shoulder_height=self._height)
 
     # ------------------------------------------------------------------ phases
 
     def _plan(self) -> None:
         """Lay the way to where the target is now."""
         center = np.asarray(self.target(), float)
-        ahead = center - self.hand.shoulder
+        ahead = center - self.hand.shoulder_position
         ahead[2] = np.hypot(ahead[0], ahead[1]) * np.tan(RISE)
         self._axis = frames.normalize(ahead)
         touch = center - self.radius * self._axis
@@ -134,7 +134,7 @@ class ReachAndPush:
             Phase.RETREAT: ready,
         }
         self._height = center[2]
-        self.hand.start()
+        self.hand.reset()
         if self.hand.gripper:
             self.robot.command_gripper(self.hand.gripper, 0.0)
 
@@ -142,7 +142,7 @@ class ReachAndPush:
         self.phase, self._started = phase, time
         fast = phase in (Phase.APPROACH, Phase.RETREAT)
         self._fastest = self.speed if fast else self.touch_speed
-        way = np.linalg.norm(self.goal - self.hand.place)
+        way = np.linalg.norm(self.goal - self.hand.reference)
         # a bunch that pushes back may keep the tip from arriving; then time ends the phase
         self._patience = 2.0 * way / self._fastest + 2.0 * self._fastest / self.hand.acceleration + 3.0
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.robot.control.waypoint_follower import Way
+from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.task import Failed, Script
 
@@ -97,7 +97,7 @@ class Exchange(Script):
         phase, group = f"take the {'full' if box == self.swap.full else 'empty'} box", f"clamp_{end}"
         here = self._base()[:2].copy()
         fingers = self.robot.description.indices(group)
-        self.robot.command_position(self.robot.upper[fingers], fingers)
+        self.robot.command_position(self.robot.upper_limit[fingers], fingers)
         yield from self._lift(phase, end, 0.0)
         yield from self._reach(phase, end, self.box_pose(box))
         self.robot.command_position(np.zeros(len(fingers)), fingers)
@@ -119,7 +119,7 @@ class Exchange(Script):
         down = float(self.robot.rigid.read(self.robot.name)[0][self._lift_index(end)])
         yield from self._lift(phase, end, down - float(self.box_pose(box)[2] - self._place[2]) + GROUNDED)
         fingers = self.robot.description.indices(f"clamp_{end}")
-        self.robot.command_position(self.robot.upper[fingers], fingers)
+        self.robot.command_position(self.robot.upper_limit[fingers], fingers)
         yield from self.wait(1.5, phase)
         yield from self._straight(phase, here, backwards=end == "front")
 
@@ -137,10 +137,10 @@ class Exchange(Script):
     # ------------------------------------------------------------------ what the steps are made of
 
     def _go(self, phase: str, points: np.ndarray, heading: float) -> Iterator[str]:
-        yield from self._follow(phase, Way(self.robot, points, heading, speed=0.5, turn=0.3))
+        yield from self._follow(phase, WaypointFollower(self.robot, points, heading, speed=0.5, turn_rate=0.3))
 
     def _straight(self, phase: str, place: np.ndarray, *, backwards: bool) -> Iterator[str]:
-        yield from self._follow(phase, Way(self.robot, place, None, speed=CREEP, backwards=backwards))
+        yield from self._follow(phase, WaypointFollower(self.robot, place, None, speed=CREEP, reverse=backwards))
 
     def _reach(self, phase: str, end: str, box: np.ndarray) -> Iterator[str]:
         """Bring the clamp at one ``end`` to a box at pose [7], straight."""
@@ -152,10 +152,10 @@ class Exchange(Script):
         place = base + ahead * (float((box[:2] - base) @ ahead) - reach)
         yield from self._straight(phase, place, backwards=end == "rear")
 
-    def _follow(self, phase: str, way: Way) -> Iterator[str]:
-        while not way.done:
+    def _follow(self, phase: str, way: WaypointFollower) -> Iterator[str]:
+        while not way.is_done:
             way.control(self.time)
-            if way.stuck:
+            if way.is_stuck:
                 raise Failed("something keeps the base from going on")
             yield phase
 
