@@ -33,7 +33,7 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
         points = np.concatenate([task.stand[None, :2], task.way])
         for a, b in itertools.pairwise(points[:-1]):
             line = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
-            assert start_poses.free_room(model, line).min() > pick_planning.ROOM - pick_planning.GRID
+            assert start_poses.ground_clearance(model, line).min() > pick_planning.ROOM - pick_planning.GRID
         end = frames.pose(np.append(points[-1], 0.0), frames.yaw(task.heading))
         box = frames.compose(frames.inverse(end), model.box_pose[task.box].astype(float))[:3]
         gap = abs(box[1]) - 0.5 * float(model.box_size[task.box, 1]) - pick_planning.WIDTH
@@ -49,7 +49,7 @@ def test_a_way_goes_round_what_stands_and_is_short():
     assert 2.8 < length < 5.0
     for a, b in itertools.pairwise(points):
         line = a + np.linspace(0.0, 1.0, 100)[:, None] * (b - a)
-        assert start_poses.free_room(model, line).min() > pick_planning.ROOM - pick_planning.GRID
+        assert start_poses.ground_clearance(model, line).min() > pick_planning.ROOM - pick_planning.GRID
 
 
 def test_no_way_through_a_vine():
@@ -59,7 +59,7 @@ def test_no_way_through_a_vine():
 
 def test_boxes_without_room_are_told():
     model = generate(harvest(7, boxes=()))
-    with pytest.raises(start_poses.NoPlace, match=r"no box of this scene has .* room beside it"):
+    with pytest.raises(start_poses.PlacementError, match=r"no box of this scene has .* room beside it"):
         next(pick_planning.tasks(model, np.zeros(2)))
 
 
@@ -67,5 +67,5 @@ def test_a_box_is_an_obstacle_as_large_as_it_is():
     model = generate(harvest(7, boxes=(Box(x=3.75, y=1.2, yaw=0.5),)))
     corner = np.array([3.75, 1.2]) + frames.rotate(frames.yaw(0.5), np.array([0.3, 0.2, 0.0]))[:2]
     away = frames.rotate(frames.yaw(0.5), np.array([0.3, 0.4, 0.0]))[:2]
-    assert start_poses.free_room(model, (corner + away)[None])[0] == pytest.approx(0.5, abs=1e-6)
-    assert start_poses.free_room(model, corner[None], without=0)[0] > 1.0
+    assert start_poses.ground_clearance(model, (corner + away)[None])[0] == pytest.approx(0.5, abs=1e-6)
+    assert start_poses.ground_clearance(model, corner[None], without=0)[0] > 1.0

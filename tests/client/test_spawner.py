@@ -13,7 +13,7 @@ from vinesim import frames
 from vinesim.client.remote.spawner import Arrivals, described
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
@@ -39,22 +39,22 @@ class Later(concurrent.futures.Executor):
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
+def vinebot() -> RobotDescription:
     return load("vinebot")
 
 
-def greeting(description: Description, name: str = "guest", **change) -> Hello:
+def greeting(description: RobotDescription, name: str = "guest", **change) -> Hello:
     usual = {"robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7}
     return Hello(name, **{**usual, **change})
 
 
-def standing(description: Description, x: float) -> RobotUpdate:
+def standing(description: RobotDescription, x: float) -> RobotUpdate:
     position = description.home.copy()
     position[0] += 0.05
     return RobotUpdate("guest", 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), position, np.zeros_like(position))
 
 
-def world(description: Description) -> Physics:
+def world(description: RobotDescription) -> Physics:
     physics = Physics(assemble([cane((5.0, 5.0, 1.0), radius=0.005)]))
     physics.rigid.add_robot(description.spec("host", 1, frames.pose([0.0, 3.0, 0.0])))
     return physics

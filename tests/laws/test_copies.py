@@ -9,7 +9,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load
 from vinesim.robot.drives import RobotInstance, RemoteRobot, Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
@@ -98,7 +98,7 @@ def test_across_the_network_the_stronger_wins_too(left, right, delay):
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
+def vinebot() -> RobotDescription:
     return load("vinebot")
 
 

@@ -13,17 +13,17 @@ import trimesh
 import yourdfpy
 
 from vinesim import frames
-from vinesim.robot.description.description import Description, DescriptionError, load
+from vinesim.robot.description.description import RobotDescription, DescriptionError, load
 from vinesim.scene import data_files
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
+def vinebot() -> RobotDescription:
     return load("vinebot")
 
 
 @pytest.fixture(scope="module")
-def parsed(vinebot: Description) -> yourdfpy.Robot:
+def parsed(vinebot: RobotDescription) -> yourdfpy.Robot:
     return parse(vinebot.urdf)
 
 
@@ -43,7 +43,7 @@ def test_urdf_is_what_its_writer_writes() -> None:
     assert (root / "data" / "robots" / "vinebot.urdf").read_text() == writer.vinebot()
 
 
-def test_vinebot_is_a_dual_arm_carrier(vinebot: Description) -> None:
+def test_vinebot_is_a_dual_arm_carrier(vinebot: RobotDescription) -> None:
     assert vinebot.base == "base_footprint"
     assert 150.0 < vinebot.mass < 250.0
     assert len(vinebot.drives) == 21
@@ -56,7 +56,7 @@ def test_vinebot_is_a_dual_arm_carrier(vinebot: Description) -> None:
         assert drive.lower <= home <= drive.upper, drive.joint
 
 
-def test_arms_weigh_as_arms_do(vinebot: Description, parsed: yourdfpy.Robot) -> None:
+def test_arms_weigh_as_arms_do(vinebot: RobotDescription, parsed: yourdfpy.Robot) -> None:
     for side in ("left", "right"):
         parts = [
             link for link in parsed.links if link.name.startswith((f"arm_{side}", f"gripper_{side}", f"wrist_{side}"))
@@ -92,10 +92,10 @@ def test_inertias_are_those_of_the_shapes(parsed: yourdfpy.Robot) -> None:
     assert checked == 32
 
 
-def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: Description) -> None:
+def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: RobotDescription) -> None:
     """Wood that stands across the finger tips passes through the mouth."""
     assert [cutter.group for cutter in vinebot.cutters] == ["gripper_left", "gripper_right"]
-    poses = vinebot.frame_poses(vinebot.home)
+    poses = vinebot.link_poses(vinebot.home)
     for cutter in vinebot.cutters:
         tips = poses[f"{cutter.group}_grasping_link"]
         mouth = frames.compose(poses[cutter.frame], frames.pose(np.array(cutter.origin)))
@@ -105,11 +105,11 @@ def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: Description) -> Non
         assert -0.10 < off[2] < -0.02
 
 
-def test_bunches_are_within_reach(vinebot: Description) -> None:
+def test_bunches_are_within_reach(vinebot: RobotDescription) -> None:
     """From the shoulder, with the lift inside its range, the arm's length covers 0.45-0.9 m ahead, 1.3-1.8 m high."""
     zero = vinebot.home.copy()
     zero[vinebot.indices("arm_left")] = 0.0
-    poses = vinebot.frame_poses(zero)
+    poses = vinebot.link_poses(zero)
     shoulder, tool = poses["arm_left_2_link"][:3], poses["gripper_left_grasping_link"][:3]
     length = np.linalg.norm(shoulder - tool)
     assert 0.85 < length < 1.05
@@ -121,27 +121,27 @@ def test_bunches_are_within_reach(vinebot: Description) -> None:
             assert np.linalg.norm(target - raised) < length
 
 
-def test_sides_mirror_each_other(vinebot: Description) -> None:
-    poses = vinebot.frame_poses(vinebot.home)
+def test_sides_mirror_each_other(vinebot: RobotDescription) -> None:
+    poses = vinebot.link_poses(vinebot.home)
     left, right = poses["gripper_left_grasping_link"], poses["gripper_right_grasping_link"]
     np.testing.assert_allclose(left[:3] * [1, -1, 1], right[:3], atol=1e-12)
 
 
-def test_moving_joints_agree_with_yourdfpy(vinebot: Description, parsed: yourdfpy.Robot) -> None:
+def test_moving_joints_agree_with_yourdfpy(vinebot: RobotDescription, parsed: yourdfpy.Robot) -> None:
     """Oracle: yourdfpy's forward kinematics at a random configuration."""
     oracle = yourdfpy.URDF(parsed, build_scene_graph=True, load_meshes=False)
     rng = np.random.default_rng(4)
     position = np.array([rng.uniform(drive.lower, drive.upper) for drive in vinebot.drives])
     oracle.update_cfg(dict(zip(vinebot.joints, position, strict=True)))
-    poses = vinebot.frame_poses(position)
+    poses = vinebot.link_poses(position)
     for link in ("gripper_left_left_finger_link", "head_front_camera_depth_optical_frame", "arm_right_5_link"):
         expected = oracle.get_transform(link, "base_footprint")
         np.testing.assert_allclose(poses[link][:3], expected[:3, 3], atol=1e-9)
         np.testing.assert_allclose(frames.matrix(poses[link][3:]), expected[:3, :3], atol=1e-9)
 
 
-def test_camera_looks_ahead(vinebot: Description) -> None:
-    pose = vinebot.frame_poses(vinebot.home)["head_front_camera_rgb_optical_frame"]
+def test_camera_looks_ahead(vinebot: RobotDescription) -> None:
+    pose = vinebot.link_poses(vinebot.home)["head_front_camera_rgb_optical_frame"]
     np.testing.assert_allclose(frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0])), [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(frames.rotate(pose[3:], np.array([0.0, 1.0, 0.0])), [0, 0, -1], atol=1e-9)
 
@@ -149,7 +149,7 @@ def test_camera_looks_ahead(vinebot: Description) -> None:
 # ---------------------------------------------------------------------- foreign robots
 
 
-def tiago_pro() -> Description:
+def tiago_pro() -> RobotDescription:
     try:
         return load("tiago_pro")
     except DescriptionError as error:
@@ -167,7 +167,7 @@ def test_tiago_pro_loads() -> None:
         if shape.geometry.mesh is not None:
             assert pathlib.Path(shape.geometry.mesh.filename).is_absolute()
     assert tiago.cameras[0].frame.endswith("optical_frame")
-    ahead = frames.rotate(tiago.frame_poses(tiago.home)[tiago.cameras[0].frame][3:], np.array([0.0, 0.0, 1.0]))
+    ahead = frames.rotate(tiago.link_poses(tiago.home)[tiago.cameras[0].frame][3:], np.array([0.0, 0.0, 1.0]))
     assert ahead[0] > 0.9
     assert abs(ahead[1]) < 1e-3
 

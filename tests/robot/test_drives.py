@@ -14,21 +14,21 @@ from vinesim import frames
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load
 from vinesim.robot.drives import CommandError, CommandInterface, RemoteRobot, Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
+def vinebot() -> RobotDescription:
     return load("vinebot")
 
 
 class Yard:
     """One robot on bare ground, and a clock."""
 
-    def __init__(self, description: Description, pose: np.ndarray | None = None) -> None:
+    def __init__(self, description: RobotDescription, pose: np.ndarray | None = None) -> None:
         self.rigid = Rigid(assemble([]))
         self.robot = Robot(self.rigid, description, "anna", pose=pose)
         self.time = 0.0
@@ -47,11 +47,11 @@ class Yard:
 
 
 @pytest.fixture
-def yard(vinebot: Description) -> Yard:
+def yard(vinebot: RobotDescription) -> Yard:
     return Yard(vinebot)
 
 
-def test_home_is_held_without_sag(yard: Yard, vinebot: Description) -> None:
+def test_home_is_held_without_sag(yard: Yard, vinebot: RobotDescription) -> None:
     position = yard.run(0.5)[-1, 0]
     np.testing.assert_allclose(position, vinebot.home, atol=1e-9)
 
@@ -153,7 +153,7 @@ def test_impedance_gives_way_as_its_stiffness_says(yard: Yard) -> None:
         yard.robot.command_impedance([-1.0], [1.0], ["arm_left_4_joint"])
 
 
-def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: Description) -> None:
+def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: RobotDescription) -> None:
     yard.robot.command_effort([0.0], ["arm_left_1_joint"])
     yard.run(0.02)
     Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
@@ -207,7 +207,7 @@ def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard)
     assert np.linalg.norm(yard.rigid.base("anna")[1][:2]) < limits.linear * 1.1
 
 
-def test_samples_agree_with_the_rigid_world(vinebot: Description) -> None:
+def test_samples_agree_with_the_rigid_world(vinebot: RobotDescription) -> None:
     """Oracle: MuJoCo's kinematics of every moving link; odometry: the way since the start."""
     start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
     yard = Yard(vinebot, start)
@@ -238,7 +238,7 @@ def test_samples_keep_their_own_contacts(yard: Yard) -> None:
     assert yard.robot.sample(0.0, (other, mine)).contacts == (mine,)
 
 
-def test_two_runs_are_the_same_to_the_bit(vinebot: Description) -> None:
+def test_two_runs_are_the_same_to_the_bit(vinebot: RobotDescription) -> None:
     ends = []
     for _ in range(2):
         yard = Yard(vinebot)
@@ -271,7 +271,7 @@ def test_wrong_commands_are_named(yard: Yard) -> None:
         yard.robot.command_base(np.inf, 0.0, 0.0)
 
 
-def test_remote_copy_follows_its_original(vinebot: Description) -> None:
+def test_remote_copy_follows_its_original(vinebot: RobotDescription) -> None:
     here = Yard(vinebot)
     far = Rigid(assemble([]))
     copy = RemoteRobot(far, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
@@ -295,7 +295,7 @@ def test_remote_copy_follows_its_original(vinebot: Description) -> None:
         copy.follow(RobotUpdate("anna", 0.0, np.zeros(7), np.zeros(6), np.zeros(3), np.zeros(3)))
 
 
-def test_robots_leave(yard: Yard, vinebot: Description) -> None:
+def test_robots_leave(yard: Yard, vinebot: RobotDescription) -> None:
     second = Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
     yard.run(0.05)
     second.remove()
@@ -330,7 +330,7 @@ def test_foreign_robot_moves(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("interface", ["position", "velocity", "effort"])
-def test_each_interface_tracks_a_swing(vinebot: Description, interface: str) -> None:
+def test_each_interface_tracks_a_swing(vinebot: RobotDescription, interface: str) -> None:
     """0.3 rad at 0.4 Hz in shoulder and elbow; by effort a controller outside closes the loop at 100 Hz."""
     yard, names = Yard(vinebot), ["arm_left_1_joint", "arm_left_4_joint"]
     joints = yard.robot.joint_indices(names)
@@ -383,9 +383,9 @@ def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
 # ---------------------------------------------------------------------- what sensors on it feel
 
 
-def hand_of(description: Description, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
+def hand_of(description: RobotDescription, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
     """Mass [kg] of what hangs on the left wrist sensor, and its centre [3] in the base, from the URDF; at home."""
-    poses, mass, moment = description.frame_poses(description.home if position is None else position), 0.0, np.zeros(3)
+    poses, mass, moment = description.link_poses(description.home if position is None else position), 0.0, np.zeros(3)
     for link in ElementTree.fromstring(description.urdf).iterfind("link"):
         name = link.get("name")
         if (name.startswith("gripper_left") or name == "wrist_left_ft_link") and link.find("inertial") is not None:
@@ -407,7 +407,7 @@ def wrench_of(yard: Yard) -> tuple[np.ndarray, np.ndarray]:
     return frames.rotate(turn, wrench.force), frames.rotate(turn, wrench.torque)
 
 
-def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: Description) -> None:
+def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: RobotDescription) -> None:
     yard.run(0.5)
     force, torque = wrench_of(yard)
     mass, centre = hand_of(vinebot)
@@ -427,7 +427,7 @@ def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: Descriptio
     assert np.linalg.norm(other.force) == pytest.approx(9.81 * mass, rel=0.01)
 
 
-def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: Description) -> None:
+def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: RobotDescription) -> None:
     """Inertia counts: as the lift drops and the hand with it, the wrist carries m (g + a)."""
     hand, _ = hand_of(vinebot)
     yard.run(0.2)
@@ -456,7 +456,7 @@ def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
         yard.robot.command_base(0.5, 0.6, yard.time)
         yard.run(yard.rigid.dt)
     imu = yard.robot.sample(yard.time).imus[0]
-    x, y = yard.robot.description.frame_poses(yard.robot.description.home)["base_imu_link"][:2]
+    x, y = yard.robot.description.link_poses(yard.robot.description.home)["base_imu_link"][:2]
     np.testing.assert_allclose(imu.angular_velocity, [0.0, 0.0, 0.6], atol=0.005)
     expected = [-(0.6**2) * x, 0.5 * 0.6 - 0.6**2 * y, 9.81]
     np.testing.assert_allclose(imu.linear_acceleration, expected, atol=0.02)
@@ -466,7 +466,7 @@ def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
 
 
 @pytest.mark.parametrize(("ahead", "turning"), [(0.0, 0.0), (0.08, 0.0), (0.05, 0.2)])
-def test_odometry_believes_in_what_the_tracks_travelled(vinebot: Description, ahead: float, turning: float) -> None:
+def test_odometry_believes_in_what_the_tracks_travelled(vinebot: RobotDescription, ahead: float, turning: float) -> None:
     """Straight on, then a turn on the spot: travel = way / (1 - slip)."""
     limits = msgspec.structs.replace(vinebot.base_limits, slip=(ahead, turning))
     start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
@@ -488,7 +488,7 @@ def test_odometry_believes_in_what_the_tracks_travelled(vinebot: Description, ah
 # ---------------------------------------------------------------------- grippers and cutters
 
 
-def bunch_in_hand(description: Description, effort: float) -> tuple[Yard, int]:
+def bunch_in_hand(description: RobotDescription, effort: float) -> tuple[Yard, int]:
     """A loose round bunch of 0.3 kg between the fingers of the left hand, held with ``effort`` [N] each."""
     yard = Yard(description)
     yard.robot.command_gripper("gripper_left", 0.08)
@@ -519,7 +519,7 @@ def slid(yard: Yard, body: int, force: np.ndarray) -> float:
     return float(np.linalg.norm(place() - before))
 
 
-def test_a_bunch_is_held_by_friction_and_no_more(vinebot: Description) -> None:
+def test_a_bunch_is_held_by_friction_and_no_more(vinebot: RobotDescription) -> None:
     """Two pads of 15 N and mu 0.8 hold 24 N: with the weight of 2.9 N, 16 N more hold and 25 N more do not."""
     yard, body = bunch_in_hand(vinebot, 15.0)
     fingers = vinebot.indices("gripper_left")
@@ -530,7 +530,7 @@ def test_a_bunch_is_held_by_friction_and_no_more(vinebot: Description) -> None:
     assert slid(yard, body, 25.0 * along) > 0.02
 
 
-def test_a_held_bunch_weighs_on_the_wrist_what_it_weighs(vinebot: Description) -> None:
+def test_a_held_bunch_weighs_on_the_wrist_what_it_weighs(vinebot: RobotDescription) -> None:
     yard, _ = bunch_in_hand(vinebot, 30.0)
     mass, _ = hand_of(vinebot)
     np.testing.assert_allclose(wrench_of(yard)[0], [0.0, 0.0, -9.81 * (mass + 0.3)], atol=0.05)
@@ -545,12 +545,12 @@ def test_gripper_commands_that_make_no_sense_are_named(yard: Yard) -> None:
         yard.robot.command_cutter("gripper_left")
 
 
-def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: Description) -> None:
+def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: RobotDescription) -> None:
     """Beside the peduncle it cuts nothing, over it the bunch; and the wrist feels the vine that touches the hand."""
     model, body, _ = bunch_scene()
     stalk = Physics(model).view().body_q[body - 1, :3].astype(float)
     cutter = next(c for c in vinebot.cutters if c.group == "gripper_left")
-    home = vinebot.frame_poses(vinebot.home)[cutter.frame]
+    home = vinebot.link_poses(vinebot.home)[cutter.frame]
     ahead = np.array([cutter.half[0] - 0.005, 0.0, 0.0])  # before the blades' cover, not in it
     mouth = frames.compose(home, frames.pose(np.array(cutter.origin) + ahead))[:3]
     physics = Physics(model)
@@ -578,7 +578,7 @@ def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
     description = load("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
-    tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
+    tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
     ahead = np.array([0.15, 0.0, 0.0])  # it comes from beyond the cane's tip
     place = middle + ahead - frames.rotate(frames.yaw(np.pi), tip)
     robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
@@ -605,7 +605,7 @@ def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
     description = load("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
-    tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
+    tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
     place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.yaw(np.pi), tip)
     robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
     joints = description.indices("arm_left")

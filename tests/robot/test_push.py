@@ -9,21 +9,21 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import Description, DescriptionError, load
+from vinesim.robot.description.description import RobotDescription, DescriptionError, load
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.push import Phase, ReachAndPush
+from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble
 
 HERE = frames.pose([0.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
+def vinebot() -> RobotDescription:
     return load("vinebot")
 
 
 @pytest.fixture(scope="module")
-def robot(vinebot: Description) -> Robot:
+def robot(vinebot: RobotDescription) -> Robot:
     return Robot(Rigid(assemble([])), vinebot, "anna")
 
 
@@ -33,7 +33,7 @@ class Run:
     def __init__(self, robot: Robot, side: str, target: np.ndarray, base: np.ndarray = HERE, **options) -> None:
         robot.rigid.place("anna", base, robot.description.home)
         robot.stop()
-        self.reach = reach = ReachAndPush(robot, side, lambda: target, repeat=False, **options)
+        self.reach = reach = PushBunch(robot, side, lambda: target, repeat=False, **options)
         self.phases, self.tips, self.speeds, self.setpoints, self.errors = [], [], [], [robot.setpoint.copy()], {}
         self.time = 0.0
         while reach.phase is not Phase.DONE and self.time < 40.0:
@@ -112,10 +112,10 @@ def test_the_hand_is_smooth(robot: Robot) -> None:
     assert np.abs(acceleration).max() < 60.0
 
 
-def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: Description) -> None:
+def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescription) -> None:
     robot = Robot(Rigid(assemble([])), vinebot, "anna")
     time = 0.0
-    reach = ReachAndPush(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold=0.2)
+    reach = PushBunch(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold=0.2)
     errors = []
     while reach.cycles < 2 and time < 30.0:
         before, error = reach.phase, reach.error
@@ -142,11 +142,11 @@ def test_what_is_out_of_reach_is_given_up_calmly(robot: Robot, caplog: pytest.Lo
     assert (position <= robot.upper_limit + 0.02).all()
 
 
-def test_two_arms_share_the_robot(vinebot: Description) -> None:
+def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
     robot = Robot(Rigid(assemble([])), vinebot, "anna")
     arms = [
-        ReachAndPush(robot, "left", lambda: np.array([0.7, 0.25, 1.45]), repeat=False),
-        ReachAndPush(robot, "right", lambda: np.array([0.6, -0.3, 1.4]), repeat=False, lift=False),
+        PushBunch(robot, "left", lambda: np.array([0.7, 0.25, 1.45]), repeat=False),
+        PushBunch(robot, "right", lambda: np.array([0.6, -0.3, 1.4]), repeat=False, lift=False),
     ]
     touched = {}
     time = 0.0
@@ -164,7 +164,7 @@ def test_two_arms_share_the_robot(vinebot: Description) -> None:
     assert max(touched.values()) < 0.01
 
 
-def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: Description) -> None:
+def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: RobotDescription) -> None:
     ends = []
     for _ in range(2):
         robot = Robot(Rigid(assemble([])), vinebot, "anna")
@@ -174,7 +174,7 @@ def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: Description) -> Non
 
 def test_an_arm_without_a_tool_is_refused(robot: Robot) -> None:
     with pytest.raises(CommandError, match="'arm_middle' with a tool"):
-        ReachAndPush(robot, "middle", lambda: np.zeros(3))
+        PushBunch(robot, "middle", lambda: np.zeros(3))
 
 
 def test_a_foreign_robot_reaches_by_its_names_alone() -> None:

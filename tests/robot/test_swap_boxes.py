@@ -11,28 +11,28 @@ from vinesim.client.tasks import start_poses, swap_planning
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import load
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.swap_boxes import LIFTED, Exchange, Swap
+from vinesim.robot.tasks.swap_boxes import LIFTED, SwapBoxes, SwapPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load as load_scene
 
 
 @functools.cache
-def yard() -> tuple[Model, Swap]:
+def yard() -> tuple[Model, SwapPlan]:
     plan = load_scene("harvest")
     model = generate(plan)
     return model, swap_planning.swap(model, start_poses.spawn_pose(plan, 1))
 
 
-def begun(count: int = 6) -> Exchange:
+def begun(count: int = 6) -> SwapBoxes:
     model, swap = yard()
     physics = Physics(model, picking=False)
     robot = Robot(physics.rigid, load("logistic"), "carrier", pose=swap.start)
     swap_planning.fill(physics, swap.full, count)
-    return Exchange(physics, robot, swap)
+    return SwapBoxes(physics, robot, swap)
 
 
-def tick(exchange: Exchange) -> None:
+def tick(exchange: SwapBoxes) -> None:
     exchange.control(exchange.physics.time)
     exchange.robot.control(exchange.physics.time)
     exchange.physics.step()
@@ -84,10 +84,10 @@ def test_a_robot_without_clamps_is_refused():
     physics = Physics(model)
     robot = Robot(physics.rigid, load("vinebot"), "anna", pose=swap.start)
     with pytest.raises(CommandError, match="no group 'lift_front'"):
-        Exchange(physics, robot, swap)
+        SwapBoxes(physics, robot, swap)
 
 
 def test_a_box_that_the_scene_has_not_is_refused():
     model, swap = yard()
-    with pytest.raises(start_poses.NoPlace, match="no box 7: this scene has 2"):
+    with pytest.raises(start_poses.PlacementError, match="no box 7: this scene has 2"):
         swap_planning.swap(model, swap.start, full=7)

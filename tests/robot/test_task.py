@@ -10,11 +10,11 @@ import pytest
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.description.description import load
 from vinesim.robot.drives import Robot
-from vinesim.robot.tasks.task import Failed, Script
+from vinesim.robot.tasks.task import TaskFailed, Task
 from vinesim.scene.builder import assemble
 
 
-class Story(Script):
+class Story(Task):
     fails = False
 
     def focus(self) -> np.ndarray:
@@ -24,7 +24,7 @@ class Story(Script):
         yield from self.wait(0.5, "one")
         yield from self.wait(0.25, "two")
         if self.fails:
-            raise Failed("the end is missing")
+            raise TaskFailed("the end is missing")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from vinesim.client.client import Client
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.description import load
-from vinesim.robot.tasks.pick import Pick
+from vinesim.robot.tasks.pick import PickBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.spec import load as load_scene
@@ -46,7 +46,7 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
 
     run(100)
     empty = float(model.box_mass[task.box]) * GRAVITY
-    pick = Pick(worker.physics, worker.robot, task)
+    pick = PickBunch(worker.physics, worker.robot, task)
     worker.jobs.append(pick.control)
     bunch, worst = thing(Kind.BUNCH, task.bunch), []
     while not pick.done:

@@ -30,7 +30,7 @@ def run(
     from vinesim.client.rate_loop import Pace
     from vinesim.client.recording.trace import Trace
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import bunch_centres, checked_bunch, placed, start_pose
+    from vinesim.client.tasks.start_poses import bunch_centres, validate_bunch, placed, start_pose
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load, reseeded
@@ -42,7 +42,7 @@ def run(
     if place is not None:
         plan, spawn = placed(plan, *place), 0
     model = generate(plan)
-    checked_bunch(model, reach)
+    validate_bunch(model, reach)
     name = name or f"human-{os.getpid()}"
     start = start_pose(plan, spawn)
     walker = Walker(start, height)

@@ -65,16 +65,16 @@ def run(
     from vinesim.client.recording.trace import Trace
     from vinesim.client.sensing.sensor_process import Senses
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import checked_bunch, placed, start_pose
-    from vinesim.client.tasks.tasks import DriveTo, LookAt, checked_job, plan_job
+    from vinesim.client.tasks.start_poses import validate_bunch, placed, start_pose
+    from vinesim.client.tasks.tasks import DriveTo, LookAt, validate_task_name, plan_task
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.robot.description.description import load as load_robot
-    from vinesim.robot.tasks.push import ReachAndPush
+    from vinesim.robot.tasks.push import PushBunch
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load as load_scene
     from vinesim.scene.spec import reseeded
 
-    checked_job(job)
+    validate_task_name(job)
     plan = reseeded(load_scene(scene), seed)
     descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:
@@ -83,12 +83,12 @@ def run(
     model = generate(plan)
     start = start_pose(plan, spawn, back)
     if job is not None:
-        begin, start = plan_job(job, model, start_pose(plan, spawn))
+        begin, start = plan_task(job, model, start_pose(plan, spawn))
         back = 0.0
     name = name or f"robot-{os.getpid()}"
     names = [name] if len(descriptions) == 1 else [f"{name}_{i + 1}" for i in range(len(descriptions))]
     for bunch in (push, watch):
-        checked_bunch(model, bunch)
+        validate_bunch(model, bunch)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
 
@@ -134,7 +134,7 @@ def run(
                 DriveTo(mine, start_pose(plan, spawn, queue=i)) for i, mine in enumerate(client.robots.values())
             ]
         if push is not None and client.trace is not None:
-            reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
+            reach = PushBunch(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
             client.jobs.append(reach.control)
         script = None
         if job is not None:

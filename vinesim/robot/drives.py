@@ -26,7 +26,7 @@ from vinesim import frames
 from vinesim.physics.plants.detachment import Blade
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, Mount
+from vinesim.robot.description.description import RobotDescription, SensorMount
 from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
 
 ACCELERATION_EFFORT_SHARE = 0.7
@@ -52,7 +52,7 @@ class RobotInstance:
     def __init__(
         self,
         rigid: Rigid,
-        description: Description,
+        description: RobotDescription,
         name: str = "",
         index: int = 0,
         pose: np.ndarray | None = None,
@@ -134,7 +134,7 @@ class Robot(RobotInstance):
     def __init__(
         self,
         rigid: Rigid,
-        description: Description,
+        description: RobotDescription,
         name: str = "",
         index: int = 0,
         pose: np.ndarray | None = None,
@@ -437,7 +437,7 @@ class Robot(RobotInstance):
             imus=tuple(self._imu(mount, time) for mount in self.description.imus),
         )
 
-    def _wrench(self, mount: Mount, time: float, contacts: Sequence[Contact]) -> Wrench:
+    def _wrench(self, mount: SensorMount, time: float, contacts: Sequence[Contact]) -> Wrench:
         wrench = self.rigid.wrench(self.name, mount.frame)
         mine = [contact for contact in contacts if contact.link in self._links_beyond_sensor[mount.frame]]
         if mine:  # with plants, which the rigid world does not know
@@ -449,7 +449,7 @@ class Robot(RobotInstance):
             wrench[3:] += frames.rotate(back, frames.cross(arm, force).sum(0))
         return Wrench(time, mount.name, mount.frame, wrench[:3], wrench[3:])
 
-    def _imu(self, mount: Mount, time: float) -> Imu:
+    def _imu(self, mount: SensorMount, time: float) -> Imu:
         turn = self.frame_pose(mount.frame)[3:]
         spin = self.rigid.angular_velocity(self.name, mount.frame)
         acceleration = self.rigid.acceleration(self.name, mount.frame)[3:]
@@ -462,7 +462,7 @@ class Robot(RobotInstance):
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)
 
 
-def _subtree_links(description: Description, frame: str) -> frozenset[str]:
+def _subtree_links(description: RobotDescription, frame: str) -> frozenset[str]:
     """A link and all that hangs on it."""
     beyond = {frame}
     joints = (*description.fixed, *description.moving.frames)

@@ -12,13 +12,13 @@ from vinesim.client.humans import RemotePerson, spec_of
 from vinesim.net.codec.messages import Hello, valid_name
 from vinesim.physics.rigid.rigid_world import Draft, Rigid
 from vinesim.robot.description import description as descriptions
-from vinesim.robot.description.description import Description, DescriptionError
+from vinesim.robot.description.description import RobotDescription, DescriptionError
 from vinesim.robot.drives import RemoteRobot
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
 
-Prepared = tuple[Description | None, Draft]
+Prepared = tuple[RobotDescription | None, Draft]
 """A robot's description, or None for a person, and the world with it."""
 
 
@@ -26,7 +26,7 @@ class Arrivals:
     """Who is expected, and how far that is."""
 
     def __init__(
-        self, rigid: Rigid, own: Description | None, executor: concurrent.futures.Executor | None = None
+        self, rigid: Rigid, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
     ) -> None:
         """``own``: a description that needs not be read again, if any; without ``executor`` all is done at once."""
         self.rigid, self.own = rigid, own
@@ -90,7 +90,7 @@ class Arrivals:
         return description, self.rigid.prepare(description.spec(hello.name, hello.index, update.base_q))
 
 
-def described(hello: Hello, own: Description | None) -> Description:
+def described(hello: Hello, own: RobotDescription | None) -> RobotDescription:
     """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
     if own is not None and hello.urdf == own.urdf:
         return own

@@ -20,8 +20,8 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.sensing.latest_value import Mailbox, poller
 from vinesim.client.sensing.sensor_worker import Letter, Setup, perceive
-from vinesim.client.tasks.tasks import Obey
-from vinesim.robot.description.description import Description
+from vinesim.client.tasks.tasks import RosCommandHandler
+from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives import Robot
 from vinesim.ros import ros_setup
 from vinesim.ros.commands.types import Command
@@ -54,7 +54,7 @@ class Senses:
         name: str,
         scene: Scene,
         model: Model,
-        description: Description,
+        description: RobotDescription,
         *,
         namespace: str = "",
         ros: bool = True,
@@ -103,7 +103,7 @@ class Senses:
         self._attached = True
         client.senses.append(self._every_tick)
         if self._ros:
-            client.jobs.insert(0, Obey(self.robot, self._take_commands))
+            client.jobs.insert(0, RosCommandHandler(self.robot, self._take_commands))
 
     # ------------------------------------------------------------------ the tick
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.sensing.latest_value import Mailbox, poller
-from vinesim.robot.description.description import Description
+from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -42,7 +42,7 @@ class Setup:
 
     name: str
     model: Model
-    description: Description
+    description: RobotDescription
     sun: SunPath
     namespace: str
     ros: bool

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.tasks.start_poses import NoPlace, bunch_centres, free_room
-from vinesim.robot.tasks.pick import Task
+from vinesim.client.tasks.start_poses import PlacementError, bunch_centres, ground_clearance
+from vinesim.robot.tasks.pick import PickPlan
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
@@ -47,11 +47,11 @@ GRID = 0.1
 """[m] between the points of which a way is made."""
 
 
-def tasks(model: Model, near: np.ndarray) -> Iterator[Task]:
+def tasks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
     """Tasks that look feasible, the best first: bunches that hang freest, a little better if ``near`` [2] m."""
     beside_boxes = list(parks(model))
     if not beside_boxes:
-        raise NoPlace(f"no box of this scene has {ROOM} m of room beside it for a robot; place one in an alley")
+        raise PlacementError(f"no box of this scene has {ROOM} m of room beside it for a robot; place one in an alley")
     found = False
     for bunch, side, stand in _stands(model, near):
         beside = [park for park in beside_boxes if park.side == side]
@@ -59,10 +59,10 @@ def tasks(model: Model, near: np.ndarray) -> Iterator[Task]:
             points = way(model, stand[:2], park.start)
             if points is not None:
                 found = True
-                yield Task(bunch, side, stand, park.box, np.concatenate([points[1:], [park.place]]), park.heading)
+                yield PickPlan(bunch, side, stand, park.box, np.concatenate([points[1:], [park.place]]), park.heading)
                 break
     if not found:
-        raise NoPlace("no bunch hangs free enough for a hand with a way for a robot to a box; choose another seed")
+        raise PlacementError("no bunch hangs free enough for a hand with a way for a robot to a box; choose another seed")
 
 
 def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarray]]:
@@ -83,7 +83,7 @@ def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarr
     turn = frames.yaw(heading)
     sides = np.stack([frames.rotate(turn, np.array([AHEAD, y, 0.0]))[:, :2] for y in (ASIDE, -ASIDE)], 1)
     base = hold[bunches, None, None, :2] - sides  # [bunch, heading, side, 2]
-    roomy = (free_room(model, base.reshape(-1, 2)) > ROOM).reshape(base.shape[:3])
+    roomy = (ground_clearance(model, base.reshape(-1, 2)) > ROOM).reshape(base.shape[:3])
     found = []
     for i, bunch in enumerate(bunches.tolist()):
         here = (np.linalg.norm(points - hold[bunch], axis=1) < NEIGHBOURS) & (owner != bunch)
@@ -150,8 +150,8 @@ def parks(model: Model) -> Iterator[Park]:
                 for run in RUNS:
                     start = place - run * ahead
                     line = start + np.linspace(0.0, run + 0.1, 16)[:, None] * ahead
-                    room = float(free_room(model, line, without=box).min())
-                    if room > LANE and float(free_room(model, start[None])[0]) > ROOM:
+                    room = float(ground_clearance(model, line, without=box).min())
+                    if room > LANE and float(ground_clearance(model, start[None])[0]) > ROOM:
                         yield Park(box, side, place, start, float(np.arctan2(ahead[1], ahead[0])))
                         break
 
@@ -164,9 +164,9 @@ def way(model: Model, start: np.ndarray, goal: np.ndarray, room: float = ROOM) -
     low = np.minimum(start, goal) - 3.0
     shape = tuple((np.ceil((np.maximum(start, goal) + 3.0 - low) / GRID)).astype(int))
     at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
-    free = (free_room(model, low + GRID * at) > room).reshape(shape)
+    free = (ground_clearance(model, low + GRID * at) > room).reshape(shape)
     first, last = (tuple(np.round((p - low) / GRID).astype(int)) for p in (start, goal))
-    if not free[last] or float(free_room(model, np.array([start]))[0]) < room:
+    if not free[last] or float(ground_clearance(model, np.array([start]))[0]) < room:
         return None
     steps = [(i, j, float(np.hypot(i, j))) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     came: dict[tuple[int, int], tuple[int, int]] = {first: first}
@@ -202,4 +202,4 @@ def _open(model: Model, start: np.ndarray, end: np.ndarray, room: float) -> bool
     """Whether the straight line has room on either side."""
     count = max(int(np.linalg.norm(end - start) / (0.5 * GRID)), 2)
     line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-    return bool((free_room(model, line) > room - 0.5 * GRID).all())
+    return bool((ground_clearance(model, line) > room - 0.5 * GRID).all())

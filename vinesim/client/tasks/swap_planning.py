@@ -6,9 +6,9 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.tasks.pick_planning import way
-from vinesim.client.tasks.start_poses import NoPlace, free_room
+from vinesim.client.tasks.start_poses import PlacementError, ground_clearance
 from vinesim.physics.step import Physics
-from vinesim.robot.tasks.swap_boxes import Swap
+from vinesim.robot.tasks.swap_boxes import SwapPlan
 from vinesim.scene.model import Model
 
 ROOM = 0.92
@@ -21,20 +21,20 @@ LAYER = 6
 """Bunches that lie side by side in a box."""
 
 
-def swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> Swap:
-    """Exchange two boxes, from a base at ``start`` [7]; :class:`NoPlace` if there is no room for it."""
+def swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> SwapPlan:
+    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room for it."""
     if max(full, empty) >= len(model.box_pose):
-        raise NoPlace(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
+        raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
     here, legs = start[:2], []
     for box in (empty, full):
         ways = [way(model, here, place, ROOM) for place in _before(model, box)]
         ways = [points for points in ways if points is not None]
         if not ways:
-            raise NoPlace(f"no way for a carrier to turn before box {box}: it needs {ROOM} m around it; move the box")
+            raise PlacementError(f"no way for a carrier to turn before box {box}: it needs {ROOM} m around it; move the box")
         shortest = min(ways, key=lambda points: float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
         legs.append(shortest[1:])
         here = shortest[-1]
-    return Swap(start, full, empty, *legs)
+    return SwapPlan(start, full, empty, *legs)
 
 
 def _before(model: Model, box: int) -> list[np.ndarray]:
@@ -46,7 +46,7 @@ def _before(model: Model, box: int) -> list[np.ndarray]:
         for far in BEFORE:
             place = pose[:2] + far * side * normal
             lane = pose[:2] + np.linspace(0.1, far, 12)[:, None] * side * normal
-            if free_room(model, place[None])[0] > ROOM and free_room(model, lane, without=box).min() > LANE:
+            if ground_clearance(model, place[None])[0] > ROOM and ground_clearance(model, lane, without=box).min() > LANE:
                 places.append(place)
                 break
     return places

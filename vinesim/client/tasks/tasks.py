@@ -13,9 +13,9 @@ from vinesim.client.tasks import pick_planning, swap_planning
 from vinesim.physics.step import Physics
 from vinesim.robot.control.trajectory_controller import JointTrajectory, TrajectoryController
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.pick import Pick
-from vinesim.robot.tasks.swap_boxes import Exchange, Swap
-from vinesim.robot.tasks.task import Script
+from vinesim.robot.tasks.pick import PickBunch
+from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
+from vinesim.robot.tasks.task import Task
 from vinesim.ros.commands.types import BaseVelocity, Command, JointPositions
 from vinesim.scene.model import Model
 
@@ -23,36 +23,36 @@ log = logging.getLogger(__name__)
 
 
 JOBS = ("pick", "exchange")
-"""What :func:`plan_job` knows."""
+"""What :func:`plan_task` knows."""
 
 
-class UnknownJob(ValueError):
+class UnknownTask(ValueError):
     """A job that no robot here knows; the text says which it knows."""
 
 
-def checked_job(job: str | None) -> str | None:
+def validate_task_name(job: str | None) -> str | None:
     """The job, if there is one of that name."""
     if job is not None and job not in JOBS:
-        raise UnknownJob(f"no job {job!r}; give {' or '.join(JOBS)}")
+        raise UnknownTask(f"no job {job!r}; give {' or '.join(JOBS)}")
     return job
 
 
-def plan_job(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Script], np.ndarray]:
+def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
     """How to begin a job once physics and robot are there, and the pose [7] where the robot starts.
 
     ``near`` [7]: where it would be otherwise. Planning takes a second or two: not for the tick.
     """
-    if checked_job(job) == "pick":
+    if validate_task_name(job) == "pick":
         task = next(pick_planning.tasks(model, near[:2]))
-        return functools.partial(Pick, task=task), task.stand
+        return functools.partial(PickBunch, task=task), task.stand
     boxes = swap_planning.swap(model, near)
     return functools.partial(_exchange, swap=boxes), near
 
 
-def _exchange(physics: Physics, robot: Robot, swap: Swap) -> Exchange:
+def _exchange(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
     """Fill the box that is to be full, and exchange it."""
     swap_planning.fill(physics, swap.full)
-    return Exchange(physics, robot, swap)
+    return SwapBoxes(physics, robot, swap)
 
 
 class DriveTo:
@@ -111,7 +111,7 @@ class LookAt:
         robot.command_position(robot.setpoint[self._joints] + self.EVERY * robot.rigid.dt * rate, self._joints)
 
 
-class Obey:
+class RosCommandHandler:
     """Do what ROS asks: drive the base, hold joint positions, follow trajectories (straight between their points)."""
 
     def __init__(self, robot: Robot, commands: Callable[[], Iterable[Command]]) -> None:

@@ -5,7 +5,7 @@
 
 The URDF is read by yourdfpy. The text that physics and ROS receive differs from the file in three ways: meshes are
 named by absolute path, wheels and casters are fixed (the base is driven as a whole), and shapes whose mesh format
-physics cannot read are replaced; :attr:`Description.notes` lists each change.
+physics cannot read are replaced; :attr:`RobotDescription.notes` lists each change.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Share of the tracks' travel that is lost on the ground, ahead and in turns; odometry counts the travel."""
 
 
-class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Joints that one controller moves."""
 
     joints: tuple[str, ...]
@@ -80,7 +80,7 @@ class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Frame whose x axis points out of the hand, if the group is an arm."""
 
 
-class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A sensor: its name in topics, the frame it sits in, and the file in ``data/cameras`` or ``data/lidars``."""
 
     name: str
@@ -105,11 +105,11 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The TOML beside a URDF."""
 
     base: BaseLimits = BaseLimits()
-    groups: dict[str, Group] = {}
-    cameras: tuple[Mount, ...] | None = None
-    lidars: tuple[Mount, ...] | None = None
-    imus: tuple[Mount, ...] = ()
-    wrenches: tuple[Mount, ...] = ()
+    groups: dict[str, JointGroup] = {}
+    cameras: tuple[SensorMount, ...] | None = None
+    lidars: tuple[SensorMount, ...] | None = None
+    imus: tuple[SensorMount, ...] = ()
+    wrenches: tuple[SensorMount, ...] = ()
     cutters: tuple[Cutter, ...] = ()
 
 
@@ -144,7 +144,7 @@ class MovingJoints:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Description:
+class RobotDescription:
     """A robot as every room needs it; constant."""
 
     name: str
@@ -158,7 +158,7 @@ class Description:
     """In the URDF's order; mimicking joints have none."""
     home: np.ndarray
     """[joint] rad or m"""
-    groups: dict[str, Group]
+    groups: dict[str, JointGroup]
     moving: MovingJoints
     fixed: tuple[tuple[str, str], ...]
     """(parent frame, child frame) of every fixed joint: ``/tf_static``."""
@@ -166,10 +166,10 @@ class Description:
     """[fixed, 7] child in parent."""
     anchors: dict[str, tuple[str, np.ndarray]]
     """Of every link: the moving link (or the root) it is fixed to, and its pose [7] there."""
-    cameras: tuple[Mount, ...]
-    lidars: tuple[Mount, ...]
-    imus: tuple[Mount, ...]
-    wrenches: tuple[Mount, ...]
+    cameras: tuple[SensorMount, ...]
+    lidars: tuple[SensorMount, ...]
+    imus: tuple[SensorMount, ...]
+    wrenches: tuple[SensorMount, ...]
     cutters: tuple[Cutter, ...]
     base_limits: BaseLimits
     mass: float
@@ -187,7 +187,7 @@ class Description:
         order = {name: i for i, name in enumerate(self.joints)}
         return np.array([order[name] for name in self.groups[group].joints], int)
 
-    def frame_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
+    def link_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
         """Pose [7] of every link in the root for drive positions; walks the tree, so not for the tick."""
         parents = dict(zip([child for _, child in self.moving.frames], range(len(self.moving.frames)), strict=True))
         local = self.moving.poses(np.asarray(position, float))
@@ -215,7 +215,7 @@ class Description:
         )
 
 
-def load(name: str | pathlib.Path) -> Description:
+def load(name: str | pathlib.Path) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
     Raises :class:`DescriptionError` in one line if it cannot be simulated as it is.
@@ -552,14 +552,14 @@ def _assemble(
     urdf: str,
     sidecar: Sidecar,
     notes: list[str],
-) -> Description:
+) -> RobotDescription:
     base = order[0].parent
     driven = [joint for joint in robot.joints if joint.type in MOVING and joint.mimic is None]
     moving = _moving(robot, [joint.name for joint in driven])
     anchors = _anchors(base, order)
     fixed = [joint for joint in robot.joints if joint.type == "fixed"]
     home = np.array([_resting(joint) for joint in driven])
-    description = Description(
+    description = RobotDescription(
         name=robot.name,
         file=file,
         urdf=urdf,
@@ -630,7 +630,7 @@ def _resting(joint: yourdfpy.Joint) -> float:
     return middle if abs(middle) > 0.1 * (upper - lower) else 0.0
 
 
-def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, Group]:
+def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGroup]:
     """Groups from names in PAL style: ``arm_left_3_joint`` is of ``arm_left``, ``gripper_left_...`` of its gripper."""
 
     def tool(group: str) -> str:
@@ -642,10 +642,10 @@ def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, Group]:
         hand = re.match(r"(gripper|hand)_(left|right)", joint)
         stem = hand.group() if hand else re.sub(r"(_lift)?(_?\d+)?(_joint)?$", "", joint)
         groups.setdefault(stem or joint, []).append(joint)
-    return {name: Group(joints=tuple(members), tool=tool(name)) for name, members in groups.items()}
+    return {name: JointGroup(joints=tuple(members), tool=tool(name)) for name, members in groups.items()}
 
 
-def _guess_cameras(root: etree._Element, notes: list[str]) -> tuple[Mount, ...]:
+def _guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
     """A D435 in the first optical frame (colour before others), else in front of the first link called a camera."""
     links = [link.get("name", "") for link in root.iterfind("link")]
     optical = [link for link in links if link.endswith("optical_frame")]
@@ -665,20 +665,20 @@ def _guess_cameras(root: etree._Element, notes: list[str]) -> tuple[Mount, ...]:
         etree.SubElement(joint, "parent", link=link)
         etree.SubElement(joint, "child", link=found)
         etree.SubElement(joint, "origin", xyz="0 0 0", rpy=f"{-math.pi / 2} 0 {-math.pi / 2}")
-    return (Mount(name, found, "d435"),)
+    return (SensorMount(name, found, "d435"),)
 
 
-def _guess_lidars(root: etree._Element, notes: list[str]) -> tuple[Mount, ...]:
+def _guess_lidars(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
     """A VLP-16 in the first link called a lidar or laser, one in front before others."""
     links = [link.get("name", "") for link in root.iterfind("link")]
     found = sorted((link for link in links if re.search(r"lidar|laser|velodyne", link)), key=lambda n: "front" not in n)
     if not found:
         return ()
     notes.append(f"a vlp16 is taken to sit in {found[0]!r}")
-    return (Mount("lidar", found[0], "vlp16"),)
+    return (SensorMount("lidar", found[0], "vlp16"),)
 
 
-def _check_sidecar(description: Description, driven: set[str], file: pathlib.Path) -> None:
+def _check_sidecar(description: RobotDescription, driven: set[str], file: pathlib.Path) -> None:
     for name, group in description.groups.items():
         for joint in group.joints:
             if joint not in driven:
@@ -711,12 +711,12 @@ def _check_sidecar(description: Description, driven: set[str], file: pathlib.Pat
             raise _error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
 
 
-def _carried_inertia(robot: yourdfpy.Robot, description: Description) -> dict[str, float]:
+def _carried_inertia(robot: yourdfpy.Robot, description: RobotDescription) -> dict[str, float]:
     """What each moving joint carries with the robot at home: mass [kg], or inertia about its origin [kg m2].
 
     The inertia is the one about the worst axis through the joint, since arms bend: gains must suit any posture.
     """
-    poses = description.frame_poses(description.home)
+    poses = description.link_poses(description.home)
     above = {child: description.anchors[parent][0] for parent, child in description.moving.frames}
     heavy = [link for link in robot.links if link.inertial is not None and link.inertial.mass]
     mass = np.array([link.inertial.mass for link in heavy])

@@ -1,6 +1,6 @@
 """The picking job: reach for a bunch, hold it, cut its stalk, carry it to a box and lay it in.
 
-    pick = Pick(physics, robot, task)
+    pick = PickBunch(physics, robot, task)
     while not pick.done:
         pick.control(time)
         robot.control(time)
@@ -25,7 +25,7 @@ from vinesim.physics.step import Physics
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.task import Failed, Script
+from vinesim.robot.tasks.task import TaskFailed, Task
 
 STUMP = 0.012
 """So much of the stalk stays on the bunch [m]."""
@@ -58,7 +58,7 @@ LOST = 0.12
 
 
 @dataclasses.dataclass(frozen=True)
-class Task:
+class PickPlan:
     """What to pick, with which arm, and where to take it."""
 
     bunch: int
@@ -73,12 +73,12 @@ class Task:
     """[rad] of the base at the end of the way."""
 
 
-class Pick(Script):
+class PickBunch(Task):
     """One bunch from its vine into a box; ``done``, ``picked`` and ``reason`` say how it went."""
 
     shown = frozenset({"cut", "back"})
 
-    def __init__(self, physics: Physics, robot: Robot, task: Task, *, seconds: float = 90.0) -> None:
+    def __init__(self, physics: Physics, robot: Robot, task: PickPlan, *, seconds: float = 90.0) -> None:
         """``robot`` has been fitted with its cutters (:meth:`Robot.fit_cutters`)."""
         super().__init__(robot, seconds=seconds)
         self.physics, self.task = physics, task
@@ -102,12 +102,12 @@ class Pick(Script):
         return self.succeeded
 
     def report(self) -> dict[str, Any]:
-        """See :class:`Script`."""
+        """See :class:`Task`."""
         where = {"bunch": self.task.bunch, "side": self.task.side, "box": self.task.box}
         return {"picked": self.picked, **where, "bunch_kg": round(self.mass, 4), **super().report()}
 
     def focus(self) -> np.ndarray:
-        """See :class:`Script`."""
+        """See :class:`Task`."""
         return self._grip()
 
     @property
@@ -139,7 +139,7 @@ class Pick(Script):
     # ------------------------------------------------------------------ the job
 
     def steps(self) -> Iterator[str]:
-        """See :class:`Script`."""
+        """See :class:`Task`."""
         ahead = frames.rotate(self._base()[3:], np.array([1.0, 0.0, 0.0]))
         self.hand.reset()
         self._open(2.0 * (self._radius + SLACK))
@@ -154,7 +154,7 @@ class Pick(Script):
         yield from self._lay()
         yield from self.wait(1.0, "rest")
         if not self.in_box:
-            raise Failed(self._where())
+            raise TaskFailed(self._where())
 
     def _close(self, ahead: np.ndarray) -> Iterator[str]:
         """Close the fingers with a force that is no more than :data:`GRIP`."""
@@ -166,7 +166,7 @@ class Pick(Script):
             here, felt = position[self._fingers], np.abs(contact[self._fingers])
             firm = firm + 1 if (felt > HELD).all() else 0
             if self.time > end:
-                raise Failed(
+                raise TaskFailed(
                     f"the fingers feel {felt.min():.0f} N, at {here.sum():.3f} m between them: nothing to hold"
                 )
             self.robot.command_position(here - GRIP / stiffness, self._fingers)
@@ -180,7 +180,7 @@ class Pick(Script):
             if not self.physics.state.bunch_attached[self.task.bunch]:
                 return
             yield from self.wait(0.2, "cut")
-        raise Failed(f"the blade closed beside the stalk: {self._mouth()}")
+        raise TaskFailed(f"the blade closed beside the stalk: {self._mouth()}")
 
     def _drive(self) -> Iterator[str]:
         """Take the bunch to where the box is in reach."""
@@ -189,7 +189,7 @@ class Pick(Script):
             self.hand.hold_position()
             way.control(self.time)
             if way.is_stuck:
-                raise Failed("something keeps the base from going on")
+                raise TaskFailed("something keeps the base from going on")
             self._holding()
             yield "drive"
 
@@ -216,7 +216,7 @@ class Pick(Script):
         self, phase: str, goal: Callable[[], np.ndarray], ahead: np.ndarray, *, speed: float = 0.35, patience: float,
         near: float = NEAR,
     ) -> Iterator[str]:  # fmt: skip
-        """Lead the hand to ``goal`` [3] in the world, pointing ``ahead`` [3]; :class:`Failed` if it does not come."""
+        """Lead the hand to ``goal`` [3] in the world, pointing ``ahead`` [3]; :class:`TaskFailed` if it does not come."""
         end = self.time + patience
         self.hand.reset()
         while True:
@@ -226,7 +226,7 @@ class Pick(Script):
             if self.hand.distance_to(there) < near and off < FACING:
                 return
             if self.time > end:
-                raise Failed(
+                raise TaskFailed(
                     f"the hand is {self.hand.distance_to(there):.2f} m and {off:.2f} rad off: out of reach, or held"
                 )
             if phase not in ("rise",):
@@ -235,11 +235,11 @@ class Pick(Script):
             yield phase
 
     def _holding(self) -> None:
-        """:class:`Failed` if the bunch has left its vine and not come along."""
+        """:class:`TaskFailed` if the bunch has left its vine and not come along."""
         if not self.physics.state.bunch_attached[self.task.bunch]:
             off = float(np.linalg.norm(self._grip() - self.hand.tip_position))
             if off > LOST:
-                raise Failed(f"the bunch slipped out of the fingers, it is {off:.2f} m from them")
+                raise TaskFailed(f"the bunch slipped out of the fingers, it is {off:.2f} m from them")
 
     def _grip(self) -> np.ndarray:
         """Where the bunch is to be held [3] m."""

@@ -1,6 +1,6 @@
 """Reach for a bunch and push it: a scripted motion for demonstrations, benchmarks and tests.
 
-    reach = ReachAndPush(robot, "left", lambda: bunch_position)
+    reach = PushBunch(robot, "left", lambda: bunch_position)
     while running:
         reach.control(time)
         robot.control(time)
@@ -45,7 +45,7 @@ class Phase(enum.Enum):
     DONE = "done"
 
 
-class ReachAndPush:
+class PushBunch:
     """One arm touches a target, pushes it, lets go, and begins again.
 
     ``target`` gives the bunch's centre in the world [3] m; it is asked once for every approach. The fingers come from

@@ -1,6 +1,6 @@
 """The logistic job: a carrier with a clamp at either end takes a full box away and leaves an empty one in its place.
 
-    exchange = Exchange(physics, robot, swap)
+    exchange = SwapBoxes(physics, robot, swap)
     while not exchange.done:
         exchange.control(time)
         robot.control(time)
@@ -24,7 +24,7 @@ from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.task import Failed, Script
+from vinesim.robot.tasks.task import TaskFailed, Task
 
 LIFTED = 0.15
 """A box is carried so high above the ground [m]."""
@@ -39,7 +39,7 @@ PLACED = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
-class Swap:
+class SwapPlan:
     """Which boxes to exchange, and the ways between them."""
 
     start: np.ndarray
@@ -52,10 +52,10 @@ class Swap:
     """[n, 2] m, from there to such a place before the full box."""
 
 
-class Exchange(Script):
+class SwapBoxes(Task):
     """An empty box for a full one; ``done``, ``succeeded`` and ``reason`` say how it went."""
 
-    def __init__(self, physics: Physics, robot: Robot, swap: Swap, *, seconds: float = 180.0) -> None:
+    def __init__(self, physics: Physics, robot: Robot, swap: SwapPlan, *, seconds: float = 180.0) -> None:
         super().__init__(robot, seconds=seconds)
         self.physics, self.swap = physics, swap
         for group in ("lift_front", "clamp_front", "lift_rear", "clamp_rear"):
@@ -66,12 +66,12 @@ class Exchange(Script):
         self._contents = self._inside(swap.full)
 
     def report(self) -> dict[str, Any]:
-        """See :class:`Script`."""
+        """See :class:`Task`."""
         boxes = {"full": self.swap.full, "empty": self.swap.empty, "bunches": len(self._contents)}
         return {"exchanged": self.succeeded, **boxes, **super().report()}
 
     def focus(self) -> np.ndarray:
-        """See :class:`Script`."""
+        """See :class:`Task`."""
         return self.box_pose(self.swap.full)[:3]
 
     def box_pose(self, box: int) -> np.ndarray:
@@ -82,7 +82,7 @@ class Exchange(Script):
     # ------------------------------------------------------------------ the job
 
     def steps(self) -> Iterator[str]:
-        """See :class:`Script`."""
+        """See :class:`Task`."""
         swap = self.swap
         yield from self._go("to the empty box", swap.to_empty, self._away_from(swap.empty, swap.to_empty[-1]))
         yield from self._take("rear", swap.empty)
@@ -104,12 +104,12 @@ class Exchange(Script):
         yield from self.wait(1.5, phase)
         felt = np.abs(self.robot.rigid.read(self.robot.name)[3][fingers])
         if (felt < HELD).any():
-            raise Failed(f"the {end} paddles feel {felt.min():.0f} N: nothing between them")
+            raise TaskFailed(f"the {end} paddles feel {felt.min():.0f} N: nothing between them")
         low = float(self.box_pose(box)[2])
         yield from self._lift(phase, end, LIFTED)
         risen = float(self.box_pose(box)[2]) - low
         if risen < 0.8 * LIFTED:
-            raise Failed(f"the box has slipped: lifted by {LIFTED} m it has risen by {risen:.2f} m")
+            raise TaskFailed(f"the box has slipped: lifted by {LIFTED} m it has risen by {risen:.2f} m")
         yield from self._straight(phase, here, backwards=end == "front")
 
     def _leave(self, end: str, box: int) -> Iterator[str]:
@@ -124,15 +124,15 @@ class Exchange(Script):
         yield from self._straight(phase, here, backwards=end == "front")
 
     def _judge(self) -> None:
-        """:class:`Failed` if a box is not where it should be, or what lay in it is not in it."""
+        """:class:`TaskFailed` if a box is not where it should be, or what lay in it is not in it."""
         swap = self.swap
         off = float(np.linalg.norm(self.box_pose(swap.empty)[:2] - self._place[:2]))
         if off > PLACED:
-            raise Failed(f"the empty box stands {off:.2f} m from where the full one stood")
+            raise TaskFailed(f"the empty box stands {off:.2f} m from where the full one stood")
         if self.box_pose(swap.full)[2] < self._place[2] + 0.5 * LIFTED:
-            raise Failed("the full box has been lost on the way")
+            raise TaskFailed("the full box has been lost on the way")
         if lost := sorted(set(self._contents) - set(self._inside(swap.full))):
-            raise Failed(f"{len(lost)} of {len(self._contents)} bunches fell out of the full box: {lost}")
+            raise TaskFailed(f"{len(lost)} of {len(self._contents)} bunches fell out of the full box: {lost}")
 
     # ------------------------------------------------------------------ what the steps are made of
 
@@ -156,7 +156,7 @@ class Exchange(Script):
         while not way.is_done:
             way.control(self.time)
             if way.is_stuck:
-                raise Failed("something keeps the base from going on")
+                raise TaskFailed("something keeps the base from going on")
             yield phase
 
     def _lift(self, phase: str, end: str, height: float) -> Iterator[str]:
@@ -166,7 +166,7 @@ class Exchange(Script):
         until = self.time + 6.0
         while abs(self.robot.rigid.read(self.robot.name)[0][index[0]] - height) > 0.003:
             if self.time > until:
-                raise Failed(f"the {end} lift does not come to {height:.2f} m")
+                raise TaskFailed(f"the {end} lift does not come to {height:.2f} m")
             yield phase
 
     def _lift_index(self, end: str) -> int:

@@ -1,6 +1,6 @@
 """A job told in the order in which it happens: a generator that commands, then yields once a tick.
 
-    class Wave(Script):
+    class Wave(Task):
         def steps(self):
             for angle in (0.5, -0.5, 0.0):
                 self.robot.command_position([angle], ["arm_left_3_joint"])
@@ -26,11 +26,11 @@ from vinesim.robot.drives import Robot
 log = logging.getLogger(__name__)
 
 
-class Failed(Exception):
+class TaskFailed(Exception):
     """The job cannot go on; the text says why."""
 
 
-class Script(abc.ABC):
+class Task(abc.ABC):
     """Runs :meth:`steps` one tick at a time. ``reason`` is empty as long as all goes well."""
 
     shown: frozenset[str] = frozenset()
@@ -71,7 +71,7 @@ class Script(abc.ABC):
 
     @abc.abstractmethod
     def steps(self) -> Iterator[str]:
-        """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`Failed`."""
+        """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`TaskFailed`."""
 
     def control(self, time: float) -> None:
         """Command the robot for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
@@ -82,12 +82,12 @@ class Script(abc.ABC):
         self.time = time
         try:
             if time - self._started > self.seconds:
-                raise Failed(f"not done after {self.seconds:g} s")
+                raise TaskFailed(f"not done after {self.seconds:g} s")
             self.phase = next(self._steps)
             self.durations[self.phase] = self.durations.get(self.phase, 0.0) + self.robot.rigid.dt
         except StopIteration:
             self.done = True
-        except Failed as failure:
+        except TaskFailed as failure:
             self.done = True
             self.reason = f"{self.phase}: {failure}"
             log.warning("%s: %s", self.robot.name, self.reason)
