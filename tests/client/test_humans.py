@@ -17,7 +17,7 @@ from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch
 from vinesim.net.codec import human as poses
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.human_body import PARTS, standing
-from vinesim.robot.description.description import RobotDescription, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
@@ -37,7 +37,7 @@ SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.yaw(-0.5 * np.pi))
 
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
-    return load("vinebot")
+    return load_description("vinebot")
 
 
 class World:

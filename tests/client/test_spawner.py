@@ -13,7 +13,7 @@ from vinesim import frames
 from vinesim.client.remote.spawner import Arrivals, described
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
@@ -40,7 +40,7 @@ class Later(concurrent.futures.Executor):
 
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
-    return load("vinebot")
+    return load_description("vinebot")
 
 
 def greeting(description: RobotDescription, name: str = "guest", **change) -> Hello:
@@ -56,7 +56,7 @@ def standing(description: RobotDescription, x: float) -> RobotUpdate:
 
 def world(description: RobotDescription) -> Physics:
     physics = Physics(assemble([cane((5.0, 5.0, 1.0), radius=0.005)]))
-    physics.rigid.add_robot(description.spec("host", 1, frames.pose([0.0, 3.0, 0.0])))
+    physics.rigid.add_robot(description.to_spec("host", 1, frames.pose([0.0, 3.0, 0.0])))
     return physics
 
 

@@ -16,8 +16,8 @@ def test_before_some_bunch_a_robot_finds_room(seed):
     bunch, pose = start_poses.find_push_pose(model, start_poses.spawn_pose(scene, 0)[:2])
     local = frames.rotate(frames.conjugate(pose[3:]), start_poses.bunch_centres(model)[bunch] - pose[:3])
     assert local[:2] == pytest.approx([0.6, 0.0], abs=1e-6)
-    assert start_poses.HEIGHT[0] < local[2] < start_poses.HEIGHT[1]
-    assert start_poses.ground_clearance(model, pose[None, :2])[0] > start_poses.ROOM
+    assert start_poses.PUSH_HEIGHT[0] < local[2] < start_poses.PUSH_HEIGHT[1]
+    assert start_poses.ground_clearance(model, pose[None, :2])[0] > start_poses.BASE_CLEARANCE
 
     goal = start_poses.find_approach_pose(model, pose, 14.0)
     back = frames.rotate(goal[3:], np.array([-1.0, 0.0, 0.0]))[:2]

@@ -10,7 +10,7 @@ from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.tasks import LookAt, RosCommandHandler, UnknownTask, plan_task
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.robot.drives import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes
@@ -38,10 +38,10 @@ def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Task]:
 def test_a_client_picks():
     client, script = client_with("pick", "vinebot", 0)
     assert isinstance(script, PickBunch)
-    while not script.done and script.phase != "tuck":
+    while not script.is_done and script.phase != "tuck":
         client.tick()
     assert not script.reason
-    assert client.physics.rigid.loose == (script.task.bunch,)
+    assert client.physics.rigid.loose == (script.plan.bunch,)
     # the bunch is in its hand, and its trouble is its own: the client goes on
     assert script.report()["phases_s"]["cut"] < 0.1
 
@@ -134,4 +134,4 @@ def test_what_makes_no_sense_is_counted_and_changes_nothing():
     late = JointTrajectory("arm_left_controller", 0.0, JOINTS, np.array([2.0, 1.0]), np.zeros((2, 2)), None)
     asked.queue = [way(start + 0.2, joints=("arm_left_1_joint", "no_joint")), late, way(start + np.nan)]
     np.testing.assert_allclose(asked.go(0.5), start, atol=1e-4)
-    assert asked.obey.refused == 3
+    assert asked.obey.rejected_count == 3

@@ -12,7 +12,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import RobotDescription, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
@@ -36,7 +36,7 @@ ROTOR = 0.3
 
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
-    return load("vinebot")
+    return load_description("vinebot")
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def gate(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
         f'[groups.hinge]\njoints = ["hinge_joint"]\nstiffness = [2000.0]\ndamping = [100.0]\nrotor = [{ROTOR}]\n'
         "elastic = [150.0]\nelastic_damping = [3.0]\n"
     )
-    return load(folder / "gate.urdf")
+    return load_description(folder / "gate.urdf")
 
 
 class Stand:

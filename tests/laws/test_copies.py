@@ -9,7 +9,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import RobotDescription, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import RobotInstance, RemoteRobot, Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
@@ -99,7 +99,7 @@ def test_across_the_network_the_stronger_wins_too(left, right, delay):
 
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
-    return load("vinebot")
+    return load_description("vinebot")
 
 
 @pytest.mark.parametrize("latency", [0, 2, 5, 10, 20])

@@ -7,7 +7,7 @@ import pytest
 
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.control.admittance_controller import AdmittanceController
-from vinesim.robot.description.description import load
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.scene.builder import assemble
 
@@ -17,7 +17,7 @@ class Pushed:
 
     def __init__(self, *, heeding: bool, **gains: float) -> None:
         self.rigid = Rigid(assemble([]))
-        self.robot = Robot(self.rigid, load("vinebot"), "anna")
+        self.robot = Robot(self.rigid, load_description("vinebot"), "anna")
         self.time = 0.0
         self.controller = AdmittanceController(self.robot, "arm_left", "wrist_left_ft", **gains) if heeding else None
         self._step()
@@ -84,7 +84,7 @@ def test_weight_is_no_push_even_after_a_turn_of_the_hand() -> None:
 
 
 def test_wrong_settings_are_named() -> None:
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
     with pytest.raises(CommandError, match=r"no wrist sensor 'elbow'.*wrist_left_ft"):
         AdmittanceController(robot, "arm_left", "elbow")
     with pytest.raises(CommandError, match="above 0"):

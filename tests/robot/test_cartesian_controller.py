@@ -8,7 +8,7 @@ import pytest
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose, solve_prioritized_ik
-from vinesim.robot.description.description import load
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
 
@@ -34,7 +34,7 @@ def led(hand: CartesianController, goal: np.ndarray, ahead: np.ndarray, up: np.n
     ids=["level, to a bunch", "down, to a box"],
 )
 def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple, ahead: tuple, up: np.ndarray):
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
     hand = CartesianController(robot, side)
     there = np.array(goal) * [1.0, 1.0 if side == "left" else -1.0, 1.0]
     led(hand, there, np.array(ahead), np.array(up))
@@ -45,7 +45,7 @@ def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple,
 
 
 def test_a_hand_goes_straight_and_not_too_fast():
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
     hand = CartesianController(robot, "left", tip_offset=0.03)
     led(hand, np.array([0.6, 0.25, 1.3]), np.array([1.0, 0.0, 0.0]), UP)
     hand.reset()

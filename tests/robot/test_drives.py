@@ -14,7 +14,7 @@ from vinesim import frames
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import CommandError, CommandInterface, RemoteRobot, Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
@@ -22,7 +22,7 @@ from vinesim.scene.values import Contact, RobotUpdate
 
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
-    return load("vinebot")
+    return load_description("vinebot")
 
 
 class Yard:
@@ -179,7 +179,7 @@ def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yar
 
 
 def test_gripper_opens_by_the_given_width(yard: Yard) -> None:
-    fingers = yard.robot.description.indices("gripper_left")
+    fingers = yard.robot.description.joint_indices("gripper_left")
     for opening in (0.0, 0.1):
         yard.robot.command_gripper("gripper_left", opening)
         assert yard.run(1.2)[-1, 0, fingers].sum() == pytest.approx(opening, abs=1e-4)
@@ -225,7 +225,7 @@ def test_samples_agree_with_the_rigid_world(vinebot: RobotDescription) -> None:
         found = frames.compose(yard.robot.frame_pose(parent), pose)
         np.testing.assert_allclose(found[:3], expected[:3], atol=1e-9)
         assert abs(found[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-9)
-    for (parent, child), pose in zip(vinebot.fixed, vinebot.fixed_q, strict=True):
+    for (parent, child), pose in zip(vinebot.fixed_frames, vinebot.fixed_poses, strict=True):
         found = frames.compose(yard.robot.frame_pose(parent), pose)
         np.testing.assert_allclose(found[:3], yard.robot.frame_pose(child)[:3], atol=1e-9)
     np.testing.assert_allclose(frames.compose(start, sample.odom_q), sample.base_q, atol=1e-9)
@@ -315,7 +315,7 @@ def test_foreign_robot_moves(tmp_path) -> None:
     links = "".join(f'<link name="{name}">{inertial}</link>' for name in ("arm", "left", "right"))
     file = tmp_path / "foreign.urdf"
     file.write_text(f'<robot name="foreign"><link name="base">{inertial}</link>{links}{joints}</robot>')
-    yard = Yard(load(file))
+    yard = Yard(load_description(file))
     yard.robot.command_position([7.0, 0.08])
     yard.run(5.0)
     sample = yard.robot.sample(yard.time)
@@ -522,7 +522,7 @@ def slid(yard: Yard, body: int, force: np.ndarray) -> float:
 def test_a_bunch_is_held_by_friction_and_no_more(vinebot: RobotDescription) -> None:
     """Two pads of 15 N and mu 0.8 hold 24 N: with the weight of 2.9 N, 16 N more hold and 25 N more do not."""
     yard, body = bunch_in_hand(vinebot, 15.0)
-    fingers = vinebot.indices("gripper_left")
+    fingers = vinebot.joint_indices("gripper_left")
     squeeze = yard.rigid.read("anna")[3][fingers]
     np.testing.assert_allclose(squeeze, 15.0, atol=0.3 * 9.81 * 0.2)  # the hand is tilted: a bit of the bunch's weight
     along = frames.rotate(yard.robot.frame_pose("gripper_left_grasping_link")[3:], np.array([0.0, 0.0, -1.0]))
@@ -575,7 +575,7 @@ def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: RobotDescrip
 
 def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
     """Oracle: MuJoCo knows nothing of them, so weight and contact forces must make up the reading at rest."""
-    description = load("vinebot")
+    description = load_description("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
     tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
@@ -602,13 +602,13 @@ def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
 
 def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
     """All joints soft, a set-point behind the bunch: at rest K times what is missing is what the plants press."""
-    description = load("vinebot")
+    description = load_description("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
     tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
     place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.yaw(np.pi), tip)
     robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
-    joints = description.indices("arm_left")
+    joints = description.joint_indices("arm_left")
     stiffness = np.array([60.0, 60.0, 40.0, 40.0, 15.0, 15.0, 15.0])
     robot.command_impedance(stiffness, 0.2 * stiffness, joints)
     robot.control(physics.time)

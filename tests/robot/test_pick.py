@@ -13,7 +13,7 @@ from tests.support.contact_forces import pressed_on_ground
 from vinesim import frames
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.pick import PickBunch, PickPlan
 from vinesim.scene.generation.vineyard import generate
@@ -26,14 +26,14 @@ GRAVITY = 9.81
 
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
-    return load("vinebot")
+    return load_description("vinebot")
 
 
 @functools.cache
 def vineyard(seed: int) -> tuple[Model, PickPlan]:
     plan = reseeded(load_scene("harvest"), seed)
     model = generate(plan)
-    return model, next(pick_planning.tasks(model, start_poses.spawn_pose(plan, 0)[:2]))
+    return model, next(pick_planning.plan_picks(model, start_poses.spawn_pose(plan, 0)[:2]))
 
 
 def awake(physics: Physics) -> None:
@@ -48,7 +48,7 @@ def picker(physics: Physics, description: RobotDescription, pose: np.ndarray) ->
 
 
 def run(pick: PickBunch) -> PickBunch:
-    while not pick.done:
+    while not pick.is_done:
         pick.control(pick.physics.time)
         pick.robot.control(pick.physics.time)
         pick.physics.step()
@@ -58,7 +58,7 @@ def run(pick: PickBunch) -> PickBunch:
 def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(vinebot: RobotDescription):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = picker(physics, vinebot, task.stand)
+    robot = picker(physics, vinebot, task.base_pose)
     awake(physics)
     body = model.bunch_body[task.bunch]
     physics.plants.wake(int(model.body_tree[body]))
@@ -81,7 +81,7 @@ def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(
     assert on_vine > 3.0
     assert in_box == pytest.approx(on_vine, rel=0.01)
     # it was cut, not torn: the blade did it, and the hand that held it is empty now
-    assert np.abs(physics.rigid.bunch_pose(task.bunch)[:3] - pick.hand.tip_position).max() > 0.2
+    assert np.abs(physics.rigid.bunch_pose(task.bunch)[:3] - pick.arm.tip_position).max() > 0.2
 
 
 def _next(physics: Physics, robot: Robot, box: int) -> float:
@@ -92,7 +92,7 @@ def _next(physics: Physics, robot: Robot, box: int) -> float:
 
 def test_a_bunch_out_of_reach_is_told_in_words(vinebot: RobotDescription):
     model, task = vineyard(7)
-    far = frames.compose(task.stand, frames.pose([-0.8, 0.0, 0.0]))
+    far = frames.compose(task.base_pose, frames.pose([-0.8, 0.0, 0.0]))
     physics = Physics(model)
     pick = run(PickBunch(physics, picker(physics, vinebot, far), task))
     assert not pick.picked
@@ -104,7 +104,7 @@ def test_a_bunch_out_of_reach_is_told_in_words(vinebot: RobotDescription):
 def test_a_blade_that_does_not_cut_is_told_in_words(vinebot: RobotDescription, monkeypatch: pytest.MonkeyPatch):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = picker(physics, vinebot, task.stand)
+    robot = picker(physics, vinebot, task.base_pose)
     monkeypatch.setattr(robot, "command_cutter", lambda group: None)
     pick = run(PickBunch(physics, robot, task))
     assert not pick.picked
@@ -116,7 +116,7 @@ def test_a_bunch_that_is_gone_is_told_in_words(vinebot: RobotDescription):
     """The fingers close where nothing is: what hung there fell before."""
     model, task = vineyard(7)
     physics = Physics(model)
-    pick = PickBunch(physics, picker(physics, vinebot, task.stand), task)
+    pick = PickBunch(physics, picker(physics, vinebot, task.base_pose), task)
     while pick.phase != "advance":
         pick.control(physics.time)
         pick.robot.control(physics.time)
@@ -128,7 +128,7 @@ def test_a_bunch_that_is_gone_is_told_in_words(vinebot: RobotDescription):
 def test_a_robot_without_a_cutter_is_refused(vinebot: RobotDescription):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = picker(physics, dataclasses.replace(vinebot, cutters=()), task.stand)
+    robot = picker(physics, dataclasses.replace(vinebot, cutters=()), task.base_pose)
     with pytest.raises(CommandError, match="no gripper with a cutter on its"):
         PickBunch(physics, robot, task)
 
@@ -138,7 +138,7 @@ def test_the_same_pick_twice_is_the_same_to_the_bit(vinebot: RobotDescription):
     for _ in range(2):
         model, task = vineyard(7)
         physics = Physics(model)
-        pick = PickBunch(physics, picker(physics, vinebot, task.stand), task)
+        pick = PickBunch(physics, picker(physics, vinebot, task.base_pose), task)
         while pick.phase != "tuck":
             pick.control(physics.time)
             pick.robot.control(physics.time)

@@ -9,7 +9,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import RobotDescription, DescriptionError, load
+from vinesim.robot.description.description import RobotDescription, DescriptionError, load_description
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble
@@ -19,7 +19,7 @@ HERE = frames.pose([0.0, 0.0, 0.0])
 
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
-    return load("vinebot")
+    return load_description("vinebot")
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +67,8 @@ def test_fingertips_arrive_within_a_centimetre(robot: Robot, target: tuple[float
     steps = np.abs(np.diff(run.setpoints, axis=0)) / robot.rigid.dt
     assert (steps <= robot.max_velocity * (1.0 + 1e-6)).all()
     assert (np.abs(run.speeds) <= 1.5 * robot.max_velocity).all()
-    assert run.reach.cycles == 1
-    assert run.reach.missed == 0
+    assert run.reach.push_count == 1
+    assert run.reach.missed_count == 0
 
 
 @pytest.mark.parametrize("target", [(0.5, -0.2, 1.4), (0.8, -0.3, 1.7), (0.7, 0.1, 1.5)], ids=str)
@@ -107,7 +107,7 @@ def test_the_fingers_come_from_below_and_touch_slowly(robot: Robot) -> None:
 
 def test_the_hand_is_smooth(robot: Robot) -> None:
     run = Run(robot, "left", np.array([0.7, 0.25, 1.5]))
-    arm = robot.description.indices("arm_left")
+    arm = robot.description.joint_indices("arm_left")
     acceleration = np.diff(np.array(run.speeds)[:, arm], axis=0) / robot.rigid.dt
     assert np.abs(acceleration).max() < 60.0
 
@@ -115,9 +115,9 @@ def test_the_hand_is_smooth(robot: Robot) -> None:
 def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescription) -> None:
     robot = Robot(Rigid(assemble([])), vinebot, "anna")
     time = 0.0
-    reach = PushBunch(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold=0.2)
+    reach = PushBunch(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold_time=0.2)
     errors = []
-    while reach.cycles < 2 and time < 30.0:
+    while reach.push_count < 2 and time < 30.0:
         before, error = reach.phase, reach.error
         robot.command_base(0.05 if time < 2.0 else 0.0, 0.0, time)
         reach.control(time)
@@ -127,13 +127,13 @@ def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescr
         robot.rigid.prep()
         robot.rigid.finish()
         time += robot.rigid.dt
-    assert reach.cycles == 2
+    assert reach.push_count == 2
     assert max(errors) < 0.01
 
 
 def test_what_is_out_of_reach_is_given_up_calmly(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
     run = Run(robot, "left", np.array([1.6, 0.2, 1.5]))
-    assert run.reach.missed == 1
+    assert run.reach.missed_count == 1
     assert Phase.TOUCH not in run.phases
     assert "out of reach" in caplog.text
     assert (np.abs(run.speeds) <= 2.0 * robot.max_velocity).all()
@@ -146,7 +146,7 @@ def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
     robot = Robot(Rigid(assemble([])), vinebot, "anna")
     arms = [
         PushBunch(robot, "left", lambda: np.array([0.7, 0.25, 1.45]), repeat=False),
-        PushBunch(robot, "right", lambda: np.array([0.6, -0.3, 1.4]), repeat=False, lift=False),
+        PushBunch(robot, "right", lambda: np.array([0.6, -0.3, 1.4]), repeat=False, use_lift=False),
     ]
     touched = {}
     time = 0.0
@@ -179,11 +179,11 @@ def test_an_arm_without_a_tool_is_refused(robot: Robot) -> None:
 
 def test_a_foreign_robot_reaches_by_its_names_alone() -> None:
     try:
-        tiago = load("tiago_pro")
+        tiago = load_description("tiago_pro")
     except DescriptionError as error:
         if "not installed" in str(error):
             pytest.skip(str(error))
         raise
     run = Run(Robot(Rigid(assemble([])), tiago, "anna"), "left", np.array([0.55, 0.25, 1.1]))
-    assert run.reach.cycles == 1
+    assert run.reach.push_count == 1
     assert run.errors[Phase.TOUCH] < 0.01

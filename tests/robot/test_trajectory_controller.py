@@ -14,7 +14,7 @@ from vinesim.robot.control.trajectory_controller import (
     TrajectoryController,
     TrajectoryError,
 )
-from vinesim.robot.description.description import load
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
 
@@ -27,7 +27,7 @@ class Stage:
 
     def __init__(self, **tolerances) -> None:
         self.rigid = Rigid(assemble([]))
-        self.robot = Robot(self.rigid, load("vinebot"), "anna")
+        self.robot = Robot(self.rigid, load_description("vinebot"), "anna")
         self.controller = TrajectoryController(self.robot, ARM, **tolerances)
         self.home = self.robot.setpoint[self.controller.indices].copy()
         self.time = 0.0

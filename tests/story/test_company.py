@@ -9,9 +9,9 @@ import pytest
 
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.tasks.start_poses import QUEUE, bunch_centres, find_reachable_bunch, spawn_pose, start_pose
+from vinesim.client.tasks.start_poses import QUEUE_SPACING, bunch_centres, find_reachable_bunch, spawn_pose, start_pose
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load
@@ -106,7 +106,7 @@ def test_robots_of_one_client_start_side_by_side_then_in_line():
     scene = load("demo")
     poses = [start_pose(scene, 0, 0.0, i) for i in range(2 * len(scene.spawns))]
     first, behind = poses[0], poses[len(scene.spawns)]
-    assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE)
+    assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE_SPACING)
     apart = [np.linalg.norm(a[:2] - b[:2]) for i, a in enumerate(poses) for b in poses[:i]]
     assert min(apart) > 1.1
 

@@ -141,7 +141,7 @@ def company() -> Iterator[list[Process]]:
 
 def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
     """Run the demo and write ``out``; 0 if all went well."""
-    from vinesim.robot.description.description import load as load_robot
+    from vinesim.robot.description.description import load_description as load_robot
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load as load_scene
     from vinesim.scene.spec import reseeded
@@ -210,7 +210,7 @@ def do(
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     from vinesim.client.tasks.tasks import UnknownTask
-    from vinesim.robot.description.description import load as load_robot
+    from vinesim.robot.description.description import load_description as load_robot
     from vinesim.scene.spec import load as load_scene
     from vinesim.scene.spec import reseeded
 

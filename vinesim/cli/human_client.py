@@ -30,7 +30,7 @@ def run(
     from vinesim.client.rate_loop import Pace
     from vinesim.client.recording.trace import Trace
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import bunch_centres, validate_bunch, placed, start_pose
+    from vinesim.client.tasks.start_poses import bunch_centres, validate_bunch, with_start_pose, start_pose
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load, reseeded
@@ -40,7 +40,7 @@ def run(
     sys.setswitchinterval(SWITCH)
     plan = reseeded(load(scene), seed)
     if place is not None:
-        plan, spawn = placed(plan, *place), 0
+        plan, spawn = with_start_pose(plan, *place), 0
     model = generate(plan)
     validate_bunch(model, reach)
     name = name or f"human-{os.getpid()}"

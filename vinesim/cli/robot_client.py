@@ -65,10 +65,10 @@ def run(
     from vinesim.client.recording.trace import Trace
     from vinesim.client.sensing.sensor_process import Senses
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import validate_bunch, placed, start_pose
+    from vinesim.client.tasks.start_poses import validate_bunch, with_start_pose, start_pose
     from vinesim.client.tasks.tasks import DriveTo, LookAt, validate_task_name, plan_task
     from vinesim.net.transport.bus import MemoryHub
-    from vinesim.robot.description.description import load as load_robot
+    from vinesim.robot.description.description import load_description as load_robot
     from vinesim.robot.tasks.push import PushBunch
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load as load_scene
@@ -78,7 +78,7 @@ def run(
     plan = reseeded(load_scene(scene), seed)
     descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:
-        plan = placed(plan, *place)
+        plan = with_start_pose(plan, *place)
         spawn = 0
     model = generate(plan)
     start = start_pose(plan, spawn, back)
@@ -140,7 +140,7 @@ def run(
         if job is not None:
             script = begin(client.physics, client.robot)
             client.jobs.append(script.control)
-            client.worth = script.worth
+            client.worth = script.frame_score
             client.jobs.append(LookAt(client.robot, script.focus))
         elif client.trace is not None:
             client.jobs.append(LookAt(client.robot, client.trace.centre))
@@ -149,7 +149,7 @@ def run(
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
-        done = (lambda: False) if script is None else (lambda: script.done)
+        done = (lambda: False) if script is None else (lambda: script.is_done)
         tick_until(stop, client.tick, pace, seconds, client.physics.dt, done)
         if out is not None:
             report = reporter.report() | senses.report()

@@ -64,7 +64,7 @@ class RobotInstance:
         self.description = description
         self.name = name or description.name
         self._index = index
-        spec = description.spec(self.name, index, pose)
+        spec = description.to_spec(self.name, index, pose)
         if not is_in_world:
             rigid.add_robot(spec)
         back = frames.conjugate(spec.pose[3:])
@@ -88,8 +88,8 @@ class RobotInstance:
             base_q=base_q,
             base_qd=base_qd,
             odom_q=self._odometry(base_q),
-            transforms=self.description.moving.frames,
-            transform_q=self.description.moving.poses(position),
+            transforms=self.description.moving_joints.frames,
+            transform_q=self.description.moving_joints.poses(position),
             contacts=tuple(c for c in contacts if c.actor == self.name),
         )
 
@@ -306,7 +306,7 @@ class Robot(RobotInstance):
         if group not in self.description.groups:
             known = ", ".join(self.description.groups)
             raise CommandError(f"{self.name} has no gripper {group!r}; its groups are: {known}")
-        return self.description.indices(group)
+        return self.description.joint_indices(group)
 
     def _switch_interface(self, joints: np.ndarray, interface: CommandInterface) -> None:
         before = self.interface[joints] == CommandInterface.MOTOR_POSITION
@@ -465,7 +465,7 @@ class Robot(RobotInstance):
 def _subtree_links(description: RobotDescription, frame: str) -> frozenset[str]:
     """A link and all that hangs on it."""
     beyond = {frame}
-    joints = (*description.fixed, *description.moving.frames)
+    joints = (*description.fixed_frames, *description.moving_joints.frames)
     while more := {child for parent, child in joints if parent in beyond} - beyond:
         beyond |= more
     return frozenset(beyond)
@@ -493,5 +493,5 @@ class RemoteRobot(RobotInstance):
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
         if abs(update.base_q[2] - here[2]) > 1e-3:  # a base rolls on its plane; another height is another world
             self.rigid.remove_robot(self.name)
-            self.rigid.add_robot(self.description.spec(self.name, self._index, update.base_q))
+            self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))
         self.rigid.place(self.name, update.base_q, update.position)

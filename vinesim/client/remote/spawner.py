@@ -87,7 +87,7 @@ class Arrivals:
         description = described(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
-        return description, self.rigid.prepare(description.spec(hello.name, hello.index, update.base_q))
+        return description, self.rigid.prepare(description.to_spec(hello.name, hello.index, update.base_q))
 
 
 def described(hello: Hello, own: RobotDescription | None) -> RobotDescription:
@@ -96,7 +96,7 @@ def described(hello: Hello, own: RobotDescription | None) -> RobotDescription:
         return own
     name = hello.robot if valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
     try:
-        known = descriptions.load(name)
+        known = descriptions.load_description(name)
         if known.urdf == hello.urdf:
             return known
     except DescriptionError:
@@ -104,4 +104,4 @@ def described(hello: Hello, own: RobotDescription | None) -> RobotDescription:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return descriptions.load(file)
+        return descriptions.load_description(file)

@@ -117,7 +117,7 @@ class _Perception:
         from vinesim.ros.node import Node
 
         setup, description = self.setup, self.setup.description
-        fixed = [(p, c, q) for (p, c), q in zip(description.fixed, description.fixed_q, strict=True)]
+        fixed = [(p, c, q) for (p, c), q in zip(description.fixed_frames, description.fixed_poses, strict=True)]
         node = stack.enter_context(
             Node(
                 setup.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=setup.namespace,

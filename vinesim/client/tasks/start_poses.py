@@ -10,19 +10,19 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Spawn
 
-REACH = (0.35, 0.85)
+PUSH_REACH = (0.35, 0.85)
 """How far a bunch may be ahead of a robot's base to be pushed by an arm [m]."""
-HEIGHT = (1.2, 1.75)
+PUSH_HEIGHT = (1.2, 1.75)
 """Height of a bunch's centre that an arm reaches [m]."""
 
 
-ROOM = 0.55
+BASE_CLEARANCE = 0.55
 """A robot's base needs this much around its middle [m]."""
 
 
-QUEUE = 1.5
+QUEUE_SPACING = 1.5
 """Between robots of one client that wait behind one another [m]."""
-CANDIDATES = 200
+MAX_CANDIDATES = 200
 """So many of the nearest bunches are tried."""
 
 
@@ -45,10 +45,10 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
 def start_pose(scene: Scene, number: int, back: float = 0.0, queue: int = 0) -> np.ndarray:
     """Pose [7] of the ``queue``-th robot of a client: the next start places, then in line behind the first ones."""
     lap, place = divmod(number + queue, max(len(scene.spawns), 1)) if queue else (0, number)
-    return spawn_pose(scene, place, back + QUEUE * lap)
+    return spawn_pose(scene, place, back + QUEUE_SPACING * lap)
 
 
-def placed(scene: Scene, x: float, y: float, yaw: float) -> Scene:
+def with_start_pose(scene: Scene, x: float, y: float, yaw: float) -> Scene:
     """The same scene with one start place, at (x, y) [m] with ``yaw`` [rad]."""
     return msgspec.structs.replace(scene, spawns=(Spawn(name="given", x=x, y=y, yaw=yaw),))
 
@@ -65,13 +65,13 @@ def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
     local = frames.rotate(frames.conjugate(pose[3:]), bunch_centres(model) - pose[:3])
     distance = np.hypot(local[:, 0], local[:, 1])
     sideways = np.abs(np.arctan2(local[:, 1], local[:, 0]))
-    fits = (distance > REACH[0]) & (distance < REACH[1]) & (local[:, 2] > HEIGHT[0]) & (local[:, 2] < HEIGHT[1])
+    fits = (distance > PUSH_REACH[0]) & (distance < PUSH_REACH[1]) & (local[:, 2] > PUSH_HEIGHT[0]) & (local[:, 2] < PUSH_HEIGHT[1])
     fits &= sideways < 0.7
     if not fits.any():
         x, y = pose[:2]
         raise PlacementError(
-            f"no bunch within reach of a robot at ({x:.2f}, {y:.2f}): none {REACH[0]} to {REACH[1]} m ahead "
-            f"at {HEIGHT[0]} to {HEIGHT[1]} m height; choose another start place or seed"
+            f"no bunch within reach of a robot at ({x:.2f}, {y:.2f}): none {PUSH_REACH[0]} to {PUSH_REACH[1]} m ahead "
+            f"at {PUSH_HEIGHT[0]} to {PUSH_HEIGHT[1]} m height; choose another start place or seed"
         )
     return int(np.argmin(np.where(fits, np.abs(distance - 0.6) + 0.2 * sideways, np.inf)))
 
@@ -104,16 +104,16 @@ def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> 
 def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
     """A bunch that an arm can push, and a pose [7] of a base before it with room around; nearest to ``near`` [2]."""
     centres = bunch_centres(model)
-    high = np.flatnonzero((centres[:, 2] > HEIGHT[0]) & (centres[:, 2] < HEIGHT[1]))
-    high = high[np.argsort(np.linalg.norm(centres[high, :2] - near, axis=1), kind="stable")][:CANDIDATES]
+    high = np.flatnonzero((centres[:, 2] > PUSH_HEIGHT[0]) & (centres[:, 2] < PUSH_HEIGHT[1]))
+    high = high[np.argsort(np.linalg.norm(centres[high, :2] - near, axis=1), kind="stable")][:MAX_CANDIDATES]
     centres = centres[high]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     ahead = np.stack([np.cos(heading), np.sin(heading)], -1)
     places = centres[:, None, :2] - 0.6 * ahead
-    fits = (ground_clearance(model, places.reshape(-1, 2)) > ROOM).reshape(places.shape[:2])
+    fits = (ground_clearance(model, places.reshape(-1, 2)) > BASE_CLEARANCE).reshape(places.shape[:2])
     if not fits.any():
         raise PlacementError(
-            f"no bunch of this vineyard can be pushed: none hangs {HEIGHT[0]} to {HEIGHT[1]} m high with {ROOM} m of "
+            f"no bunch of this vineyard can be pushed: none hangs {PUSH_HEIGHT[0]} to {PUSH_HEIGHT[1]} m high with {BASE_CLEARANCE} m of "
             "room for a robot before it; choose another scene or seed"
         )
     distance = np.where(fits, np.linalg.norm(places - near, axis=-1), np.inf)

@@ -22,7 +22,7 @@ from vinesim.scene.model import Model
 log = logging.getLogger(__name__)
 
 
-JOBS = ("pick", "exchange")
+TASKS = ("pick", "exchange")
 """What :func:`plan_task` knows."""
 
 
@@ -32,8 +32,8 @@ class UnknownTask(ValueError):
 
 def validate_task_name(job: str | None) -> str | None:
     """The job, if there is one of that name."""
-    if job is not None and job not in JOBS:
-        raise UnknownTask(f"no job {job!r}; give {' or '.join(JOBS)}")
+    if job is not None and job not in TASKS:
+        raise UnknownTask(f"no job {job!r}; give {' or '.join(TASKS)}")
     return job
 
 
@@ -43,38 +43,38 @@ def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physi
     ``near`` [7]: where it would be otherwise. Planning takes a second or two: not for the tick.
     """
     if validate_task_name(job) == "pick":
-        task = next(pick_planning.tasks(model, near[:2]))
-        return functools.partial(PickBunch, task=task), task.stand
-    boxes = swap_planning.swap(model, near)
-    return functools.partial(_exchange, swap=boxes), near
+        task = next(pick_planning.plan_picks(model, near[:2]))
+        return functools.partial(PickBunch, plan=task), task.base_pose
+    boxes = swap_planning.plan_swap(model, near)
+    return functools.partial(_begin_swap, swap=boxes), near
 
 
-def _exchange(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
+def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
     """Fill the box that is to be full, and exchange it."""
-    swap_planning.fill(physics, swap.full)
+    swap_planning.fill_box(physics, swap.full_box)
     return SwapBoxes(physics, robot, swap)
 
 
 class DriveTo:
     """Drive the base to a place that lies about straight ahead, and stop there."""
 
-    ARRIVED = 0.05
+    POSITION_TOLERANCE = 0.05
     """This near is there [m]."""
 
     def __init__(self, robot: Robot, place: np.ndarray, *, speed: float = 1.2) -> None:
         """``place`` [7]: pose of the base in the world."""
         self.robot, self.speed = robot, speed
-        self.done = False
+        self.is_done = False
         self._place = np.asarray(place, float)[:2]
 
     def __call__(self, time: float) -> None:
-        if self.done:
+        if self.is_done:
             return
         base, _ = self.robot.rigid.base(self.robot.name)
         way = frames.rotate(frames.conjugate(base[3:]), np.append(self._place - base[:2], 0.0))
         distance = float(np.hypot(way[0], way[1]))
-        if distance < self.ARRIVED or way[0] < 0.0:
-            self.done = True
+        if distance < self.POSITION_TOLERANCE or way[0] < 0.0:
+            self.is_done = True
             self.robot.command_base(0.0, 0.0, time)
             return
         turn = float(np.arctan2(way[1], way[0]))
@@ -93,7 +93,7 @@ class LookAt:
         """``point`` gives the place to look at [3] m in the world. Does nothing without a head and a camera on it."""
         description = robot.description
         self.robot, self.point = robot, point
-        self._joints = description.indices("head") if "head" in description.groups and description.cameras else None
+        self._joints = description.joint_indices("head") if "head" in description.groups and description.cameras else None
         self._camera = description.cameras[0].frame if description.cameras else ""
         self._tick = 0
 
@@ -117,7 +117,7 @@ class RosCommandHandler:
     def __init__(self, robot: Robot, commands: Callable[[], Iterable[Command]]) -> None:
         """``commands`` returns what was asked since the last call."""
         self.robot = robot
-        self.refused = 0
+        self.rejected_count = 0
         """Commands that no joint of this robot can take."""
         self._commands = commands
         self._controllers: dict[str, TrajectoryController] = {}
@@ -125,15 +125,15 @@ class RosCommandHandler:
     def __call__(self, time: float) -> None:
         for command in self._commands():
             try:
-                self._take(command, time)
+                self._apply(command, time)
             except CommandError as error:
-                self.refused += 1
-                if self.refused == 1:
+                self.rejected_count += 1
+                if self.rejected_count == 1:
                     log.warning("refused a command, further ones are only counted: %s", error)
         for controller in self._controllers.values():
             controller(time)
 
-    def _take(self, command: Command, time: float) -> None:
+    def _apply(self, command: Command, time: float) -> None:
         robot = self.robot
         if isinstance(command, BaseVelocity):
             robot.command_base(float(command.linear[0]), float(command.angular[2]), time)

@@ -39,7 +39,7 @@ class AdmittanceController:
         self.mass, self.damping, self.force_deadband = mass, damping, force_deadband
         self.velocity = np.zeros(3)
         """[3] m/s of the hand, world axes, as it is asked for"""
-        self._joints = robot.description.indices(group)
+        self._joints = robot.description.joint_indices(group)
         self._weight: np.ndarray | None = None
 
     def tare(self) -> None:

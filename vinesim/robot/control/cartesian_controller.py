@@ -58,7 +58,7 @@ class CartesianController:
         self._joint_weights = speed_of / speed_of.max()
         """How readily a joint is used: the slow lift less than the arm."""
         self._home = description.home[self._joints]
-        moving = description.moving
+        moving = description.moving_joints
         self._shoulder = moving.frames[moving.names.index(arm.joints[0])][1]
         self._rates = np.zeros(len(self._joints))
         self.reset()
