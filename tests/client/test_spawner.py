@@ -83,11 +83,11 @@ def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_c
     def run(prepared: bool) -> bytes:
         physics = world(vinebot)
         physics.rigid.command("host", vinebot.home + 0.2)
-        draft = physics.rigid.prepare(vinebot.spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
+        draft = physics.rigid.prepare(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
         for _ in range(20):
             physics.step()
         if draft is None:
-            physics.rigid.add_robot(vinebot.spec("guest", 7, frames.pose([1.0, 0.0, 0.0])))
+            physics.rigid.add_robot(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0])))
         else:
             assert physics.rigid.admit(draft)
         for _ in range(20):
@@ -104,7 +104,7 @@ def test_a_world_that_changed_meanwhile_is_prepared_anew(vinebot):
     update = standing(vinebot, 0.0)
     arrivals.embody("guest", update)
     later.work()
-    physics.rigid.add_robot(vinebot.spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
+    physics.rigid.add_robot(vinebot.to_spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
     assert arrivals.embody("guest", update) is None
     assert physics.rigid.robots == ("host", "other")
     assert arrivals.embody("guest", update) is None

@@ -20,7 +20,7 @@ class Story(Task):
     def focus(self) -> np.ndarray:
         return np.zeros(3)
 
-    def steps(self) -> Iterator[str]:
+    def run(self) -> Iterator[str]:
         yield from self.wait(0.5, "one")
         yield from self.wait(0.25, "two")
         if self.fails:

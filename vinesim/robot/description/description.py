@@ -1,7 +1,7 @@
 """Robot descriptions: a URDF, and beside it a TOML with what a URDF cannot say.
 
-    robot = load("vinebot")
-    rigid.add_robot(robot.spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
+    robot = load_description("vinebot")
+    rigid.add_robot(robot.to_spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
 
 The URDF is read by yourdfpy. The text that physics and ROS receive differs from the file in three ways: meshes are
 named by absolute path, wheels and casters are fixed (the base is driven as a whole), and shapes whose mesh format

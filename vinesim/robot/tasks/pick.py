@@ -76,11 +76,11 @@ class PickPlan:
 class PickBunch(Task):
     """One bunch from its vine into a box; ``done``, ``picked`` and ``reason`` say how it went."""
 
-    shown = frozenset({"cut", "back"})
+    key_phases = frozenset({"cut", "back"})
 
-    def __init__(self, physics: Physics, robot: Robot, plan: PickPlan, *, seconds: float = 90.0) -> None:
+    def __init__(self, physics: Physics, robot: Robot, plan: PickPlan, *, timeout: float = 90.0) -> None:
         """``robot`` has been fitted with its cutters (:meth:`Robot.fit_cutters`)."""
-        super().__init__(robot, timeout=seconds)
+        super().__init__(robot, timeout=timeout)
         self.physics, self.plan = physics, plan
         self.arm = CartesianController(robot, plan.side)
         cutter = next((c for c in robot.description.cutters if c.group == self.arm.gripper), None)
@@ -138,7 +138,7 @@ class PickBunch(Task):
 
     # ------------------------------------------------------------------ the job
 
-    def steps(self) -> Iterator[str]:
+    def run(self) -> Iterator[str]:
         """See :class:`Task`."""
         ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
         self.arm.reset()

@@ -55,8 +55,8 @@ class SwapPlan:
 class SwapBoxes(Task):
     """An empty box for a full one; ``done``, ``succeeded`` and ``reason`` say how it went."""
 
-    def __init__(self, physics: Physics, robot: Robot, plan: SwapPlan, *, seconds: float = 180.0) -> None:
-        super().__init__(robot, timeout=seconds)
+    def __init__(self, physics: Physics, robot: Robot, plan: SwapPlan, *, timeout: float = 180.0) -> None:
+        super().__init__(robot, timeout=timeout)
         self.physics, self.plan = physics, plan
         for group in ("lift_front", "clamp_front", "lift_rear", "clamp_rear"):
             if group not in robot.description.groups:
@@ -81,7 +81,7 @@ class SwapBoxes(Task):
 
     # ------------------------------------------------------------------ the job
 
-    def steps(self) -> Iterator[str]:
+    def run(self) -> Iterator[str]:
         """See :class:`Task`."""
         swap = self.plan
         yield from self._follow_path("to the empty box", swap.path_to_empty, self._away_from(swap.empty_box, swap.path_to_empty[-1]))

@@ -1,7 +1,7 @@
 """A job told in the order in which it happens: a generator that commands, then yields once a tick.
 
     class Wave(Task):
-        def steps(self):
+        def run(self):
             for angle in (0.5, -0.5, 0.0):
                 self.robot.command_position([angle], ["arm_left_3_joint"])
                 yield from self.wait(1.0, "wave")
@@ -31,13 +31,13 @@ class TaskFailed(Exception):
 
 
 class Task(abc.ABC):
-    """Runs :meth:`steps` one tick at a time. ``reason`` is empty as long as all goes well."""
+    """Runs :meth:`run` one tick at a time. ``reason`` is empty as long as all goes well."""
 
     key_phases: frozenset[str] = frozenset()
     """Phases of which a picture tells most."""
 
     def __init__(self, robot: Robot, *, timeout: float) -> None:
-        """Given up after ``seconds`` [s]."""
+        """Given up after ``timeout`` [s]."""
         self.robot, self.timeout = robot, timeout
         self.time = 0.0
         """Of the present tick [s]."""
