@@ -58,7 +58,7 @@ GRID = list(itertools.product((0.45, 0.65, 0.9), (0.1, 0.35), (1.3, 1.55, 1.8)))
 
 @pytest.mark.parametrize("target", GRID, ids=str)
 def test_fingertips_arrive_within_a_centimetre(robot: Robot, target: tuple[float, float, float]) -> None:
-    run = Run(robot, "left", np.array(target), radius=0.0, hold=0.1)
+    run = Run(robot, "left", np.array(target), radius=0.0, hold_time=0.1)
     for phase in (Phase.APPROACH, Phase.TOUCH, Phase.PUSH):
         assert run.errors[phase] < 0.01, phase
     touched = np.flatnonzero([phase is Phase.PUSH for phase in run.phases])[0]

@@ -10,7 +10,7 @@ from vinesim.robot.control.trajectory_controller import (
     Outcome,
     GoalHandle,
     Tolerance,
-    JointTrajectory,
+    Trajectory,
     TrajectoryController,
     TrajectoryError,
 )
@@ -51,12 +51,12 @@ class Stage:
         return self.rigid.read("anna")[0][self.robot.joint_indices(joints)]
 
 
-def swing(stage: Stage, *, smooth: bool = True) -> JointTrajectory:
+def swing(stage: Stage, *, smooth: bool = True) -> Trajectory:
     """Two joints to and fro in 3 s; their home is where they start."""
     home = stage.at(TWO)
     positions = home + np.array([[0.2, -0.3], [0.4, -0.6], [0.1, -0.2]])
     velocities = np.array([[0.3, -0.45], [0.0, 0.0], [0.0, 0.0]]) if smooth else None
-    return JointTrajectory(TWO, np.array([1.0, 2.0, 3.0]), positions, velocities)
+    return Trajectory(TWO, np.array([1.0, 2.0, 3.0]), positions, velocities)
 
 
 @pytest.mark.parametrize("smooth", [True, False])
@@ -101,8 +101,8 @@ def test_controller_says_where_it_should_be_and_is() -> None:
 
 def test_a_trajectory_too_fast_for_the_drives_breaks_its_path_tolerance() -> None:
     """The URDF allows 1.9 rad/s; 1.2 rad in 0.2 s are three times as fast. The arm stops where it is."""
-    stage = Stage(path=Tolerance.uniform(7, position=0.1))
-    run = stage.controller.start(JointTrajectory(TWO, np.array([0.2]), stage.at(TWO) + np.array([[1.2, 0.0]])), 0.0)
+    stage = Stage(path_tolerance=Tolerance.uniform(7, position=0.1))
+    run = stage.controller.start(Trajectory(TWO, np.array([0.2]), stage.at(TWO) + np.array([[1.2, 0.0]])), 0.0)
     stage.run(1.0, until=run)
     assert run.outcome is Outcome.PATH_TOLERANCE_VIOLATED
     assert "arm_left_1_joint is off by 0.1" in run.text
@@ -116,9 +116,9 @@ def test_a_trajectory_too_fast_for_the_drives_breaks_its_path_tolerance() -> Non
 
 
 def test_a_blocked_arm_misses_its_goal_in_time() -> None:
-    stage = Stage(goal=Tolerance.uniform(7, position=0.01), goal_time=0.5)
+    stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01), goal_time_tolerance=0.5)
     stage.rigid.push("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
-    run = stage.controller.start(JointTrajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
+    run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
     stage.run(3.0, until=run)
     assert run.outcome is Outcome.GOAL_TOLERANCE_VIOLATED
     assert "arm_left_1_joint" in run.text
@@ -126,9 +126,9 @@ def test_a_blocked_arm_misses_its_goal_in_time() -> None:
 
 
 def test_without_a_limit_of_time_it_waits_until_the_goal_is_met() -> None:
-    stage = Stage(goal=Tolerance.uniform(7, position=0.01))
+    stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01))
     stage.rigid.push("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
-    run = stage.controller.start(JointTrajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
+    run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
     stage.run(3.0, until=run)
     assert not run.is_done
     stage.rigid.push("anna", "arm_left_4_link", np.zeros(3))
@@ -137,10 +137,10 @@ def test_without_a_limit_of_time_it_waits_until_the_goal_is_met() -> None:
 
 
 def test_a_tolerance_of_the_trajectory_goes_before_the_controllers() -> None:
-    stage = Stage(path=Tolerance.uniform(7, position=1e-9))
+    stage = Stage(path_tolerance=Tolerance.uniform(7, position=1e-9))
     loose = swing(stage)
     for tolerance, outcome in ((None, Outcome.PATH_TOLERANCE_VIOLATED), (Tolerance.uniform(2, 0.05), Outcome.SUCCESSFUL)):
-        plan = JointTrajectory(TWO, loose.times, loose.positions, loose.velocities, path_tolerance=tolerance)
+        plan = Trajectory(TWO, loose.times, loose.positions, loose.velocities, path_tolerance=tolerance)
         run = stage.controller.start(plan, stage.time)
         stage.run(4.0, until=run)
         assert run.outcome is outcome
@@ -151,7 +151,7 @@ def test_a_newer_trajectory_takes_over_without_a_jerk() -> None:
     first = stage.controller.start(swing(stage), 0.0)
     stage.run(1.5)
     there = stage.home[[0, 3]] + 0.1
-    second = stage.controller.start(JointTrajectory(TWO, np.array([1.5]), there[None], np.zeros((1, 2))), stage.time)
+    second = stage.controller.start(Trajectory(TWO, np.array([1.5]), there[None], np.zeros((1, 2))), stage.time)
     assert first.outcome is Outcome.PREEMPTED
     stage.run(3.0, until=second)
     assert second.outcome is Outcome.SUCCESSFUL
@@ -176,7 +176,7 @@ def test_cancelling_stops_where_it_is() -> None:
 def test_a_trajectory_may_begin_later_and_must_not_be_over() -> None:
     stage = Stage()
     plan = swing(stage)
-    later = JointTrajectory(TWO, plan.times, plan.positions, plan.velocities, start_time=0.5)
+    later = Trajectory(TWO, plan.times, plan.positions, plan.velocities, start_time=0.5)
     run = stage.controller.start(later, 0.0)
     stage.run(0.5)
     np.testing.assert_allclose(stage.at(), stage.home, atol=1e-4)
@@ -201,10 +201,10 @@ def test_trajectories_that_make_no_sense_are_refused_and_change_nothing() -> Non
         (TWO, np.zeros(0), np.zeros((0, 2)), Outcome.INVALID_GOAL, "rise from 0"),
     ):
         with pytest.raises(TrajectoryError, match=text) as error:
-            stage.controller.start(JointTrajectory(joints, times, positions), 0.0)
+            stage.controller.start(Trajectory(joints, times, positions), 0.0)
         assert error.value.code is code
     with pytest.raises(TrajectoryError, match="path tolerances for 7 joints"):
-        stage.controller.start(JointTrajectory(TWO, one, here[None], path_tolerance=Tolerance.uniform(7)), 0.0)
+        stage.controller.start(Trajectory(TWO, one, here[None], path_tolerance=Tolerance.uniform(7)), 0.0)
     assert not run.is_done
 
 

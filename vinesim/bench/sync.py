@@ -258,7 +258,7 @@ def one_push(delay: float, *, quiet: float = 0.0) -> Rows:
     """The first robot pushes the bunch, the second looks on; then both worlds have ``quiet`` [s] at most to rest."""
     pair = Pair(delay)
     pair.meet()
-    reach = pair.push(pair.first, hold=0.5)
+    reach = pair.push(pair.first, hold_time=0.5)
     recorder = Recorder(pair, Authority(pair))
     until = 0
     for tick in range(2000):
@@ -285,7 +285,7 @@ def both_push(delay: float, *, naive: bool = False, hold: float = 4.0) -> Rows:
     if naive:
         pair.take_back()
     pair.meet()
-    reaches = [pair.push(client, hold=hold) for client in pair.clients]
+    reaches = [pair.push(client, hold_time=hold) for client in pair.clients]
     recorder = Recorder(pair)
     for _ in range(2000):
         recorder.tick()

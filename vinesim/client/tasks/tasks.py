@@ -11,7 +11,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.tasks import pick_planning, swap_planning
 from vinesim.physics.step import Physics
-from vinesim.robot.control.trajectory_controller import JointTrajectory, TrajectoryController
+from vinesim.robot.control.trajectory_controller import Trajectory, TrajectoryController
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
@@ -146,7 +146,7 @@ class RosCommandHandler:
                 self._controllers[command.controller] = TrajectoryController(robot, robot.description.joints)
             controller = self._controllers[command.controller]
             if len(command.times):
-                way = JointTrajectory(command.joints, command.times, command.positions, start_time=command.time)
+                way = Trajectory(command.joints, command.times, command.positions, start_time=command.time)
                 controller.start(way, time)
             else:
                 controller.cancel()

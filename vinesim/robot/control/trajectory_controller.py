@@ -62,7 +62,7 @@ class Tolerance:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class JointTrajectory:
+class Trajectory:
     """Way points of some joints (trajectory_msgs/JointTrajectory)."""
 
     joints: tuple[str, ...]
@@ -103,7 +103,7 @@ class ControllerState:
 class GoalHandle:
     """One trajectory on its way, or what came of it."""
 
-    trajectory: JointTrajectory
+    trajectory: Trajectory
     start_time: float
     """[s] simulation time of its first moment"""
     outcome: Outcome | None = None
@@ -148,7 +148,7 @@ class TrajectoryController:
 
     # ------------------------------------------------------------------ commands
 
-    def start(self, trajectory: JointTrajectory, time: float) -> GoalHandle:
+    def start(self, trajectory: Trajectory, time: float) -> GoalHandle:
         """Follow a trajectory from now, or from its own start, on; what ran before is preempted.
 
         Joints that it does not name stay where they are. Raises :class:`TrajectoryError` and changes nothing if the
@@ -177,7 +177,7 @@ class TrajectoryController:
             self._end(Outcome.CANCELED, "it was cancelled")
             self._hold()
 
-    def _validate(self, trajectory: JointTrajectory, time: float) -> np.ndarray:
+    def _validate(self, trajectory: Trajectory, time: float) -> np.ndarray:
         """Where the trajectory's joints stand among this controller's [joint]."""
         name, t = self.robot.name, trajectory
         strangers = [joint for joint in t.joints if joint not in self.joints]
