@@ -274,7 +274,7 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
     physics = Physics(assemble([tree], **box))
     for _ in range(50):
         physics.step()
-    physics.plants.rest(physics.plants.awake)
+    physics.plants.put_to_sleep(physics.plants.awake)
     for _ in range(20):
         physics.step()
     assert len(physics.plants.awake) == 0
@@ -291,7 +291,7 @@ def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     physics = Physics(model)
     physics.touching = Touching(model, physics.plants, physics.rigid, capacity=2)
     physics.add_robot(gripper(middle))
-    stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+    stages = (physics.rigid.prep, physics.touching.find, physics.plants.predict, physics.touching.solve)
     for tick in range(250):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         for stage in stages:
@@ -526,7 +526,7 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         physics.add_robot(bar(at, damping=200.0))
         physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
         seen = set()
-        stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+        stages = (physics.rigid.prep, physics.touching.find, physics.plants.predict, physics.touching.solve)
         for _ in range(40):
             for stage in stages:
                 stage()
@@ -647,7 +647,7 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
         for i in range(15):
             physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
         physics.plants.wake(np.arange(460))
-        for stage in (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve):
+        for stage in (physics.rigid.prep, physics.touching.find, physics.plants.predict, physics.touching.solve):
             stage()
         t = physics.touching
         return t.count, t.dropped, t.complaint, t._gap[:100].copy(), t.bodies.tobytes() + t.wrenches.tobytes(), t

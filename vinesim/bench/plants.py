@@ -14,7 +14,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
 from vinesim.bench.scenes import interleaved
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import Tree, Wood, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -40,19 +40,19 @@ def vineyard(count: int) -> Model:
     return assemble([cane(0.5 * i) for i in range(count)])
 
 
-def ready(model: Model, awake: int) -> Plants:
+def ready(model: Model, awake: int) -> ArticulationSolver:
     """Plants with their first trees awake and every kernel warm."""
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(awake))
     steps(plants, 5)
     return plants
 
 
-def steps(plants: Plants, count: int) -> None:
+def steps(plants: ArticulationSolver, count: int) -> None:
     """Whole ticks without contacts."""
     for _ in range(count):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
 
 
 def plants() -> Iterator[Measurement]:

@@ -8,11 +8,11 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import Touching
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.plants.detachment import Blade, Partings
-from vinesim.physics.plants.fault_guard import Guard
-from vinesim.physics.plants.level_of_detail import Detail
-from vinesim.physics.plants.sleep import Sleep
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.detachment import Blade, DetachmentMonitor
+from vinesim.physics.plants.fault_guard import FaultGuard
+from vinesim.physics.plants.level_of_detail import LevelOfDetail
+from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.dormant_bunches import Lying
 from vinesim.physics.rigid.hand_grasp import Holding
@@ -35,21 +35,21 @@ class Physics:
     def __init__(
         self, model: Model, *, dt: float = 0.01, device: str = "cpu", threads: int = 1, picking: bool = True
     ) -> None:
-        """``dt`` [s]; ``device``, ``threads``: see :class:`Plants`; ``picking``: bunches part when pulled too hard."""
+        """``dt`` [s]; ``device``, ``threads``: see :class:`ArticulationSolver`; ``picking``: bunches part when pulled too hard."""
         self.model, self.dt = model, dt
         self.state = State.at_rest(model)
-        self.plants = Plants(model, self.state, dt=dt, device=device, threads=threads)
+        self.plants = ArticulationSolver(model, self.state, dt=dt, device=device, threads=threads)
         self.rigid = Rigid(model, dt=dt)
         self.touching = Touching(model, self.plants, self.rigid)
-        self.parting = Partings(self.plants, self.rigid, self.touching)
+        self.parting = DetachmentMonitor(self.plants, self.rigid, self.touching)
         self.holding = Holding(self.plants, self.rigid, self.touching)
         self.riding = Riding(self.rigid)
         self.lying = Lying(self.plants, self.rigid, self.touching, self.riding)
         self._links: tuple[tuple[Link, ...], tuple[Link, ...], tuple[Link, ...]] = ((), (), ())
         self._picking = picking
-        self.detail = Detail(self.plants)
-        self.sleep = Sleep(self.plants)
-        self.guard = Guard(self.plants)
+        self.detail = LevelOfDetail(self.plants)
+        self.sleep = SleepMonitor(self.plants)
+        self.guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
         self.partings: tuple[Parting, ...] = ()
@@ -65,7 +65,7 @@ class Physics:
             ("rigid: predict without plants", self.rigid.prep),
             ("touching: wake what is near", self.touching.find),
             ("detail: berries move where somebody is near", self._refine),
-            ("plants: predict without contacts", self.plants.free),
+            ("plants: predict without contacts", self.plants.predict),
             ("touching: solve the contacts of both", self.touching.solve),
             ("plants: move, pushed by them", self._commit),
             ("rigid: move, pushed by them", self._finish),
@@ -109,7 +109,7 @@ class Physics:
     def refresh(self) -> None:
         """Bring ``state.body_q`` from the start of the last tick to its end."""
         if not self._fresh:
-            self.plants.kinematics()
+            self.plants.forward_kinematics()
             self._fresh = True
 
     def view(self) -> View:
@@ -171,37 +171,37 @@ class Physics:
         return self.rigid.hand(name, side)
 
     def pick(self, bunch: int) -> None:
-        """Take a bunch off its vine, between ticks; see :meth:`Partings.pick`."""
+        """Take a bunch off its vine, between ticks; see :meth:`DetachmentMonitor.pick`."""
         self.parting.pick(bunch)
         self._body_q = None
 
     def cut(self, body: int) -> None:
-        """Cut a piece of wood off its vine, between ticks; see :meth:`Partings.cut`."""
+        """Cut a piece of wood off its vine, between ticks; see :meth:`DetachmentMonitor.cut`."""
         self.parting.cut(body)
         self._body_q = None
 
     def told_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Another client has picked a bunch; see :meth:`Partings.told_pick`."""
-        self.parting.told_pick(bunch, pose, velocity)
+        """Another client has picked a bunch; see :meth:`DetachmentMonitor.apply_remote_pick`."""
+        self.parting.apply_remote_pick(bunch, pose, velocity)
         self._body_q = None
 
     def told_cut(self, body: int) -> None:
-        """Another client has cut a piece of wood off; see :meth:`Partings.told_cut`."""
-        self.parting.told_cut(body)
+        """Another client has cut a piece of wood off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
+        self.parting.apply_remote_cut(body)
         self._body_q = None
 
     def told_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
         """Others say in what shape trees rest ([body of the tree, 4] each): so they do here, and none wakes for it."""
         for tree, turned in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(turned, np.float32))
-        self.plants.rest(np.array(trees, np.int32))
+        self.plants.put_to_sleep(np.array(trees, np.int32))
         self.touching.moved(np.array(trees, np.int32))
         self.stirred = np.union1d(self.stirred, trees).astype(np.int32)
         self._body_q = None
 
     def watch(self, points: np.ndarray, radius: float) -> None:
-        """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`Detail.watch`."""
-        self.detail.watch(points, radius)
+        """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`LevelOfDetail.set_focus`."""
+        self.detail.set_focus(points, radius)
 
     def blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
         """Give a robot's link a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
@@ -224,7 +224,7 @@ class Physics:
         self.detail.update(self.touching.near)
 
     def _commit(self) -> None:
-        self.plants.commit(self.touching.bodies, self.touching.wrenches)
+        self.plants.integrate(self.touching.bodies, self.touching.wrenches)
         if len(self.plants.awake):
             self._body_q, self._fresh = None, False
 
@@ -232,16 +232,16 @@ class Physics:
         self.rigid.finish(self.touching.force)
 
     def _guard(self) -> None:
-        self.guard.check()
+        self.guard.stop_faulty_trees()
 
     def _part(self) -> None:
-        self.partings = self.parting.update(strain=self._picking)
+        self.partings = self.parting.update(check_load=self._picking)
         if self.partings:
             self._body_q = None
 
     def _hold(self) -> None:
         self.holding.end(self.partings)
-        self.parting.held = self.holding.contacts
+        self.parting.hand_contacts = self.holding.contacts
 
     def _sleep(self) -> None:
         held = self.holding.trees
