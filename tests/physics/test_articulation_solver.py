@@ -373,7 +373,9 @@ def test_a_cut_tree_that_coarsens_keeps_all_momentum(at: int) -> None:
     assert after[3] < energy
 
 
-def test_sleepers_refine_in_their_sleep_and_plain_trees_ignore_it(plants: ArticulationSolver, fruit: ArticulationSolver) -> None:
+def test_sleepers_refine_in_their_sleep_and_plain_trees_ignore_it(
+    plants: ArticulationSolver, fruit: ArticulationSolver
+) -> None:
     plants.refine(np.arange(4))
     plants.coarsen(2)
     assert not plants.state.tree_fine.any()

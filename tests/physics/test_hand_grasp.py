@@ -10,7 +10,7 @@ import pytest
 from tests.physics.test_human_body import eva, put
 from tests.support.contact_scenes import bunch_scene, cane, gripper, probe
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import MAX_TIES_PER_BODY, MAX_TIED_BODIES, ArticulationSolver
+from vinesim.physics.plants.articulation_solver import MAX_TIED_BODIES, MAX_TIES_PER_BODY, ArticulationSolver
 from vinesim.physics.rigid.human_body import THICK
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble

@@ -63,7 +63,9 @@ def test_gusts_are_as_strong_and_as_large_as_asked_and_without_divergence() -> N
     power = np.zeros(3)
     for seed in range(40):
         wind = Wind([3.0, 0.0, 0.0], gusts=0.8, scale=2.0, seed=seed)
-        a, b, c = (wind.velocity_at(points[:500] + shift, 0.0) - wind.mean for shift in ([0, 0, 0], [0.2, 0, 0], [20.0, 0, 0]))
+        a, b, c = (
+            wind.velocity_at(points[:500] + shift, 0.0) - wind.mean for shift in ([0, 0, 0], [0.2, 0, 0], [20.0, 0, 0])
+        )
         power += (a * a).mean(0) / 40
         near.append((a * b).sum(1).mean() / 1.92)
         far.append((a * c).sum(1).mean() / 1.92)
@@ -72,7 +74,8 @@ def test_gusts_are_as_strong_and_as_large_as_asked_and_without_divergence() -> N
     assert abs(np.mean(far)) < 0.1
     h = 1e-4
     divergence = sum(
-        (wind.velocity_at(points + h * e, 0.0) - wind.velocity_at(points - h * e, 0.0))[:, i] for i, e in enumerate(np.eye(3))
+        (wind.velocity_at(points + h * e, 0.0) - wind.velocity_at(points - h * e, 0.0))[:, i]
+        for i, e in enumerate(np.eye(3))
     )
     np.testing.assert_allclose(divergence / (2 * h), 0.0, atol=2e-5)
 

@@ -72,7 +72,9 @@ def moving(plants: ArticulationSolver, trees: np.ndarray) -> np.ndarray:
     return np.concatenate([np.arange(f, f + n) for f, n in zip(plants.model.tree_first[trees], size, strict=True)])
 
 
-def momenta(plants: ArticulationSolver, bodies: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def momenta(
+    plants: ArticulationSolver, bodies: np.ndarray, about: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Of bodies, as ``kinematics`` shows them: linear, angular about a point, centre of mass, kinetic energy."""
     pose, speed = plants.state.body_q[bodies].astype(float), plants.state.body_qd[bodies].astype(float)
     mass = plants.body_mass[bodies].astype(float)

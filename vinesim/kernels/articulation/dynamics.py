@@ -215,7 +215,9 @@ def add_tie(
     damper = residual_damping(damping, stiffness, phi, dt)
     grip = phi * dt * (phi * dt * stiffness + damper)
     swing = wp.cross(omega, at)
-    hold = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing, phi, dt) - grip * wp.cross(omega, swing)
+    hold = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing, phi, dt) - grip * wp.cross(
+        omega, swing
+    )
     J_out[k] = J_out[k] + point_mass_inertia(grip, at)
     H_out[k] = H_out[k] + grip * wp.skew(at)
     M_out[k] = M_out[k] + grip * wp.identity(n=3, dtype=float)
@@ -744,7 +746,9 @@ def integrate(
     first = tree_first[tree]
     size = tree_moving[tree]
     turning = max_joint_rate(joint_qd_free, first, size, pitch)
-    most = wp.length(wp.vec2(turning, max_root_speed(joint_x, joint_xd_free, body_parent, body_root, first, size, pitch)))
+    most = wp.length(
+        wp.vec2(turning, max_root_speed(joint_x, joint_xd_free, body_parent, body_root, first, size, pitch))
+    )
     tree_rate_out[tree] = most
     onset = wp.max(tree_onset_out[tree] - 1, 0)
     phi = tree_phi[tree]

@@ -562,7 +562,9 @@ class ContactSolver:
              *doubles("dof_free", "dof_held", "dof_held_before"), com],
             [*moving, speed, *g_box],
         )  # fmt: skip
-        self._bound_actors = bind_launch(kernels.bound_actors, [MIN_WAKING_SPEED, a_first, a_lies, speed, *g_box], a_box)
+        self._bound_actors = bind_launch(
+            kernels.bound_actors, [MIN_WAKING_SPEED, a_first, a_lies, speed, *g_box], a_box
+        )
         self._bound_trees = bind_launch(
             kernels.bound_trees,
             [dt, s_tree, s_body, s_bunch, s_when, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius,
@@ -602,7 +604,9 @@ class ContactSolver:
         flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_other"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
         axes, sparse = shared(self._axes, wp.mat33d), [shared(x, wp.int32) for x in mj["sparse"]]
-        self._gathering = bind_launch(kernels.gather, [MAX_CONTACTS_PER_TREE, *ints("found"), onset], ints("hits", "tally"))
+        self._gathering = bind_launch(
+            kernels.gather, [MAX_CONTACTS_PER_TREE, *ints("found"), onset], ints("hits", "tally")
+        )
         self._indexing = bind_launch(
             kernels.index,
             [s_body, m_tree, g_dof, sparse[0], *ints("hits"), *flat[:2], *ints("group")],
@@ -626,7 +630,9 @@ class ContactSolver:
              *(shared(x, wp.float64) for x in mj["factors"])],
             answers,
         )  # fmt: skip
-        self._assembling = bind_launch(kernels.assemble, [g_dof, d_parent, *blocks, *pairs, *rows, *answers], doubles("A"))
+        self._assembling = bind_launch(
+            kernels.assemble, [g_dof, d_parent, *blocks, *pairs, *rows, *answers], doubles("A")
+        )
         self._adding = bind_launch(
             kernels.add_up, [dt, *ints("tally"), *pairs, rows[0], *doubles("impulse")], doubles("wrench")
         )

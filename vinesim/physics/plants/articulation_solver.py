@@ -562,7 +562,11 @@ class ArticulationSolver:
     def remove_tie(self, body: int, tie: int) -> None:
         """Undo a tie of :meth:`add_tie`."""
         self.tie_stiffness[tie] = self.tie_damping[tie] = 0.0
-        start = len(self.model.tie_body) + (self._max_model_ties + MAX_TIES_PER_BODY) * self._tied_bodies[body] + self._max_model_ties
+        start = (
+            len(self.model.tie_body)
+            + (self._max_model_ties + MAX_TIES_PER_BODY) * self._tied_bodies[body]
+            + self._max_model_ties
+        )
         if not self.tie_stiffness[start : start + MAX_TIES_PER_BODY].any():
             del self._tied_bodies[body]
             self._ties[body] = self._model_ties[body]

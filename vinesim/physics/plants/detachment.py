@@ -92,7 +92,9 @@ class DetachmentMonitor:
         self._overloaded_steps[bunches] = np.where(strained, self._overloaded_steps[bunches] + 1, 0)
         for i in np.flatnonzero(self._overloaded_steps[bunches] >= PATIENCE):
             bunch = int(bunches[i])
-            self._pick(bunch, "pull" if pulled[i] >= bent[i] else "bend", self._hardest_pressing_actor(bunch), carried[i])
+            self._pick(
+                bunch, "pull" if pulled[i] >= bent[i] else "bend", self._hardest_pressing_actor(bunch), carried[i]
+            )
 
     def _attached_bunches(self) -> np.ndarray:
         """The bunches on awake trees that have not been picked [k]."""

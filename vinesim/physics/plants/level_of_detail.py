@@ -22,7 +22,9 @@ PATIENCE = 25
 class LevelOfDetail:
     """Refines the trees that somebody is near or watches, and coarsens them when that is over."""
 
-    def __init__(self, plants: ArticulationSolver, *, linger: int = LINGER, quiet: float = QUIET, patience: int = PATIENCE) -> None:
+    def __init__(
+        self, plants: ArticulationSolver, *, linger: int = LINGER, quiet: float = QUIET, patience: int = PATIENCE
+    ) -> None:
         self.plants, self.linger, self.quiet, self.patience = plants, linger, quiet, patience
         model = plants.model
         trees = len(model.tree_first)

@@ -21,7 +21,12 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.articulation import dynamics
-from vinesim.physics.plants.articulation_solver import FAULT_JOINT_RATE, FAST_JOINT_RATE, MAX_JOINT_RATE, ArticulationSolver
+from vinesim.physics.plants.articulation_solver import (
+    FAST_JOINT_RATE,
+    FAULT_JOINT_RATE,
+    MAX_JOINT_RATE,
+    ArticulationSolver,
+)
 from vinesim.physics.plants.device_buffers import DeviceBuffers, find_device
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
@@ -108,9 +113,17 @@ class Rollout:
                 f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, dt above 0, "
                 "phi from 0.5 to 1"
             )
-        self.model, self.ticks, self.dt, self.fault_rate, self.device = model, ticks, dt, fault_rate, find_device(device)
+        self.model, self.ticks, self.dt, self.fault_rate, self.device = (
+            model,
+            ticks,
+            dt,
+            fault_rate,
+            find_device(device),
+        )
         self.state = State.at_rest(model)
-        plants = ArticulationSolver(model, self.state, buffers=DeviceBuffers("cpu"))  # what the kernels are given there they are given here
+        plants = ArticulationSolver(
+            model, self.state, buffers=DeviceBuffers("cpu")
+        )  # what the kernels are given there they are given here
         if fine:
             plants.refine(np.arange(len(model.tree_first)))
         self._host = plants.buffers.host

@@ -63,7 +63,9 @@ class Wind:
             return np.broadcast_to(self.mean, points.shape)
         return self.mean + np.cos((points - self.mean * time) @ self._wave.T + self._phase) @ self._sway
 
-    def update(self, plants: ArticulationSolver, time: float, observers: tuple[np.ndarray, float] | None = None) -> None:
+    def update(
+        self, plants: ArticulationSolver, time: float, observers: tuple[np.ndarray, float] | None = None
+    ) -> None:
         """Set ``plants.tree_air`` of awake trees for the next tick; wake sleepers that the wind would move.
 
         Wind blows everywhere and gusts let nothing rest, but ten thousand awake trees fit in no tick. ``reach`` =
