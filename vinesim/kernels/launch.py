@@ -1,7 +1,7 @@
 """A kernel bound to its arrays once, launched many times a second; and a crew of threads that share one launch.
 
 Warp packs a kernel's arguments anew at every CPU launch, recorded or not: 10 us for twenty arguments, more than most of
-our kernels run. :func:`bind` packs them once and then only calls the compiled function: 1 us. That call gives the
+our kernels run. :func:`bind_launch` packs them once and then only calls the compiled function: 1 us. That call gives the
 interpreter lock away, so Python threads can run a kernel side by side on parts of its list: see :class:`ThreadPool`.
 """
 

@@ -554,7 +554,7 @@ class ContactSolver:
         moving, speed = vectors("geom_middle", "geom_velocity", "geom_spin"), doubles("geom_speed")[0]
         dt, k, c = self.dt, self.stiffness, self.damping
         softness = 1.0 / (dt * (k * dt + c))
-        dealt = {"over": "every", "shares": self.plants.threads}
+        dealt = {"index_list": "every", "partitions": self.plants.threads}
 
         self._bound_geoms = bind_launch(
             kernels.bound_geoms,

@@ -767,7 +767,7 @@ class ArticulationSolver:
         where = ("joint_x", "joint_xd", "joint_q", "joint_qd")
         factors = ("axes", "lever", "D", "DJ", "DH", "lift")
         freed = ("joint_xd_free", "joint_qd_free")
-        dealt = {"over": "trees", "shares": self.threads}
+        dealt = {"index_list": "trees", "partitions": self.threads}
 
         def free(brisk: float, tension: float, trees: str, phi: str, acceleration: str, velocity: str) -> Callable:
             return record(
