@@ -27,13 +27,17 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
         centre = start_poses.bunch_centres(model)[task.bunch]
         local = frames.compose(frames.inverse(task.base_pose), frames.pose(centre))[:3]
         assert local[0] == pytest.approx(pick_planning.BUNCH_AHEAD, abs=0.02)
-        assert local[1] == pytest.approx(pick_planning.BUNCH_ASIDE if task.side == "left" else -pick_planning.BUNCH_ASIDE, abs=0.02)
+        assert local[1] == pytest.approx(
+            pick_planning.BUNCH_ASIDE if task.side == "left" else -pick_planning.BUNCH_ASIDE, abs=0.02
+        )
         assert model.bunch_radius[task.bunch] <= pick_planning.MAX_BUNCH_RADIUS
         # the way keeps away from what stands, and ends with the box beside the base, on the arm's side
         points = np.concatenate([task.base_pose[None, :2], task.path])
         for a, b in itertools.pairwise(points[:-1]):
             line = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
-            assert start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - pick_planning.GRID_SIZE
+            assert (
+                start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - pick_planning.GRID_SIZE
+            )
         end = frames.pose(np.append(points[-1], 0.0), frames.yaw(task.final_heading))
         box = frames.compose(frames.inverse(end), model.box_pose[task.box].astype(float))[:3]
         gap = abs(box[1]) - 0.5 * float(model.box_size[task.box, 1]) - pick_planning.BASE_HALF_WIDTH

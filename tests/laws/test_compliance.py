@@ -216,7 +216,9 @@ def test_a_whole_arm_gives_way_by_f_over_k(vinebot: RobotDescription) -> None:
 
 
 @pytest.mark.parametrize(("joint", "stiffness", "zeta"), [(0, 80.0, 0.08), (3, 30.0, 0.15), (5, 40.0, 0.25)])
-def test_a_joint_of_an_arm_swings_as_asked(vinebot: RobotDescription, joint: int, stiffness: float, zeta: float) -> None:
+def test_a_joint_of_an_arm_swings_as_asked(
+    vinebot: RobotDescription, joint: int, stiffness: float, zeta: float
+) -> None:
     """The robot's own hinge friction (URDF) adds to the damping asked for; inertia from the URDF and the rotor."""
     stand, name = Stand(vinebot), ARM[joint]
     inertia = inertia_about(vinebot, name) + next(d.armature for d in vinebot.drives if d.joint == name)

@@ -10,7 +10,7 @@ import pytest
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.description.description import RobotDescription, load_description
-from vinesim.robot.drives import RobotInstance, RemoteRobot, Robot
+from vinesim.robot.drives import RemoteRobot, Robot, RobotInstance
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
 

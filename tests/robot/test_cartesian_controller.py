@@ -15,7 +15,9 @@ from vinesim.scene.builder import assemble
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def led(hand: CartesianController, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, seconds: float = 6.0) -> np.ndarray:
+def led(
+    hand: CartesianController, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, seconds: float = 6.0
+) -> np.ndarray:
     """Lead a hand for a while; the places [tick, 3] m that its point went through."""
     robot, points = hand.robot, []
     for tick in range(round(seconds / 0.01)):

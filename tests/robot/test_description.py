@@ -13,7 +13,7 @@ import trimesh
 import yourdfpy
 
 from vinesim import frames
-from vinesim.robot.description.description import RobotDescription, DescriptionError, load_description
+from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
 from vinesim.scene import data_files
 
 

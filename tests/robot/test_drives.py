@@ -466,7 +466,9 @@ def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
 
 
 @pytest.mark.parametrize(("ahead", "turning"), [(0.0, 0.0), (0.08, 0.0), (0.05, 0.2)])
-def test_odometry_believes_in_what_the_tracks_travelled(vinebot: RobotDescription, ahead: float, turning: float) -> None:
+def test_odometry_believes_in_what_the_tracks_travelled(
+    vinebot: RobotDescription, ahead: float, turning: float
+) -> None:
     """Straight on, then a turn on the spot: travel = way / (1 - slip)."""
     limits = msgspec.structs.replace(vinebot.base_limits, slip=(ahead, turning))
     start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))

@@ -9,7 +9,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import RobotDescription, DescriptionError, load_description
+from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble

@@ -10,7 +10,7 @@ import pytest
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
-from vinesim.robot.tasks.task import TaskFailed, Task
+from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.builder import assemble
 
 

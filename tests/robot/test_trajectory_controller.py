@@ -7,8 +7,8 @@ import pytest
 
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.control.trajectory_controller import (
-    Outcome,
     GoalHandle,
+    Outcome,
     Tolerance,
     Trajectory,
     TrajectoryController,
@@ -139,7 +139,10 @@ def test_without_a_limit_of_time_it_waits_until_the_goal_is_met() -> None:
 def test_a_tolerance_of_the_trajectory_goes_before_the_controllers() -> None:
     stage = Stage(path_tolerance=Tolerance.uniform(7, position=1e-9))
     loose = swing(stage)
-    for tolerance, outcome in ((None, Outcome.PATH_TOLERANCE_VIOLATED), (Tolerance.uniform(2, 0.05), Outcome.SUCCESSFUL)):
+    for tolerance, outcome in (
+        (None, Outcome.PATH_TOLERANCE_VIOLATED),
+        (Tolerance.uniform(2, 0.05), Outcome.SUCCESSFUL),
+    ):
         plan = Trajectory(TWO, loose.times, loose.positions, loose.velocities, path_tolerance=tolerance)
         run = stage.controller.start(plan, stage.time)
         stage.run(4.0, until=run)

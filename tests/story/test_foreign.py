@@ -6,7 +6,7 @@ import pytest
 from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription, DescriptionError, load_description
+from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
 from vinesim.robot.drives import Robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.builder import assemble

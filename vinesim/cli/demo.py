@@ -297,7 +297,10 @@ def choose_poses(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[
     from vinesim.client.tasks import start_poses
 
     try:
-        return start_poses.find_reachable_bunch(model, start_poses.spawn_pose(plan, 0)), (["--spawn", "0"], ["--spawn", "1"])
+        return start_poses.find_reachable_bunch(model, start_poses.spawn_pose(plan, 0)), (
+            ["--spawn", "0"],
+            ["--spawn", "1"],
+        )
     except start_poses.PlacementError:
         bunch, pusher = start_poses.find_push_pose(model, start_poses.spawn_pose(plan, 0)[:2])
     poses = (pusher, start_poses.find_approach_pose(model, pusher, APPROACH_DISTANCE))

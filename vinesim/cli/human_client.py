@@ -30,7 +30,7 @@ def run(
     from vinesim.client.rate_loop import RateLoop
     from vinesim.client.recording.trace import Trace
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import bunch_centres, validate_bunch, with_start_pose, start_pose
+    from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch, with_start_pose
     from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate

@@ -63,8 +63,8 @@ def run(
     from vinesim.client.recording.trace import Trace
     from vinesim.client.sensing.sensor_process import SensorProcess
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import validate_bunch, with_start_pose, start_pose
-    from vinesim.client.tasks.tasks import DriveTo, LookAt, validate_task_name, plan_task
+    from vinesim.client.tasks.start_poses import start_pose, validate_bunch, with_start_pose
+    from vinesim.client.tasks.tasks import DriveTo, LookAt, plan_task, validate_task_name
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.robot.description.description import load_description as load_robot
     from vinesim.robot.tasks.push import PushBunch

@@ -152,9 +152,13 @@ class Robot(RobotInstance):
         self._is_compliant = np.zeros(len(drives), bool)
         """[joint] whose gains were asked for, so that they must be right to the letter"""
         self._effort_limit = self.max_effort.copy()
-        self.series_stiffness = np.array([drive.series_stiffness or drive.stiffness or drive.effort / 0.05 for drive in drives])
+        self.series_stiffness = np.array(
+            [drive.series_stiffness or drive.stiffness or drive.effort / 0.05 for drive in drives]
+        )
         """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
-        self._series_damping = np.array([drive.series_damping if drive.series_stiffness else drive.damping for drive in drives])
+        self._series_damping = np.array(
+            [drive.series_damping if drive.series_stiffness else drive.damping for drive in drives]
+        )
         self._joint_index = {drive.joint: i for i, drive in enumerate(drives)}
         self._finger_groups: dict[str, np.ndarray] = {}
         """Fingers that close together: a hand that drifted with what it holds would be two hands."""
@@ -162,7 +166,9 @@ class Robot(RobotInstance):
         self._physics: Physics | None = None
         for mount in (*description.wrenches, *description.imus):
             rigid.instrument(self.name, mount.frame)
-        self._links_beyond_sensor = {mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches}
+        self._links_beyond_sensor = {
+            mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches
+        }
         self.stop()
 
     def fit_cutters(self, physics: Physics) -> None:
@@ -254,7 +260,9 @@ class Robot(RobotInstance):
             raise CommandError(f"{self.name}: gripper effort {effort}; give more than 0, or none for all there is")
         self.command_position(np.full(len(fingers), opening / len(fingers)), fingers)
         self._finger_groups[group] = fingers
-        self._effort_limit[fingers] = self.max_effort[fingers] if effort is None else np.minimum(effort, self.max_effort[fingers])
+        self._effort_limit[fingers] = (
+            self.max_effort[fingers] if effort is None else np.minimum(effort, self.max_effort[fingers])
+        )
         self._gains_changed = True
 
     def command_cutter(self, group: str) -> None:
@@ -351,12 +359,17 @@ class Robot(RobotInstance):
 
     def _prepare_interfaces(self) -> None:
         """Prepare what changes only with the interfaces, gains and limits."""
-        self._in_effort, self._in_motor_position = self.interface == CommandInterface.EFFORT, self.interface == CommandInterface.MOTOR_POSITION
+        self._in_effort, self._in_motor_position = (
+            self.interface == CommandInterface.EFFORT,
+            self.interface == CommandInterface.MOTOR_POSITION,
+        )
         self._velocity_joints = np.flatnonzero(self.interface == CommandInterface.VELOCITY)
         self._gains_vary = bool(self._in_effort.any() or self._in_motor_position.any())
         """Whether gains follow the state, so that they must be set in every tick."""
         self._active_stiffness = np.where(self._in_motor_position, self.series_stiffness, self._stiffness)
-        self._max_tracking_error = self._effort_limit / np.maximum(self._active_stiffness, 1e-9) + self.max_velocity * self.rigid.dt
+        self._max_tracking_error = (
+            self._effort_limit / np.maximum(self._active_stiffness, 1e-9) + self.max_velocity * self.rigid.dt
+        )
         self._max_impulse = ACCELERATION_EFFORT_SHARE * self.rigid.dt * self._effort_limit
 
     def _advance_setpoints(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -392,7 +405,9 @@ class Robot(RobotInstance):
         towards = np.copysign(1.0, velocity)
         brake, along = 10.0 * self.max_effort / self.max_velocity, towards * self._command
         ahead = towards * (2.0 * velocity - self._velocity)
-        near = (along > brake * (self.max_velocity - ahead)) | (self._is_speed_limited & (np.abs(velocity) > 0.5 * self.max_velocity))
+        near = (along > brake * (self.max_velocity - ahead)) | (
+            self._is_speed_limited & (np.abs(velocity) > 0.5 * self.max_velocity)
+        )
         self._is_speed_limited = near & (along >= 0.0) & self._in_effort
         spare = self.max_velocity - np.abs(velocity)
         most = 0.8 * np.where(spare > 0.0, along, self.max_effort)

@@ -12,7 +12,7 @@ from vinesim.client.humans import RemotePerson, spec_of
 from vinesim.net.codec.messages import Hello, valid_name
 from vinesim.physics.rigid.rigid_world import Draft, Rigid
 from vinesim.robot.description import description as descriptions
-from vinesim.robot.description.description import RobotDescription, DescriptionError
+from vinesim.robot.description.description import DescriptionError, RobotDescription
 from vinesim.robot.drives import RemoteRobot
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 

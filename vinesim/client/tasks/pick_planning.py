@@ -51,7 +51,9 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
     """Tasks that look feasible, the best first: bunches that hang freest, a little better if ``near`` [2] m."""
     beside_boxes = list(box_approaches(model))
     if not beside_boxes:
-        raise PlacementError(f"no box of this scene has {BASE_CLEARANCE} m of room beside it for a robot; place one in an alley")
+        raise PlacementError(
+            f"no box of this scene has {BASE_CLEARANCE} m of room beside it for a robot; place one in an alley"
+        )
     found = False
     for bunch, side, stand in _base_poses(model, near):
         beside = [park for park in beside_boxes if park.side == side]
@@ -62,7 +64,9 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
                 yield PickPlan(bunch, side, stand, park.box, np.concatenate([points[1:], [park.place]]), park.heading)
                 break
     if not found:
-        raise PlacementError("no bunch hangs free enough for a hand with a way for a robot to a box; choose another seed")
+        raise PlacementError(
+            "no bunch hangs free enough for a hand with a way for a robot to a box; choose another seed"
+        )
 
 
 def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarray]]:
@@ -71,7 +75,12 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
     body_q = model.forward(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     hold = body_q[:, :3] + GRASP_DEPTH * axis
-    fits = (hold[:, 2] > GRASP_HEIGHT[0]) & (hold[:, 2] < GRASP_HEIGHT[1]) & (model.bunch_radius <= MAX_BUNCH_RADIUS) & (axis[:, 2] < -0.95)
+    fits = (
+        (hold[:, 2] > GRASP_HEIGHT[0])
+        & (hold[:, 2] < GRASP_HEIGHT[1])
+        & (model.bunch_radius <= MAX_BUNCH_RADIUS)
+        & (axis[:, 2] < -0.95)
+    )
     bunches = np.flatnonzero(fits)
     away = np.linalg.norm(hold[bunches, :2] - near, axis=1)
     bunches = np.sort(bunches[np.argsort(away, kind="stable")][:MAX_CANDIDATES])
@@ -81,7 +90,9 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
     points, radius, owner = points[region], radius[region], owner[region]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     turn = frames.yaw(heading)
-    sides = np.stack([frames.rotate(turn, np.array([BUNCH_AHEAD, y, 0.0]))[:, :2] for y in (BUNCH_ASIDE, -BUNCH_ASIDE)], 1)
+    sides = np.stack(
+        [frames.rotate(turn, np.array([BUNCH_AHEAD, y, 0.0]))[:, :2] for y in (BUNCH_ASIDE, -BUNCH_ASIDE)], 1
+    )
     base = hold[bunches, None, None, :2] - sides  # [bunch, heading, side, 2]
     roomy = (ground_clearance(model, base.reshape(-1, 2)) > BASE_CLEARANCE).reshape(base.shape[:3])
     found = []
@@ -92,7 +103,9 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
         local = frames.rotate(frames.conjugate(turn[looking])[:, None], points[here] - hold[bunch])
         beyond = np.maximum(low - local, local - HAND_UPPER)
         apart = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(-1), 0.0)
-        for j, clear in zip(looking.tolist(), (apart - radius[here]).min(-1, initial=FULL_CLEARANCE).tolist(), strict=True):
+        for j, clear in zip(
+            looking.tolist(), (apart - radius[here]).min(-1, initial=FULL_CLEARANCE).tolist(), strict=True
+        ):
             for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= MIN_HAND_CLEARANCE else ():
                 score = clear - 0.01 * float(np.linalg.norm(base[i, j, k] - near))
                 pose = frames.pose(np.append(base[i, j, k], 0.0), turn[j])
@@ -193,7 +206,9 @@ def find_path(model: Model, start: np.ndarray, goal: np.ndarray, room: float = B
     points = [start, *(low + GRID_SIZE * np.array(cell) for cell in cells[-2:0:-1]), goal]
     kept, i = [points[0]], 0
     while i < len(points) - 1:
-        i = next(j for j in range(len(points) - 1, i, -1) if j == i + 1 or _is_line_free(model, points[i], points[j], room))
+        i = next(
+            j for j in range(len(points) - 1, i, -1) if j == i + 1 or _is_line_free(model, points[i], points[j], room)
+        )
         kept.append(points[i])
     return np.array(kept)
 

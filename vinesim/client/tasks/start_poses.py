@@ -65,7 +65,12 @@ def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
     local = frames.rotate(frames.conjugate(pose[3:]), bunch_centres(model) - pose[:3])
     distance = np.hypot(local[:, 0], local[:, 1])
     sideways = np.abs(np.arctan2(local[:, 1], local[:, 0]))
-    fits = (distance > PUSH_REACH[0]) & (distance < PUSH_REACH[1]) & (local[:, 2] > PUSH_HEIGHT[0]) & (local[:, 2] < PUSH_HEIGHT[1])
+    fits = (
+        (distance > PUSH_REACH[0])
+        & (distance < PUSH_REACH[1])
+        & (local[:, 2] > PUSH_HEIGHT[0])
+        & (local[:, 2] < PUSH_HEIGHT[1])
+    )
     fits &= sideways < 0.7
     if not fits.any():
         x, y = pose[:2]
@@ -130,7 +135,9 @@ def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.nda
         for angle in heading:
             back = np.array([np.cos(angle), np.sin(angle)])
             way = goal - np.linspace(0.0, length, 40)[:, None] * back
-            room = min(float(ground_clearance(model, way).min()), float(np.linalg.norm(way - place[:2], axis=1).min()) - 0.6)
+            room = min(
+                float(ground_clearance(model, way).min()), float(np.linalg.norm(way - place[:2], axis=1).min()) - 0.6
+            )
             if room > most:
                 best, most = frames.pose(np.append(goal, 0.0), frames.yaw(angle)), room
     return best

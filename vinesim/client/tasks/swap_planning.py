@@ -30,7 +30,9 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
         ways = [find_path(model, here, place, TURNING_RADIUS) for place in _turning_places(model, box)]
         ways = [points for points in ways if points is not None]
         if not ways:
-            raise PlacementError(f"no way for a carrier to turn before box {box}: it needs {TURNING_RADIUS} m around it; move the box")
+            raise PlacementError(
+                f"no way for a carrier to turn before box {box}: it needs {TURNING_RADIUS} m around it; move the box"
+            )
         shortest = min(ways, key=lambda points: float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
         legs.append(shortest[1:])
         here = shortest[-1]
@@ -46,7 +48,10 @@ def _turning_places(model: Model, box: int) -> list[np.ndarray]:
         for far in TURNING_DISTANCES:
             place = pose[:2] + far * side * normal
             lane = pose[:2] + np.linspace(0.1, far, 12)[:, None] * side * normal
-            if ground_clearance(model, place[None])[0] > TURNING_RADIUS and ground_clearance(model, lane, without=box).min() > LANE_HALF_WIDTH:
+            if (
+                ground_clearance(model, place[None])[0] > TURNING_RADIUS
+                and ground_clearance(model, lane, without=box).min() > LANE_HALF_WIDTH
+            ):
                 places.append(place)
                 break
     return places

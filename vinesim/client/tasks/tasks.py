@@ -93,7 +93,9 @@ class LookAt:
         """``point`` gives the place to look at [3] m in the world. Does nothing without a head and a camera on it."""
         description = robot.description
         self.robot, self.point = robot, point
-        self._joints = description.joint_indices("head") if "head" in description.groups and description.cameras else None
+        self._joints = (
+            description.joint_indices("head") if "head" in description.groups and description.cameras else None
+        )
         self._camera = description.cameras[0].frame if description.cameras else ""
         self._tick = 0
 

@@ -23,7 +23,14 @@ class AdmittanceController:
     """The hand is a mass in honey: mass dv/dt + damping v = force; it keeps its attitude."""
 
     def __init__(
-        self, robot: Robot, group: str, sensor: str, *, mass: float = 6.0, damping: float = 60.0, force_deadband: float = 0.5
+        self,
+        robot: Robot,
+        group: str,
+        sensor: str,
+        *,
+        mass: float = 6.0,
+        damping: float = 60.0,
+        force_deadband: float = 0.5,
     ) -> None:
         """``mass`` [kg] and ``damping`` [N s/m] that a hand feels; forces below ``ignored`` [N] count as none.
 

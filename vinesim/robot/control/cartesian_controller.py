@@ -88,7 +88,13 @@ class CartesianController:
         return float(np.linalg.norm(goal - self.tip_position))
 
     def move_towards(
-        self, goal: np.ndarray, x_axis: np.ndarray, z_axis: np.ndarray | None = None, *, speed: float, shoulder_height: float
+        self,
+        goal: np.ndarray,
+        x_axis: np.ndarray,
+        z_axis: np.ndarray | None = None,
+        *,
+        speed: float,
+        shoulder_height: float,
     ) -> None:
         """Command the arm for one tick: the point towards ``goal`` [3] m at most at ``speed`` [m/s].
 
@@ -105,13 +111,20 @@ class CartesianController:
             turning = axes[1:] @ jacobian[3:], _clip_norm(POSITION_GAIN * _pointing_error(axes @ x_axis), MAX_TOOL_RATE)
         else:
             wanted = np.array([x_axis, frames.cross(z_axis, x_axis), z_axis])
-            turning = jacobian[3:], _clip_norm(POSITION_GAIN * frames.log(frames.from_matrix(wanted.T @ axes)), MAX_TOOL_RATE)
+            turning = (
+                jacobian[3:],
+                _clip_norm(POSITION_GAIN * frames.log(frames.from_matrix(wanted.T @ axes)), MAX_TOOL_RATE),
+            )
 
         now, home = robot.setpoint[self._joints], self._home.copy()
         if self._lifts:
             raised = shoulder_height - SHOULDER_DROP - self.shoulder_position[2]
             home[: self._lifts] = now[: self._lifts] + raised / self._lifts
-        lower, upper, fastest = robot.lower_limit[self._joints], robot.upper_limit[self._joints], robot.max_velocity[self._joints]
+        lower, upper, fastest = (
+            robot.lower_limit[self._joints],
+            robot.upper_limit[self._joints],
+            robot.max_velocity[self._joints],
+        )
         rates = solve_prioritized_ik(
             [(jacobian[:3], move), turning],
             np.clip(POSTURE_GAIN * (np.clip(home, lower, upper) - now), -0.8 * fastest, 0.8 * fastest),
@@ -215,7 +228,9 @@ def _solve_task_stack(
 def _damped_inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pseudo-inverse [joint, k] with small singular values damped, and the projector [joint, joint] on what it uses."""
     u, s, vt = np.linalg.svd(matrix, full_matrices=False)
-    damping = np.where(s < MIN_SINGULAR_VALUE, (1.0 - (s / MIN_SINGULAR_VALUE) ** 2) * (0.5 * MIN_SINGULAR_VALUE) ** 2, 0.0)
+    damping = np.where(
+        s < MIN_SINGULAR_VALUE, (1.0 - (s / MIN_SINGULAR_VALUE) ** 2) * (0.5 * MIN_SINGULAR_VALUE) ** 2, 0.0
+    )
     inverse = (vt.T * (s / np.maximum(s * s + damping, 1e-12))) @ u.T
     used = vt[s > 1e-3 * MIN_SINGULAR_VALUE]
     return inverse, used.T @ used

@@ -158,7 +158,11 @@ class TrajectoryController:
         began = max(trajectory.start_time, time) if trajectory.start_time > 0.0 else time
         self._end(Outcome.PREEMPTED, "a newer trajectory took over")
         active = self.indices[order]
-        self._knot_times, self._knot_positions, self._knot_velocities = trajectory.times, trajectory.positions, trajectory.velocities
+        self._knot_times, self._knot_positions, self._knot_velocities = (
+            trajectory.times,
+            trajectory.positions,
+            trajectory.velocities,
+        )
         if trajectory.times[0] > 0.0:  # from where they are, or should be
             by_servo = np.isin(self.robot.interface[active], (CommandInterface.POSITION, CommandInterface.VELOCITY))
             here = np.where(by_servo, self.robot.setpoint[active], self.robot.rigid.read(self.robot.name)[0][active])
@@ -233,7 +237,11 @@ class TrajectoryController:
         else:
             tolerance = run.trajectory.goal_tolerance or _reordered(self.goal_tolerance, self._order)
             off = tolerance.violated(error, slip)
-            late = self.goal_time_tolerance if run.trajectory.goal_time_tolerance is None else run.trajectory.goal_time_tolerance
+            late = (
+                self.goal_time_tolerance
+                if run.trajectory.goal_time_tolerance is None
+                else run.trajectory.goal_time_tolerance
+            )
             if not len(off):
                 self._end(Outcome.SUCCESSFUL, "")
                 self.active_goal = None

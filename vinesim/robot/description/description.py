@@ -189,7 +189,9 @@ class RobotDescription:
 
     def link_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
         """Pose [7] of every link in the root for drive positions; walks the tree, so not for the tick."""
-        parents = dict(zip([child for _, child in self.moving_joints.frames], range(len(self.moving_joints.frames)), strict=True))
+        parents = dict(
+            zip([child for _, child in self.moving_joints.frames], range(len(self.moving_joints.frames)), strict=True)
+        )
         local = self.moving_joints.poses(np.asarray(position, float))
         found = {self.base: frames.pose([0.0, 0.0, 0.0])}
 

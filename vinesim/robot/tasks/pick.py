@@ -25,7 +25,7 @@ from vinesim.physics.step import Physics
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.task import TaskFailed, Task
+from vinesim.robot.tasks.task import Task, TaskFailed
 
 STALK_LENGTH = 0.012
 """So much of the stalk stays on the bunch [m]."""
@@ -143,13 +143,17 @@ class PickBunch(Task):
         ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
         self.arm.reset()
         self._open_gripper(2.0 * (self._radius + OPENING_MARGIN))
-        yield from self._move_hand("reach", lambda: self._grasp_point() - APPROACH_DISTANCE * ahead, ahead, patience=12.0)
+        yield from self._move_hand(
+            "reach", lambda: self._grasp_point() - APPROACH_DISTANCE * ahead, ahead, patience=12.0
+        )
         yield from self._move_hand("advance", self._grasp_point, ahead, speed=0.10, patience=8.0, near=0.003)
         yield from self._close_gripper(ahead)
         yield from self._cut()
         back = self.arm.tip_position - APPROACH_DISTANCE * ahead + [0.0, 0.0, -0.03]
         yield from self._move_hand("back", lambda: back, ahead, speed=0.15, patience=6.0)
-        yield from self._move_hand("tuck", lambda: self._base_to_world(CARRY_POSITION), ahead, speed=CARRY_SPEED, patience=10.0, near=0.03)
+        yield from self._move_hand(
+            "tuck", lambda: self._base_to_world(CARRY_POSITION), ahead, speed=CARRY_SPEED, patience=10.0, near=0.03
+        )
         yield from self._drive()
         yield from self._place_in_box()
         yield from self.wait(1.0, "rest")

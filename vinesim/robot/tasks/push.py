@@ -74,7 +74,9 @@ class PushBunch:
         """
         self.robot = robot
         self.target = target
-        self.arm = CartesianController(robot, side, tip_offset=FINGER_LENGTH, acceleration=acceleration, use_lift=use_lift)
+        self.arm = CartesianController(
+            robot, side, tip_offset=FINGER_LENGTH, acceleration=acceleration, use_lift=use_lift
+        )
         self.tool = self.arm.tool
         self.radius, self.depth, self.clearance, self.hold_time = radius, depth, clearance, hold_time
         self.speed, self.touch_speed = speed, touch_speed

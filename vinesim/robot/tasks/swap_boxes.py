@@ -24,7 +24,7 @@ from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.task import TaskFailed, Task
+from vinesim.robot.tasks.task import Task, TaskFailed
 
 LIFT_HEIGHT = 0.15
 """A box is carried so high above the ground [m]."""
@@ -84,11 +84,17 @@ class SwapBoxes(Task):
     def run(self) -> Iterator[str]:
         """See :class:`Task`."""
         swap = self.plan
-        yield from self._follow_path("to the empty box", swap.path_to_empty, self._away_from(swap.empty_box, swap.path_to_empty[-1]))
+        yield from self._follow_path(
+            "to the empty box", swap.path_to_empty, self._away_from(swap.empty_box, swap.path_to_empty[-1])
+        )
         yield from self._take("rear", swap.empty_box)
-        yield from self._follow_path("to the full box", swap.path_to_full, self._away_from(swap.full_box, swap.path_to_full[-1]) + math.pi)
+        yield from self._follow_path(
+            "to the full box", swap.path_to_full, self._away_from(swap.full_box, swap.path_to_full[-1]) + math.pi
+        )
         yield from self._take("front", swap.full_box)
-        yield from self._follow_path("turn", np.zeros((0, 2)), self._away_from(swap.full_box, swap.path_to_full[-1], self._target_pose))
+        yield from self._follow_path(
+            "turn", np.zeros((0, 2)), self._away_from(swap.full_box, swap.path_to_full[-1], self._target_pose)
+        )
         yield from self._put_down("rear", swap.empty_box)
         self._check_result()
 
@@ -117,7 +123,9 @@ class SwapBoxes(Task):
         phase, here = "leave the empty box", self._base_pose()[:2].copy()
         yield from self._align_clamp(phase, end, self._target_pose)
         down = float(self.robot.rigid.read(self.robot.name)[0][self._lift_index(end)])
-        yield from self._move_lift(phase, end, down - float(self.box_pose(box)[2] - self._target_pose[2]) + RELEASE_HEIGHT)
+        yield from self._move_lift(
+            phase, end, down - float(self.box_pose(box)[2] - self._target_pose[2]) + RELEASE_HEIGHT
+        )
         fingers = self.robot.description.joint_indices(f"clamp_{end}")
         self.robot.command_position(self.robot.upper_limit[fingers], fingers)
         yield from self.wait(1.5, phase)
@@ -140,7 +148,9 @@ class SwapBoxes(Task):
         yield from self._follow(phase, WaypointFollower(self.robot, points, heading, speed=0.5, turn_rate=0.3))
 
     def _drive_straight(self, phase: str, place: np.ndarray, *, backwards: bool) -> Iterator[str]:
-        yield from self._follow(phase, WaypointFollower(self.robot, place, None, speed=APPROACH_SPEED, reverse=backwards))
+        yield from self._follow(
+            phase, WaypointFollower(self.robot, place, None, speed=APPROACH_SPEED, reverse=backwards)
+        )
 
     def _align_clamp(self, phase: str, end: str, box: np.ndarray) -> Iterator[str]:
         """Bring the clamp at one ``end`` to a box at pose [7], straight."""
