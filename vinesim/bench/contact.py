@@ -21,7 +21,7 @@ from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement, RobotSpec
 
 CANES = (64, 256)
@@ -50,7 +50,7 @@ def tick(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
     on the headland. All swing their joints.
     """
     yield from _beside("1 hand, 1 held vine", "tick", scenes.row(1), [scenes.hand("hand", scenes.bunch_at(0))], 100)
-    model = generate(load(SCENE))
+    model = generate(load_scene(SCENE))
     with _one_core():
         for count in ROBOTS:
             yield from _block(model, robot, raised, count)
@@ -60,7 +60,7 @@ def _block(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> It
     """Tick by tick, and stage by stage, each with its own clock."""
     physics = Physics(model)
     for i in range(count):
-        pose = frames.pose([*PLACE, 0.0], frames.yaw(0.5 * np.pi)) if i == 0 else frames.pose([4.0 * i, -6.0, 0.0])
+        pose = frames.pose([*PLACE, 0.0], frames.from_yaw(0.5 * np.pi)) if i == 0 else frames.pose([4.0 * i, -6.0, 0.0])
         home = robot.home if i else raised
         physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
         physics.rigid.drive_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))

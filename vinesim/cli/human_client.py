@@ -33,12 +33,12 @@ def run(
     from vinesim.client.tasks.start_poses import bunch_centres, checked_bunch, placed, start_pose
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     if status not in ("text", "json", "none"):
         raise WrongUse(f"--status {status!r}: give text, json or none")
     sys.setswitchinterval(SWITCH)
-    plan = reseeded(load(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     if place is not None:
         plan, spawn = placed(plan, *place), 0
     model = generate(plan)

@@ -34,7 +34,7 @@ MIDDLE = 1.2
 
 def viewpoint(x: float, y: float, heading: float) -> np.ndarray:
     """Pose [7] of the eyes of somebody who stands at (x, y) [m] and looks along ``heading`` [rad]."""
-    return frames.pose([x, y, EYES], frames.yaw(heading))
+    return frames.pose([x, y, EYES], frames.from_yaw(heading))
 
 
 def looking_at(base: np.ndarray) -> np.ndarray:
