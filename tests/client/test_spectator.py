@@ -12,13 +12,13 @@ from tests.client.test_recorder import World
 from tests.client.test_replay import recorded_trees
 from tests.support.recorded_world import TICK, Light, vineyard
 from vinesim import frames
-from vinesim.cli.replay import WrongUse
 from vinesim.cli.replay import run as replay
 from vinesim.client.client import Client
 from vinesim.client.recording.recorder import Recorder
 from vinesim.client.recording.replay import ReplayBus
 from vinesim.client.spectator import ASIDE, EYES, Spectator, looking_at, viewpoint
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_file import NotARecording, Recording, Tape, read
 from vinesim.net.transport.bus import MemoryHub
@@ -162,5 +162,5 @@ def test_another_vineyard_is_refused(robot_tape, tmp_path):
     with pytest.raises(NotARecording, match=r"digest .*: give its --scene and --seed"):
         replay(**options(robot_tape, tmp_path / "out", seed=8))
     assert not (tmp_path / "out").exists()
-    with pytest.raises(WrongUse, match=r"lasts \d"):
+    with pytest.raises(UsageError, match=r"lasts \d"):
         replay(**options(robot_tape, tmp_path / "out", start=60.0))

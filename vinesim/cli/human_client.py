@@ -25,18 +25,19 @@ def run(
 ) -> int:  # fmt: skip
     """Walk, reach for a bunch, hold it and pull at it, let go; until told to stop. Then write report.json."""
     from vinesim.avatar.scripted_human import Walker
-    from vinesim.cli.robot_client import SWITCH, WrongUse, save_report, speak, tick_until
+    from vinesim.cli.robot_client import SWITCH, save_report, speak, tick_until
     from vinesim.client.client import Client
     from vinesim.client.rate_loop import Pace
     from vinesim.client.recording.trace import Trace
     from vinesim.client.status import Status
     from vinesim.client.tasks.start_poses import bunch_centres, checked_bunch, placed, start_pose
+    from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
 
     if status not in ("text", "json", "none"):
-        raise WrongUse(f"--status {status!r}: give text, json or none")
+        raise UsageError(f"--status {status!r}: give text, json or none")
     sys.setswitchinterval(SWITCH)
     plan = with_seed(load_scene(scene), seed)
     if place is not None:

@@ -16,6 +16,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+from vinesim.errors import UsageError
+
 if TYPE_CHECKING:
     from vinesim.client.rate_loop import Pace
 
@@ -25,10 +27,6 @@ SWITCH = 2e-4
 """How long another thread may hold the interpreter lock when the tick wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
-
-
-class WrongUse(ValueError):
-    """Options that cannot be meant; the text says which."""
 
 
 def run(
@@ -42,11 +40,11 @@ def run(
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
-        raise WrongUse(f"role {role!r} is none of robot, human, spectator; give one of them")
+        raise UsageError(f"role {role!r} is none of robot, human, spectator; give one of them")
     if status not in ("text", "json", "none"):
-        raise WrongUse(f"--status {status!r}: give text, json or none")
+        raise UsageError(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
-        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
+        raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
     from vinesim.physics.plants.device_buffers import device_of
     from vinesim.sensors.camera import renderers
@@ -54,7 +52,7 @@ def run(
     device_of(device)  # refused before anything is built
     renderers.check(renderer)
     if threads > 1 and device != "cpu":
-        raise WrongUse(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
+        raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
     # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
     sys.setswitchinterval(SWITCH)
