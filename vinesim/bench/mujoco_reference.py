@@ -11,6 +11,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import shapes_of
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, furnished
@@ -66,10 +67,10 @@ class Whole:
     """
 
     def __init__(self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01, give: float | None = None) -> None:
-        self.rigid = mine = Rigid(model, dt=dt)
+        self.rigid = mine = Rigid(model, parameters=PhysicsParameters(dt=dt))
         for robot in robots:
             mine.add_robot(robot)
-        spec = furnished(model, dt)
+        spec = furnished(model, mine.parameters)
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         for bit, robot in enumerate(robots, FIRST_ACTOR):

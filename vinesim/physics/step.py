@@ -8,6 +8,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.plants.detachment import Blade, Partings
 from vinesim.physics.plants.fault_guard import Guard
@@ -22,9 +23,6 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
 
-STIRRED = 4.0
-"""[m] With robots or people about, wind moves only the trees whose foot is so near to one of them."""
-
 
 class Physics:
     """A vineyard that moves: plants, rigid bodies, and what passes between them.
@@ -33,22 +31,37 @@ class Physics:
     """
 
     def __init__(
-        self, model: Model, *, dt: float = 0.01, device: str = "cpu", threads: int = 1, picking: bool = True
+        self,
+        model: Model,
+        *,
+        parameters: PhysicsParameters = PhysicsParameters(),
+        device: str = "cpu",
+        threads: int = 1,
+        picking: bool = True,
     ) -> None:
-        """``dt`` [s]; ``device``, ``threads``: see :class:`Plants`; ``picking``: bunches part when pulled too hard."""
-        self.model, self.dt = model, dt
+        """``device``, ``threads``: see :class:`Plants`; ``picking``: whether bunches detach when pulled too hard."""
+        p = parameters
+        self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
-        self.plants = Plants(model, self.state, dt=dt, device=device, threads=threads)
-        self.rigid = Rigid(model, dt=dt)
-        self.touching = Touching(model, self.plants, self.rigid)
+        self.plants = Plants(
+            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, brisk=p.fast_joint_rate,
+            limit=p.max_joint_rate, bound=p.fault_joint_rate,
+        )  # fmt: skip
+        self.rigid = Rigid(model, parameters=p)
+        self.touching = Touching(
+            model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
+        )
         self.parting = Partings(self.plants, self.rigid, self.touching)
         self.holding = Holding(self.plants, self.rigid, self.touching)
         self.riding = Riding(self.rigid)
         self.lying = Lying(self.plants, self.rigid, self.touching, self.riding)
         self._links: tuple[tuple[Link, ...], tuple[Link, ...], tuple[Link, ...]] = ((), (), ())
         self._picking = picking
-        self.detail = Detail(self.plants)
-        self.sleep = Sleep(self.plants)
+        self.detail = Detail(
+            self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
+            patience=p.steps(p.detail_rest_duration),
+        )  # fmt: skip
+        self.sleep = Sleep(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
         self.guard = Guard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
@@ -218,7 +231,9 @@ class Physics:
     def _blow(self) -> None:
         if self.wind is not None:
             actors = [self.rigid.stands(name) for name in self.rigid.actors]
-            self.wind.update(self.plants, self.time, (np.array(actors), STIRRED) if actors else None)
+            self.wind.update(
+                self.plants, self.time, (np.array(actors), self.parameters.wind_radius) if actors else None
+            )
 
     def _refine(self) -> None:
         self.detail.update(self.touching.near)
@@ -244,5 +259,7 @@ class Physics:
         self.parting.held = self.holding.contacts
 
     def _sleep(self) -> None:
+        if not self.parameters.sleep:
+            return
         held = self.holding.trees
         self.sleep.update(np.union1d(self.touching.near, held) if len(held) else self.touching.near)

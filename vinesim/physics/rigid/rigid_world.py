@@ -20,6 +20,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact import collision_geoms
 from vinesim.physics.contact.effective_mass import Metric
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, hand_wrenches, recompile, static_world
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.human_body import HAND, LIMBS, PARTS, Hand, HumanError, Person, rouse
@@ -47,15 +48,15 @@ class Draft:
 class Rigid:
     """Robots, boxes and what stands, in one MuJoCo world that is compiled anew when an actor comes or goes."""
 
-    def __init__(self, model: Model, *, dt: float = 0.01) -> None:
-        self.model = model
-        self.dt = dt
+    def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        self.model, self.parameters = model, parameters
+        self.dt = parameters.dt
         self._robots: dict[str, RobotBody] = {}
         self._people: dict[str, Person] = {}
         self._bunches: dict[int, Loose] = {}
         self._waiting = 0
         self._slot: dict[int, int] = {}
-        self._scene = static_world.furnished(model, dt)
+        self._scene = static_world.furnished(model, parameters)
         self._drafting = threading.Lock()
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
