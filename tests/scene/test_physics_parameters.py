@@ -12,7 +12,7 @@ from vinesim.physics.parameters import ParameterError, PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene import physics_parameters
 from vinesim.scene.data_files import data_dir
-from vinesim.scene.spec import SceneError, load
+from vinesim.scene.spec import SceneError, load_scene
 
 FIELDS = [field.name for field in msgspec.structs.fields(PhysicsParameters)]
 

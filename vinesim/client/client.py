@@ -166,12 +166,12 @@ class Client:
             self.spawner.cancel(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
                 other.leave()
-                self.physics.touching.copies.discard(name)
+                self.physics.contact_solver.remote_actors.discard(name)
                 log.info("%s left", name)
         for name, update in (*inbox.robots.items(), *inbox.people.items()):
             if name in self.spawner and (other := self.spawner.spawn(name, update)) is not None:
                 self.remote_actors[name] = other
-                self.physics.touching.copies.add(name)
+                self.physics.contact_solver.remote_actors.add(name)
             if name in self.remote_actors:
                 self.remote_actors[name].follow(update)
         self._apply_remote_trees(inbox)
@@ -283,7 +283,7 @@ class Client:
 
     def _apply_remote_trees(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
-        things, told = self.objects, self.physics.touching.told
+        things, told = self.objects, self.physics.contact_solver.remote_trees
         for update in inbox.trees:
             if update.tree not in self._remote_trees:
                 self.physics.plants.wake(update.tree)
