@@ -11,7 +11,7 @@ from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.avatar.scripted_human import Legs, Walker
-from vinesim.cli.human_client import before
+from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
 from vinesim.client.tasks.start_poses import bunch_centres, bunch_in_reach, start_pose
 from vinesim.net.codec import human as poses
@@ -355,7 +355,7 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     bunch = bunch_in_reach(world.model, stand)
     body = int(world.model.bunch_body[bunch])
     centre = bunch_centres(world.model)[bunch]
-    walker = Walker(frames.pose(np.array([*before(centre, stand), 0.0]), stand[3:]))
+    walker = Walker(frames.pose(np.array([*standing_place(centre, stand), 0.0]), stand[3:]))
     eva = world.join("eva", None, walker.root, walker)
     aside = frames.compose(stand, frames.pose(np.array([-1.5, 1.0, 0.0])))
     anna = world.join("anna", vinebot, aside)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SWITCH = 2e-4
+SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the tick wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
@@ -55,7 +55,7 @@ def run(
         raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
     # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     stop = threading.Event()
 
     from vinesim.client.client import Client
@@ -143,7 +143,7 @@ def run(
             client.pre_step.append(LookAt(client.robot, client.trace.centre))
         reporter = Status(client, pace, senses.sent_messages, script)
         speaker = threading.Thread(
-            target=speak, args=(reporter, senses.publish_diagnostics, status, stop), name="status"
+            target=report_status, args=(reporter, senses.publish_diagnostics, status, stop), name="status"
         )
         speaker.start()
         stack.callback(speaker.join)
@@ -190,7 +190,7 @@ def ros_name(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def speak(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
+def report_status(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
     """Once a second, say how it goes: to the terminal, and to whoever wants to ``diagnose``."""
     try:
         while not stop.wait(STATUS_PERIOD):

@@ -19,7 +19,7 @@ def run(
     renderer: str, **_: Any,
 ) -> int:  # fmt: skip
     """Look until told to stop; pictures go to ``out``."""
-    from vinesim.cli.robot_client import speak, tick_until
+    from vinesim.cli.robot_client import report_status, tick_until
     from vinesim.client.rate_loop import RateLoop
     from vinesim.client.spectator import PictureWriter, Spectator, standing_view
     from vinesim.client.status import Status
@@ -56,7 +56,7 @@ def run(
         stop = threading.Event()
         pace = RateLoop(spectator.physics.dt)
         reporter = Status(spectator, pace)
-        speaker = threading.Thread(target=speak, args=(reporter, lambda _: None, status, stop), name="status")
+        speaker = threading.Thread(target=report_status, args=(reporter, lambda _: None, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)

@@ -71,7 +71,7 @@ class SensorProcess:
         """
         self.name = name
         self._attached = False
-        if ros and (reason := ros_setup.available()) is not None:
+        if ros and (reason := ros_setup.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
         self._ros = ros

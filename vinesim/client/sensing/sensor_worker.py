@@ -153,7 +153,7 @@ class SensorWorker:
         return stack.enter_context(Eyes(setup.model, mounts, primitives=primitives, nice=RENDER_NICE))
 
     def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:
-        return lambda: always or (self.node is not None and self.node.wanted(name))
+        return lambda: always or (self.node is not None and self.node.has_subscribers(name))
 
     # ------------------------------------------------------------------ running
 
@@ -190,8 +190,8 @@ class SensorWorker:
         if letter.bodies is not None:
             self.pipe.send(("read", (letter.number, letter.links is not None)))
         if self.node is not None:
-            self.node.publish_tick(letter.time, letter.sample)
-            if letter.tick % 10 == 0 and letter.bodies is not None and self.node.wanted("tf_environment"):
+            self.node.publish_robot_state(letter.time, letter.sample)
+            if letter.tick % 10 == 0 and letter.bodies is not None and self.node.has_subscribers("tf_environment"):
                 self._publish_truth(letter.time)
             if commands := self.node.commands():
                 self.pipe.send(("commands", commands))
@@ -217,7 +217,7 @@ class SensorWorker:
             figures |= {
                 "sent": self.node.sent,
                 "ros_dropped": self.node.dropped,
-                "truth": self.node.wanted("tf_environment"),
+                "truth": self.node.has_subscribers("tf_environment"),
             }
         return figures
 
