@@ -39,7 +39,9 @@ def run(
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     life = Life(actors) if actors > 0.0 else None
-    plan = Plan(load_scene(scene), seed, camera, None if size is None else parse_size(size), life, renderers.check(renderer))
+    plan = Plan(
+        load_scene(scene), seed, camera, None if size is None else parse_size(size), life, renderers.check(renderer)
+    )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crew: list[Share] = []
     try:
