@@ -148,13 +148,13 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
         rigid.command("grip", grasp(0.01 * tick)[0])
         rigid.prep()
         touching.wake_near_trees()
-        physics.plants.free()
+        physics.plants.predict()
         start = physics.state.body_q.copy()
         touching.solve()
         free = rigid.velocity_free
         if touching.count:
             pressed += 1
-            response = physics.plants.response(touching.bodies)
+            response = physics.plants.impulse_response(touching.bodies)
             rows = slice(0, len(touching.bodies))
             pushed = np.einsum("uitj,tj->ui", response[rows], touching.wrenches) * physics.dt
             predicted = physics.plants.velocity_free[touching.bodies] + pushed

@@ -274,7 +274,7 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
     physics = Physics(assemble([tree], **box))
     for _ in range(50):
         physics.step()
-    physics.plants.rest(physics.plants.awake)
+    physics.plants.put_to_sleep(physics.plants.awake)
     for _ in range(20):
         physics.step()
     assert len(physics.plants.awake) == 0
@@ -294,7 +294,7 @@ def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     stages = (
         physics.rigid.prep,
         physics.contact_solver.wake_near_trees,
-        physics.plants.free,
+        physics.plants.predict,
         physics.contact_solver.solve,
     )
     for tick in range(250):
@@ -534,7 +534,7 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         stages = (
             physics.rigid.prep,
             physics.contact_solver.wake_near_trees,
-            physics.plants.free,
+            physics.plants.predict,
             physics.contact_solver.solve,
         )
         for _ in range(40):
@@ -662,7 +662,7 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
         for stage in (
             physics.rigid.prep,
             physics.contact_solver.wake_near_trees,
-            physics.plants.free,
+            physics.plants.predict,
             physics.contact_solver.solve,
         ):
             stage()

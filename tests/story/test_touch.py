@@ -108,7 +108,7 @@ def test_the_whole_way(world):
     picker.pre_step.clear()
     away = picker.robot.description.home
     picker.robot.command_position(away)
-    world.until(lambda: world.tree not in picker.physics.sleep.moving, 60.0)
+    world.until(lambda: world.tree not in picker.physics.sleep.restless, 60.0)
     world.until(lambda: visitor.replicator.owner(world.tree) is None, 2.0)
     here = world.model.bodies_of(world.tree)
     mine, theirs = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]

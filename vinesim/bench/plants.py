@@ -14,8 +14,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
 from vinesim.bench.scenes import interleaved_medians
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -40,19 +40,19 @@ def cane_scene(count: int) -> Model:
     return assemble([plain_cane(0.5 * i) for i in range(count)])
 
 
-def warmed_up_solver(model: Model, awake: int) -> Plants:
+def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
     """Plants with their first trees awake and every kernel warm."""
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(awake))
     run_steps(plants, 5)
     return plants
 
 
-def run_steps(plants: Plants, count: int) -> None:
+def run_steps(plants: ArticulationSolver, count: int) -> None:
     """Whole ticks without contacts."""
     for _ in range(count):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
 
 
 def plant_measurements() -> Iterator[Measurement]:

@@ -46,10 +46,10 @@ def run(
     if tls is not None and connect is None:
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
-    from vinesim.physics.plants.device_buffers import device_of
+    from vinesim.physics.plants.device_buffers import find_device
     from vinesim.sensors.camera import renderers
 
-    device_of(device)  # refused before anything is built
+    find_device(device)  # refused before anything is built
     renderers.check(renderer)
     if threads > 1 and device != "cpu":
         raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
