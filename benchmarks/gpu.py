@@ -21,7 +21,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State

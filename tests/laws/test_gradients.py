@@ -11,7 +11,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.plants.rollout import Rollout, Trajectory
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 
 

@@ -12,7 +12,7 @@ from tests.support.beam_theory import Rod
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
 PIECES = 32

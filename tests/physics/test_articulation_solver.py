@@ -13,7 +13,7 @@ from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ONSET, ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers, DeviceUnavailable
 from vinesim.physics.plants.fault_guard import FaultGuard
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 

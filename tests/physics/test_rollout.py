@@ -7,7 +7,7 @@ from tests.support.clustered_trees import clustered
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.rollout import Rollout, RolloutDiverged
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 

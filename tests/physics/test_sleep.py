@@ -5,7 +5,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.sleep import SleepMonitor
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
 

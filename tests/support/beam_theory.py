@@ -17,7 +17,7 @@ from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
 G = 9.81

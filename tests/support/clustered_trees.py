@@ -6,7 +6,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import GRAVITY, TreeBuilder, RodMaterial, assemble, solve_rest_pose
+from vinesim.scene.builder import GRAVITY, RodMaterial, TreeBuilder, assemble, solve_rest_pose
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 

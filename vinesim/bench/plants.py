@@ -15,7 +15,7 @@ from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
 from vinesim.bench.scenes import interleaved_medians
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import TreeBuilder, RodMaterial, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
