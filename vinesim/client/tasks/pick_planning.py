@@ -72,7 +72,7 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
 def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarray]]:
     """Bunch, side and pose [7] of the base, those with most clearance first."""
     points, radius, owner = _obstacles(model)
-    body_q = model.forward(model.joint_settled)[model.bunch_body]
+    body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     hold = body_q[:, :3] + GRASP_DEPTH * axis
     fits = (
@@ -89,7 +89,7 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
     region = np.linalg.norm(points - middle, axis=1) < reached
     points, radius, owner = points[region], radius[region], owner[region]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-    turn = frames.yaw(heading)
+    turn = frames.from_yaw(heading)
     sides = np.stack(
         [frames.rotate(turn, np.array([BUNCH_AHEAD, y, 0.0]))[:, :2] for y in (BUNCH_ASIDE, -BUNCH_ASIDE)], 1
     )
@@ -116,8 +116,8 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Balls that fill wood and bunches at rest: points [n, 3] m, radii [n] m, and whose bunch each belongs to [n]."""
-    body_q = model.forward(model.joint_settled).astype(float)
-    owner = model.bunch_of()
+    body_q = model.forward_kinematics(model.joint_settled).astype(float)
+    owner = model.bunch_of_body()
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
     share = np.linspace(0.0, 1.0, 4)
     along = share[None] * model.body_length[wood, None]
