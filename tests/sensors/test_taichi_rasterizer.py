@@ -8,8 +8,8 @@ import pytest
 from tests.sensors.test_camera_raster import VIEWPOINTS
 from tests.support import sensor_scenes
 from vinesim.kernels.raster import camera_raster
-from vinesim.sensors.camera.camera import Visibility, pinhole
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitive_batches import KINDS
 
 pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
@@ -42,7 +42,7 @@ def _seen(scene, pose: np.ndarray, raster) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("where", [*VIEWPOINTS, *NEAR_PLANE])
 def test_the_twin_sees_the_same(scene, raster, where: str) -> None:
-    pose = looking(*map(np.array, (VIEWPOINTS | NEAR_PLANE)[where]))
+    pose = look_at(*map(np.array, (VIEWPOINTS | NEAR_PLANE)[where]))
     (mine, depth), (other, truth) = _seen(scene, pose, raster), _seen(scene, pose, None)
     same = mine == other
     assert same.mean() >= 0.999
@@ -57,7 +57,7 @@ def test_every_kind_is_seen(scene, raster) -> None:
     """None is missing from the comparison above."""
     found = set()
     for view in VIEWPOINTS.values():
-        primitive = _seen(scene, looking(*map(np.array, view)), raster)[0]
+        primitive = _seen(scene, look_at(*map(np.array, view)), raster)[0]
         found |= set(np.unique(scene.shapes.kind.numpy()[primitive[primitive >= 0]]))
     assert found == set(np.unique(scene.shapes.kind.numpy())) == set(KINDS.values())
 
@@ -67,13 +67,13 @@ def test_two_passes_find_what_one_finds(scene, raster) -> None:
     phased = twin.Twin()
     phased._gpu = True
     for where in ("along the rows", "solids", "inside the canopy"):
-        pose = looking(*map(np.array, VIEWPOINTS[where]))
+        pose = look_at(*map(np.array, VIEWPOINTS[where]))
         assert (_seen(scene, pose, phased)[0] == _seen(scene, pose, None)[0]).mean() >= 0.999
 
 
 def test_another_thread_may_draw(scene, raster) -> None:
     """Eyes have a thread of their own, which is not the one that started Taichi."""
-    pose = looking(*map(np.array, VIEWPOINTS["solids"]))
+    pose = look_at(*map(np.array, VIEWPOINTS["solids"]))
     found = []
     thread = threading.Thread(target=lambda: found.append(_seen(scene, pose, raster)[0]))
     thread.start()
@@ -82,11 +82,11 @@ def test_another_thread_may_draw(scene, raster) -> None:
 
 
 def test_some_clusters_alone(scene, raster) -> None:
-    seen = Visibility(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height)
+    seen = CameraRasterizer(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height)
     some = np.arange(0, len(scene.cluster_first), 5)
-    raster.fill(scene, pinhole(sensor_scenes.SMALL, looking(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys)
+    raster.fill(scene, pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys)
     keys = seen.keys.numpy()
-    numbers = keys[keys < int(camera_raster.EMPTY)] & int(camera_raster.LOW)
+    numbers = keys[keys < int(camera_raster.EMPTY_KEY)] & int(camera_raster.PRIMITIVE_MASK)
     owner = np.repeat(np.arange(len(scene.cluster_first)), scene.cluster_size)
     assert len(numbers) > 100
     assert np.isin(owner[numbers], some).all()

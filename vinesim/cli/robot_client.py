@@ -52,7 +52,7 @@ def run(
     from vinesim.sensors.camera import renderers
 
     device_of(device)  # refused before anything is built
-    renderers.check(renderer)
+    renderers.check_renderer(renderer)
     if threads > 1 and device != "cpu":
         raise WrongUse(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 

@@ -34,7 +34,7 @@ def run(
         raise WrongUse(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
         raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
-    renderers.check(renderer)
+    renderers.check_renderer(renderer)
     plan = reseeded(load(scene), seed)
     if place is None:
         start = spawn_pose(plan, spawn)

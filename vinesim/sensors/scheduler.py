@@ -26,7 +26,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, LidarScan, View
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.lidar.lidar import Lidar
-from vinesim.sensors.lidar.spinning_scan import Rolling
+from vinesim.sensors.lidar.spinning_scan import SpinningScan
 from vinesim.sensors.scene.primitives import Primitives
 
 log = logging.getLogger(__name__)
@@ -41,21 +41,21 @@ def load_kernels() -> None:
         wp.load_module(module, device="cpu")
 
 
-class Wanted(Protocol):
+class DemandQuery(Protocol):
     """Whether anybody listens to a sensor now."""
 
     def __call__(self) -> bool: ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Mount:
+class ScheduledSensor:
     """One sensor and its listener."""
 
     sensor: Camera | Lidar
     deliver: Callable[[CameraFrame | LidarScan], None]
     """Called in the sensing thread with every frame or scan."""
-    wanted: Wanted = lambda: True
-    depth_wanted: Wanted = lambda: True
+    is_wanted: DemandQuery = lambda: True
+    is_depth_wanted: DemandQuery = lambda: True
     """Of a camera: whether anybody looks at its depth, too."""
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
@@ -66,13 +66,13 @@ class Mount:
         return self.sensor.name
 
 
-class Eyes:
+class SensorScheduler:
     """All sensors of one client in one thread. Use as a context manager, or :meth:`start` and :meth:`stop`."""
 
     def __init__(
         self,
         model: Model,
-        mounts: list[Mount] | tuple[Mount, ...],
+        mounts: list[ScheduledSensor] | tuple[ScheduledSensor, ...],
         *,
         primitives: Primitives | None = None,
         nice: int = 0,
@@ -82,7 +82,7 @@ class Eyes:
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)
             raise ValueError(f"two sensors are named {twice!r}; give each its own name")
-        self.mounts = tuple(mounts)
+        self.sensors = tuple(mounts)
         self._nice = nice
         self.primitives = primitives or Primitives(model)
         self.frames = dict.fromkeys(names, 0)
@@ -92,7 +92,7 @@ class Eyes:
         self.failure: BaseException | None = None
         """What stopped the thread, if anything did; :meth:`see` and :meth:`stop` raise it."""
         self._due = dict.fromkeys(names, -np.inf)
-        self._turning = {m.name: Rolling(m.sensor, m.rate) for m in mounts if isinstance(m.sensor, Lidar)}
+        self._turning = {m.name: SpinningScan(m.sensor, m.rate) for m in mounts if isinstance(m.sensor, Lidar)}
         self._stands: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in self._turning}
         self._news = threading.Condition()
         self._newest: tuple[View, Mapping[str, np.ndarray]] | None = None
@@ -100,7 +100,7 @@ class Eyes:
         self._stopping = False
         self._thread: threading.Thread | None = None
 
-    def start(self) -> Eyes:
+    def start(self) -> SensorScheduler:
         """Start the thread."""
         if self._thread is not None:
             raise RuntimeError("these eyes are open already; stop them first")
@@ -121,7 +121,7 @@ class Eyes:
                 raise TimeoutError(f"the sensing thread did not end within {timeout} s")
         self._raise()
 
-    def __enter__(self) -> Eyes:
+    def __enter__(self) -> SensorScheduler:
         return self.start()
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -131,7 +131,7 @@ class Eyes:
             if kind is None:  # a failure of the body comes first
                 raise
 
-    def see(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
+    def submit(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
         """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
         self._raise()
         with self._news:
@@ -166,9 +166,9 @@ class Eyes:
                     self._moved = []
                     for name, stands in self._stands.items():
                         for time, pose in stands:
-                            self._turning[name].track.add(time, pose)
+                            self._turning[name].pose_history.add(time, pose)
                         stands.clear()
-                due = [m for m in self.mounts if self._is_due(m, view.time, poses)]
+                due = [m for m in self.sensors if self._is_due(m, view.time, poses)]
                 if not due:
                     continue
                 self.primitives.update(view, np.concatenate(moved) if moved else np.zeros(0, np.int64))
@@ -183,26 +183,26 @@ class Eyes:
             log.exception("the sensing thread stops")
             self.failure = failure
 
-    def _take(self, mount: Mount, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
+    def _take(self, mount: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
         """What a sensor has to deliver at simulation time ``now``."""
         if isinstance(mount.sensor, Camera):
-            yield mount.sensor.render(self.primitives, pose, now, measure=mount.depth_wanted())
+            yield mount.sensor.render(self.primitives, pose, now, measure_depth=mount.is_depth_wanted())
             return
         turning = self._turning[mount.name]
         missed = turning.dropped
-        yield from turning.go(self.primitives, now)
+        yield from turning.advance(self.primitives, now)
         self.dropped[mount.name] += turning.dropped - missed
 
-    def _is_due(self, mount: Mount, now: float, poses: Mapping[str, np.ndarray]) -> bool:
+    def _is_due(self, mount: ScheduledSensor, now: float, poses: Mapping[str, np.ndarray]) -> bool:
         """Whether a sensor has something to do at simulation time ``now``; counts the frames it has missed."""
         name = mount.name
-        if name not in poses or not mount.wanted():
+        if name not in poses or not mount.is_wanted():
             self._due[name] = -np.inf  # whoever comes back is served at once, and missed nothing
             if name in self._turning:
-                self._turning[name].stop(now)
+                self._turning[name].cancel(now)
             return False
         if name in self._turning:
-            return self._turning[name].due(now)
+            return self._turning[name].is_due(now)
         due, period = self._due[name], 1.0 / (mount.rate or mount.sensor.rate)
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf

@@ -22,24 +22,24 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import HumanSpec, View
-from vinesim.sensors.scene.primitives import still_view
+from vinesim.sensors.scene.primitives import rest_snapshot
 
-BULK = 330.0
+HEAP_DENSITY = 330.0
 """Of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
-WALL, MASS = 0.012, 1.6
+CRATE_WALL, CRATE_MASS = 0.012, 1.6
 """[m] and [kg] of a crate: how thick its walls are, and how heavy it is when empty."""
-CLEAR = 0.01
+MAX_PENETRATION = 0.01
 """[m] Whoever stands deeper than this in something else stands in it."""
-FALL, REST, TRIES = 25, 100, 3
+FALL_STEPS, SETTLE_STEPS, MAX_REFILLS = 25, 100, 3
 """[tick] between bunches that fall into a crate; for the heap to settle; how often what rolled out is put back."""
 
 
-class NoRoom(ValueError):
+class PlacementError(ValueError):
     """Something cannot stand where it is asked to. The text is one line."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class RobotAt:
+class RobotPlacement:
     """A robot by the name of its description, as it stands at ``x``, ``y`` [m], ``yaw`` [rad]."""
 
     robot: str
@@ -49,7 +49,7 @@ class RobotAt:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class PersonAt:
+class PersonPlacement:
     """A person in a posture of ``data/figures/postures.toml``."""
 
     x: float
@@ -61,7 +61,7 @@ class PersonAt:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class CrateAt:
+class CratePlacement:
     """A crate on the ground, ``fill`` of its inside heaped with bunches."""
 
     x: float
@@ -78,24 +78,24 @@ class CrateAt:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Stage:
+class SceneComposer:
     """Who and what is in a picture beside the vineyard; labels count from 0 in the order given here."""
 
-    robots: tuple[RobotAt, ...] = ()
-    people: tuple[PersonAt, ...] = ()
-    crates: tuple[CrateAt, ...] = ()
+    robots: tuple[RobotPlacement, ...] = ()
+    people: tuple[PersonPlacement, ...] = ()
+    crates: tuple[CratePlacement, ...] = ()
     """After those of the scene."""
 
-    def set(self, model: Model) -> View:
+    def compose(self, model: Model) -> View:
         """The vineyard with all of it at rest; :class:`NoRoom` if two would stand in each other."""
-        furnished = self.furnished(model)
+        furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
-            return self.enter(Physics(furnished))
+            return self.populate(Physics(furnished))
         rigid = Rigid(furnished)  # plants that nobody picks from need not be ready to move
         self._admit(rigid)
-        return still_view(model, rigid.links(), rigid.link_q())
+        return rest_snapshot(model, rigid.links(), rigid.link_q())
 
-    def furnished(self, model: Model) -> Model:
+    def with_crates(self, model: Model) -> Model:
         """The same vineyard with the crates after its own boxes."""
         count = len(self.crates)
         pose, size = np.array([c.pose for c in self.crates]), np.array([c.size for c in self.crates])
@@ -103,13 +103,13 @@ class Stage:
             model,
             box_pose=np.concatenate([model.box_pose, pose.reshape(count, 7)]).astype(model.box_pose.dtype),
             box_size=np.concatenate([model.box_size, size.reshape(count, 3)]).astype(model.box_size.dtype),
-            box_mass=np.append(model.box_mass, [MASS] * count).astype(model.box_mass.dtype),
+            box_mass=np.append(model.box_mass, [CRATE_MASS] * count).astype(model.box_mass.dtype),
         )
 
-    def enter(self, physics: Physics) -> View:
+    def populate(self, physics: Physics) -> View:
         """In a world that is furnished: fill the crates, then let everybody in."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
-            heap(physics, number, crate)
+            fill_crate(physics, number, crate)
         self._admit(physics.rigid)
         return physics.view()
 
@@ -123,7 +123,7 @@ class Stage:
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
         _apart(rigid)
 
-    def told(self, model: Model) -> list[dict]:
+    def actor_records(self, model: Model) -> list[dict]:
         """Everything that is set down in a vineyard, as JSON: label, kind, where."""
         told = []
         for organ, things, start in (
@@ -138,34 +138,34 @@ def _at(x: float, y: float, yaw: float) -> np.ndarray:
     return frames.pose(np.array([x, y, 0.0]), frames.yaw(yaw))
 
 
-def weights(model: Model) -> np.ndarray:
+def bunch_masses(model: Model) -> np.ndarray:
     """Of all bunches [kg]."""
     return model.bunch_berries * np.array([v.mass for v in VARIETIES])[model.bunch_variety]
 
 
-def heap(physics: Physics, number: int, crate: CrateAt) -> list[int]:
+def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int]:
     """Let the bunches that hang nearest to a crate fall into it until they fill their share; returns which."""
     model, rigid = physics.model, physics.rigid
-    inside = np.array(crate.size) - [2.0 * WALL, 2.0 * WALL, WALL]
-    wanted = crate.fill * BULK * float(np.prod(inside))
+    inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
+    wanted = crate.fill * HEAP_DENSITY * float(np.prod(inside))
     where = physics.state.body_q[model.bunch_body, :3]
     away = np.hypot(where[:, 0] - crate.x, where[:, 1] - crate.y)
     near = np.argsort(np.where(physics.state.bunch_attached, away, np.inf), kind="stable")
     near = near[: int(physics.state.bunch_attached.sum())]
-    chosen = near[: int(np.searchsorted(np.cumsum(weights(model)[near]), wanted))]
+    chosen = near[: int(np.searchsorted(np.cumsum(bunch_masses(model)[near]), wanted))]
     if len(chosen) == len(near) and wanted > 0.0:
-        raise NoRoom(f"crate {number} wants {wanted:.1f} kg of bunches, more than the vineyard bears; fill it less")
+        raise PlacementError(f"crate {number} wants {wanted:.1f} kg of bunches, more than the vineyard bears; fill it less")
     rng = np.random.default_rng([number, model.bunch_seed[0] if len(model.bunch_seed) else 0])
     waiting, inside_it = chosen.tolist(), []
-    for _ in range(TRIES):
+    for _ in range(MAX_REFILLS):
         for bunch in waiting:
             if physics.state.bunch_attached[bunch]:
                 physics.pick(bunch)
-            top = max([WALL, *(_top(physics, other) for other in inside_it)])
+            top = max([CRATE_WALL, *(_top(physics, other) for other in inside_it)])
             rigid.place_bunch(bunch, frames.compose(crate.pose, _above(model, bunch, inside, top, rng)), np.zeros(6))
             inside_it.append(bunch)
-            _fall(rigid, FALL)
-        _fall(rigid, REST)
+            _fall(rigid, FALL_STEPS)
+        _fall(rigid, SETTLE_STEPS)
         middle = {bunch: _ends(physics, bunch).mean(0) - crate.pose[:3] for bunch in inside_it}
         level = {bunch: frames.rotate(frames.conjugate(crate.pose[3:]), at)[:2] for bunch, at in middle.items()}
         waiting = [bunch for bunch, at in level.items() if (np.abs(at) > 0.5 * inside[:2]).any()]
@@ -209,8 +209,8 @@ def _apart(rigid: Rigid) -> None:
     rigid.prep()
     for names in rigid.overlaps():
         one, other = sorted(names[:2], key=rigid.actors.__contains__, reverse=True)
-        if names[2] > CLEAR and one in rigid.actors:
+        if names[2] > MAX_PENETRATION and one in rigid.actors:
             kind, _, number = other.partition("/")
             if kind == "fixed":
                 other = Organ(int(rigid.model.fixed_organ[int(number)])).name.lower()
-            raise NoRoom(f"{one} stands {100.0 * names[2]:.0f} cm deep in {other}; move one of them")
+            raise PlacementError(f"{one} stands {100.0 * names[2]:.0f} cm deep in {other}; move one of them")

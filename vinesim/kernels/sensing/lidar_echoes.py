@@ -6,7 +6,7 @@ from vinesim.kernels.raster.primitives import Shapes, normal_at
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-Beam = wp.types.vector(length=8, dtype=wp.float32)
+RayValues = wp.types.vector(length=8, dtype=wp.float32)
 """One number for each ray of a shot; an echo is (signal, range, brightness, which ray shows most of it)."""
 
 
@@ -32,7 +32,7 @@ class Receiver:
 
 
 @wp.func
-def measured(r: Receiver, echo: wp.vec4, luck: float) -> float:
+def measured_range(r: Receiver, echo: wp.vec4, luck: float) -> float:
     """Range of an echo [m]: noise grows as the signal comes near the weakest that is noticed."""
     sigma = r.noise
     if r.weakest > 0.0:
@@ -44,7 +44,7 @@ def measured(r: Receiver, echo: wp.vec4, luck: float) -> float:
 
 
 @wp.func
-def name_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) -> int:
+def label_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) -> int:
     """Label of what a ray has met."""
     if primitive < 0:
         return ground_label
@@ -52,7 +52,7 @@ def name_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) 
 
 
 @wp.kernel
-def receive(
+def detect_returns(
     # model
     shapes: Shapes,
     label: wp.array(dtype=wp.int32),
@@ -75,9 +75,9 @@ def receive(
     """One thread makes one or two returns of one shot's rays; label -1 where there is none."""
     shot = first + wp.tid()
     rays = receiver.rays
-    t = Beam()
-    bright = Beam()
-    name = Beam()  # which ray, sorted with the others
+    t = RayValues()
+    bright = RayValues()
+    name = RayValues()  # which ray, sorted with the others
     count = wp.int32(0)
     for k in range(rays):
         ray = shot * rays + k
@@ -137,14 +137,14 @@ def receive(
         echo = last
     label_out[shot, 0] = -1
     if echo[0] > 0.0:
-        label_out[shot, 0] = name_of(primitive[int(echo[3])], label, ground_label)
-        xyz_out[shot, 0] = d * measured(receiver, echo, luck[shot, 0])
+        label_out[shot, 0] = label_of(primitive[int(echo[3])], label, ground_label)
+        xyz_out[shot, 0] = d * measured_range(receiver, echo, luck[shot, 0])
         intensity_out[shot, 0] = wp.clamp(100.0 * echo[2], 0.0, 255.0)
     if receiver.returns == 2:
         if last[1] == strongest[1]:
             last = second
         label_out[shot, 1] = -1
         if last[0] > 0.0 and wp.abs(last[1] - strongest[1]) >= receiver.separation:
-            label_out[shot, 1] = name_of(primitive[int(last[3])], label, ground_label)
-            xyz_out[shot, 1] = d * measured(receiver, last, luck[shot, 1])
+            label_out[shot, 1] = label_of(primitive[int(last[3])], label, ground_label)
+            xyz_out[shot, 1] = d * measured_range(receiver, last, luck[shot, 1])
             intensity_out[shot, 1] = wp.clamp(100.0 * last[2], 0.0, 255.0)

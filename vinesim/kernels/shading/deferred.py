@@ -11,24 +11,24 @@ from vinesim.kernels.raster.camera_raster import Pinhole
 from vinesim.kernels.raster.primitives import LEAF, SPHEROID, Shapes
 from vinesim.kernels.shading.materials import (
     BERRY,
-    Looks,
+    Materials,
     Surface,
     berry_surface,
     ground_surface,
     leaf_surface,
     mix,
-    smooth,
+    sample_bilinear,
     smoothstep,
     solid_surface,
 )
-from vinesim.kernels.shading.shadow_maps import ShadowMap, lit_share
+from vinesim.kernels.shading.shadow_maps import ShadowMap, sun_visibility
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-WHITE = wp.constant(3.0)
+WHITE_POINT = wp.constant(3.0)
 """Light, after exposure, that the tone curve shows as nearly white."""
-DARKEST = wp.constant(0.02)
-BRIGHTEST = wp.constant(2.0)
+MIN_METERED_LUMINANCE = wp.constant(0.02)
+MAX_METERED_LUMINANCE = wp.constant(2.0)
 """What is darker or brighter counts as this when light is metered."""
 
 
@@ -54,7 +54,7 @@ class Light:
 
 
 @wp.func
-def arctangent(y: float, x: float) -> float:
+def fast_atan2(y: float, x: float) -> float:
     """atan2 to 1e-4 rad."""
     ax = wp.abs(x)
     ay = wp.abs(y)
@@ -69,10 +69,10 @@ def arctangent(y: float, x: float) -> float:
 
 
 @wp.func
-def sky_light(light: Light, d: wp.vec3) -> wp.vec3:
+def sky_radiance(light: Light, d: wp.vec3) -> wp.vec3:
     rows = light.table.shape[0]
     columns = light.table.shape[1]
-    x = (arctangent(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
+    x = (fast_atan2(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
     y = wp.sqrt(wp.max(d[2], 0.0)) * float(rows - 1)
     i = wp.clamp(int(x), 0, columns - 2)
     j = wp.clamp(int(y), 0, rows - 2)
@@ -84,7 +84,7 @@ def sky_light(light: Light, d: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def ambient(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
+def ambient_light(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
     """Cool sky through the gaps, green light through leaves, warm bounce from the ground."""
     up = 0.5 + 0.5 * n[2]
     above = light.sky_colour * (sky * sky) + light.leaves * (1.0 - sky)
@@ -92,17 +92,17 @@ def ambient(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
 
 
 @wp.func
-def mirrored(looks: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
+def reflected_light(looks: Materials, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
     """What a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
-    t = smooth(looks.noise, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
+    t = sample_bilinear(looks.noise, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
     hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, t[1])
     above = mix(light.leaves * 0.4, light.sky_colour * 1.3, hole)
     return mix(light.bounce * 0.8, above, smoothstep(-0.25, 0.25, r[2]))
 
 
 @wp.func
-def shine(
-    looks: Looks,
+def shade_surface(
+    looks: Materials,
     light: Light,
     near: ShadowMap,
     far: ShadowMap,
@@ -125,9 +125,9 @@ def shine(
         away = plain
         if wp.dot(plain, light.sun) < 0.0:
             away = -plain
-        lit = lit_share(near, p, away, turn, light.spiral, light.taps)
+        lit = sun_visibility(near, p, away, turn, light.spiral, light.taps)
         if lit < 0.0:
-            lit = lit_share(far, p, away, turn, light.spiral, light.taps)
+            lit = sun_visibility(far, p, away, turn, light.spiral, light.taps)
             if lit < 0.0:
                 lit = wp.where(s.sky > 0.7, 1.0, s.sky)
     direct = wp.vec3(
@@ -138,17 +138,17 @@ def shine(
     colour = wp.cw_mul(
         s.albedo,
         wp.cw_mul(direct, light.sun_colour) * (lit * (0.35 + 0.65 * s.occlusion))
-        + ambient(light, n, s.sky) * s.occlusion,
+        + ambient_light(light, n, s.sky) * s.occlusion,
     )
     if s.through[0] > 0.0:
         if kind == SPHEROID:  # a long way through the berry: saturated, brightest at the rim
             rim = wp.clamp(0.55 - 0.75 * ndl, 0.0, 1.0)
             sunny = rim * rim * 0.30 * (0.15 + 0.85 * lit) * s.occlusion * (0.25 + 0.75 * s.sky)
-            colour += wp.cw_mul(s.through, light.sun_colour * sunny + ambient(light, -n, s.sky) * (0.35 * s.occlusion))
+            colour += wp.cw_mul(s.through, light.sun_colour * sunny + ambient_light(light, -n, s.sky) * (0.35 * s.occlusion))
         else:
             colour += wp.cw_mul(
                 s.through,
-                light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55) + ambient(light, -n, s.sky) * (0.30 * s.occlusion),
+                light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55) + ambient_light(light, -n, s.sky) * (0.30 * s.occlusion),
             )
     if s.gloss > 0.0:
         grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
@@ -167,16 +167,16 @@ def shine(
                 above = mix(light.leaves * 0.45, light.sky_colour, s.sky * s.sky)
                 colour += mix(light.bounce, above, 0.5 + 0.5 * r[2]) * (wp.min(fresnel, 0.16) * s.mirror * s.occlusion)
             else:
-                colour += mirrored(looks, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)
+                colour += reflected_light(looks, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)
     colour += s.albedo * s.glow
     return mix(colour, light.haze, 0.6 * (1.0 - wp.exp(-t * 0.006)))
 
 
 @wp.kernel
-def shade(
+def shade_pixels(
     # model
     shapes: Shapes,
-    looks: Looks,
+    looks: Materials,
     # in
     light: Light,
     near: ShadowMap,
@@ -232,7 +232,7 @@ def shade(
                 d = ray / scale
                 colour = wp.vec3(0.0, 0.0, 0.0)
                 if i == -1:
-                    colour = sky_light(light, d)
+                    colour = sky_radiance(light, d)
                 else:
                     p = lens.eye + ray * z
                     footprint = z * float(block) / lens.fx
@@ -252,7 +252,7 @@ def shade(
                             s = solid_surface(shapes, looks, i, p, footprint)
                     else:
                         s = ground_surface(looks, p, footprint, footprint * z * scale / lens.eye[2])
-                    colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
+                    colour = shade_surface(looks, light, near, far, s, kind, p, d, z * scale, turn)
                 for k in range(c, corners):
                     x = left + (k & half)
                     y = top + (k >> half)
@@ -262,7 +262,7 @@ def shade(
 
 
 @wp.kernel
-def meter(
+def meter_luminance(
     # in
     radiance: wp.array(dtype=wp.vec3),
     width: int,
@@ -278,13 +278,13 @@ def meter(
     y = (i // across) * step + step / 2
     if y < height:
         c = radiance[y * width + x]
-        light = wp.clamp(0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2], DARKEST, BRIGHTEST)
+        light = wp.clamp(0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2], MIN_METERED_LUMINANCE, MAX_METERED_LUMINANCE)
         wp.atomic_add(sum_out, 0, wp.int64(int(wp.log2(light) * 65536.0)))
         wp.atomic_add(sum_out, 1, wp.int64(1))
 
 
 @wp.kernel
-def expose(
+def update_exposure(
     # in
     usual: float,
     key: float,
@@ -306,7 +306,7 @@ def expose(
 
 
 @wp.kernel
-def develop(
+def tone_map(
     # in
     radiance: wp.array(dtype=wp.vec3),
     width: int,
@@ -329,6 +329,6 @@ def develop(
         for k in range(samples * samples):
             c = wp.cw_mul(gain, radiance[(top + k // samples) * width * samples + left + k % samples])
             # what is brighter than white counts as white: edges against the sky stay smooth
-            colour += wp.min(c, wp.vec3(WHITE, WHITE, WHITE))
+            colour += wp.min(c, wp.vec3(WHITE_POINT, WHITE_POINT, WHITE_POINT))
         for k in range(3):
             rgb_out[pixel, k] = tone[wp.clamp(int(wp.sqrt(wp.max(colour[k] * per, 0.0)) * 1024.0), 0, 4095)]

@@ -54,7 +54,7 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Grey level from which on a window is overexposed."""
 
 
-class View(Protocol):
+class DepthRenderer(Protocol):
     """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.Visibility`)."""
 
     depth: wp.array
@@ -71,7 +71,7 @@ class Stereo:
         spec: StereoSpec,
         info: CameraInfo,
         reach: tuple[float, float],
-        viewer: Callable[[int, int, str], View],
+        viewer: Callable[[int, int, str], DepthRenderer],
         device: str = "cpu",
     ) -> None:
         """``reach``: nearest and farthest depth [m]; ``viewer`` makes what draws a view of some width and height."""
@@ -107,16 +107,16 @@ class Stereo:
         lens: camera_raster.Pinhole,
         depth: np.ndarray,
         rgb: np.ndarray,
-        dice: np.random.Generator,
+        rng: np.random.Generator,
     ) -> np.ndarray:
         """Measured depth [height, width] m where ``depth`` [height, width] m is true and ``rgb`` what it looks like."""
         second = self._view(lens)
         self._second.draw(primitives, second)
-        self._luck.assign(self._throw(dice))
+        self._luck.assign(self._throw(rng))
         _, rows, columns = self._luck.shape
         run = columns if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
-            stereo_depth.measure,
+            stereo_depth.measure_depth,
             rows * columns // run,
             inputs=[
                 self._struct,
@@ -144,7 +144,7 @@ class Stereo:
         other.width, other.height, other.reach = self._columns, self._rows, lens.reach
         wide = max(other.cx, other.width - other.cx) / other.fx
         high = max(other.cy, other.height - other.cy) / other.fy
-        other.close = float(camera_raster.CLOSE) * float(np.sqrt(1.0 + wide * wide + high * high))
+        other.close = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
         return other
 
     def _throw(self, dice: np.random.Generator) -> np.ndarray:

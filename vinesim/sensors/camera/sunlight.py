@@ -55,14 +55,14 @@ class _Map:
         """Draw the map anew if it no longer holds for this camera at ``time``."""
         wanted = eye + self.ahead * forward
         strayed = not np.linalg.norm(wanted - self.focus) <= self.slack
-        other = self.built != primitives.built
+        other = self.built != primitives.layout_version
         if not (strayed or other):
             due = self.rigid and not 0.0 <= time - self.time < period
             if not due or not (primitives.cluster_version[self._inside(primitives)] > self.version).any():
                 return
         if strayed:
             self.focus = wanted
-        self.time, self.version, self.built = time, primitives.version, primitives.built
+        self.time, self.version, self.built = time, primitives.pose_version, primitives.layout_version
         self._draw(primitives)
 
     def _inside(self, primitives: Primitives) -> np.ndarray:
@@ -77,10 +77,10 @@ class _Map:
 
     def _casting(self, primitives: Primitives) -> wp.array:
         """Clusters that this map shows, wherever they are."""
-        if self._known != primitives.built:
+        if self._known != primitives.layout_version:
             every = np.arange(len(primitives.cluster_first), dtype=np.int32)
             mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
-            self._every, self._known = wp.array(mine, device=self.device), primitives.built
+            self._every, self._known = wp.array(mine, device=self.device), primitives.layout_version
         return self._every
 
     def _draw(self, primitives: Primitives) -> None:
@@ -92,7 +92,7 @@ class _Map:
             which, (lanes, slices) = self._casting(primitives), _SPREAD
         if len(which):
             wp.launch(
-                shadow_maps.cast_shadows,
+                shadow_maps.raster_shadow_map,
                 (len(which), lanes, slices),
                 inputs=[
                     primitives.shapes,
@@ -182,7 +182,7 @@ class Sunlight:
         light.sun = _vector(direction)
         light.sun_colour = _vector(sun)
         light.sky_colour, light.haze = _vector(_SKY * dim), _vector(_HAZE * dim)
-        table = textures.sky(tuple(direction), tuple(sun)) * np.float32(dim)
+        table = textures.sky_texture(tuple(direction), tuple(sun)) * np.float32(dim)
         light.table = wp.array(table, dtype=wp.vec3, device=self._device)
         falls = sun * max(direction[2], 0.05) + _SKY * dim
         usual = _NOON * _HIGH + _SKY
@@ -194,7 +194,7 @@ class Sunlight:
         self._near.aim(raised)
         self._far.aim(raised)
 
-    def follow(
+    def update(
         self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
     ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
         """The fine and the coarse shadow map for a camera at ``eye`` that looks along ``forward``."""

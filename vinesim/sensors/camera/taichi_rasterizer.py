@@ -29,8 +29,8 @@ from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSO
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
 
-FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.CLOSE)
-EMPTY, SMOOTH_SIZE, TEXELS = int(camera_raster.EMPTY), float(camera_raster.SMOOTH_SIZE), float(shapes.OUTLINE_TEXELS)
+FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.NEAR_DEPTH)
+EMPTY, SMOOTH_SIZE, TEXELS = int(camera_raster.EMPTY_KEY), float(camera_raster.SMOOTH_SIZE), float(shapes.OUTLINE_TEXELS)
 _NOBODY = 2**31 - 1
 _NEARLY = 2**30
 """Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
@@ -466,7 +466,7 @@ def _drawer(kind: int, phase: int):
     return draw
 
 
-class Twin:
+class TaichiRasterizer:
     """Fills the keys of pictures as Warp's rasteriser does: on all cores of the CPU, or on a Vulkan or Metal GPU."""
 
     def __init__(self, gpu: bool = False) -> None:
@@ -478,7 +478,7 @@ class Twin:
         self._tables: list = []
         self._pixels: list = []
 
-    def fill(
+    def rasterize(
         self, primitives: "Primitives", lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
@@ -500,8 +500,8 @@ class Twin:
         self, primitives: "Primitives", lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
         """On a GPU: depths, then numbers; what has not moved stays there."""
-        if self._of != (primitives, primitives.version):
-            s, self._of = primitives.shapes, (primitives, primitives.version)
+        if self._of != (primitives, primitives.pose_version):
+            s, self._of = primitives.shapes, (primitives, primitives.pose_version)
             vectors = [(ti.Vector.ndarray(4, ti.f32, len(t)), t.numpy()) for t in (s.a, s.b, s.c, s.d)]
             flat = [(ti.ndarray(ti.i32, s.outline.shape), s.outline.numpy().astype(np.int32))]
             hull = s.hull.numpy()

@@ -13,19 +13,19 @@ from vinesim.scene.berries import VARIETIES, berries, piece_of
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID, Batch, batch, columns
+from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID, Batch, make_batch, stack_columns
 
 _BROWN = (0.30, 0.17, 0.08)
 _STEM = (0.19, 0.22, 0.075)
 
 
-def pieces_of(model: Model, bunch: int) -> np.ndarray:
+def bunch_bodies(model: Model, bunch: int) -> np.ndarray:
     """Bodies that carry one bunch's berries [piece]: its own, then its clusters."""
     first, count = int(model.bunch_cluster[bunch]), int(model.bunch_clusters[bunch])
     return np.append(model.bunch_body[bunch], np.arange(first, first + count))
 
 
-def canes(model: Model, still: int) -> Batch:
+def cane_batch(model: Model, still: int) -> Batch:
     """One round cone for each piece of cane and peduncle."""
     bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
     rng = np.random.default_rng(5)
@@ -41,11 +41,11 @@ def canes(model: Model, still: int) -> Batch:
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
     length = model.body_length[bodies]
     zero = np.zeros(len(bodies))
-    return batch(
+    return make_batch(
         CONE,
-        columns(zero, zero, zero, model.body_radius[bodies, 0]),
-        b=columns(length, zero, zero, model.body_radius[bodies, 1]),
-        c=columns(zero, seed[tree] * 7.0, zero, zero),
+        stack_columns(zero, zero, zero, model.body_radius[bodies, 0]),
+        b=stack_columns(length, zero, zero, model.body_radius[bodies, 1]),
+        c=stack_columns(zero, seed[tree] * 7.0, zero, zero),
         material=material,
         tint=tint,
         organ=organ,
@@ -55,7 +55,7 @@ def canes(model: Model, still: int) -> Batch:
     )
 
 
-def foliage(model: Model) -> list[Batch]:
+def leaf_batches(model: Model) -> list[Batch]:
     """Blades, their petioles, and the nodes from which they grow."""
     count = len(model.leaf_body)
     if not count:
@@ -71,12 +71,12 @@ def foliage(model: Model) -> list[Batch]:
     bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
     body, tree = model.leaf_body, model.body_tree[model.leaf_body]
     names = label(Organ.LEAF, 0) + tree
-    blade = batch(
+    blade = make_batch(
         LEAF,
-        columns(petiole_end, size),
-        b=columns(rib, shape),
-        c=columns(up, rng.uniform(size=count)),
-        d=columns(bend, model.leaf_age),
+        stack_columns(petiole_end, size),
+        b=stack_columns(rib, shape),
+        c=stack_columns(up, rng.uniform(size=count)),
+        d=stack_columns(bend, model.leaf_age),
         material=int(materials.FOLIAGE),
         tint=tint,
         organ=int(Organ.LEAF),
@@ -84,10 +84,10 @@ def foliage(model: Model) -> list[Batch]:
         carrier=body,
         group=tree,
     )
-    petiole = batch(
+    petiole = make_batch(
         CONE,
-        columns(base, 0.0017),
-        b=columns(petiole_end, 0.0012),
+        stack_columns(base, 0.0017),
+        b=stack_columns(petiole_end, 0.0012),
         material=int(materials.STEM),
         tint=(0.21, 0.13, 0.06),
         organ=int(Organ.LEAF),
@@ -100,10 +100,10 @@ def foliage(model: Model) -> list[Batch]:
     r = model.body_radius[body, 0] * (1.0 - along) + model.body_radius[body, 1] * along
     reach = np.array([1.0, 0.0, 0.0]) * r[:, None]
     axis = base * np.array([1.0, 0.0, 0.0])
-    node = batch(
+    node = make_batch(
         CONE,
-        columns(axis - 0.7 * reach, 1.25 * r),
-        b=columns(axis + 0.4 * reach, 1.45 * r),
+        stack_columns(axis - 0.7 * reach, 1.25 * r),
+        b=stack_columns(axis + 0.4 * reach, 1.45 * r),
         material=int(materials.CANE),
         tint=(0.24, 0.15, 0.07),
         organ=int(Organ.CANE),
@@ -138,7 +138,7 @@ class Ripeness:
         return cls(np.round(rng.beta(2.2, 0.7, count), 3), seed)
 
 
-def bunches(
+def bunch_batches(
     model: Model,
     which: np.ndarray,
     place: list[np.ndarray] | None,
@@ -230,12 +230,12 @@ def _bunches(
             "carrier": on[piece],
         }  # fmt: skip
 
-    fruit = batch(
+    fruit = make_batch(
         SPHEROID,
-        columns(placed(position, on_berry, owner), radius),
-        b=columns(turned(axis, on_berry), elongation),
-        c=columns(speck, depth, 0.0, 0.0),
-        d=columns(turned(crowding[:, :3], on_berry), crowding[:, 3]),
+        stack_columns(placed(position, on_berry, owner), radius),
+        b=stack_columns(turned(axis, on_berry), elongation),
+        c=stack_columns(speck, depth, 0.0, 0.0),
+        d=stack_columns(turned(crowding[:, :3], on_berry), crowding[:, 3]),
         material=int(materials.BERRY),
         tint=colour,
         **common(on_berry, owner),
@@ -245,10 +245,10 @@ def _bunches(
     taper = np.concatenate([np.tile(np.linspace(0.0028, 0.0013, r.shape[1] - 1), len(r)) for r in lines])
     line_owner = np.repeat(np.arange(len(ones)), [len(r) * (r.shape[1] - 1) for r in lines])
     middle = piece_at(0.5 * (start + end), line_owner)
-    rachis = batch(
+    rachis = make_batch(
         CONE,
-        columns(placed(start, middle, line_owner), taper),
-        b=columns(placed(end, middle, line_owner), 0.9 * taper),
+        stack_columns(placed(start, middle, line_owner), taper),
+        b=stack_columns(placed(end, middle, line_owner), 0.9 * taper),
         material=int(materials.STEM),
         tint=_STEM,
         **common(middle, line_owner),
@@ -256,10 +256,10 @@ def _bunches(
     berry_end = position - axis * (radius * elongation * 0.95)[:, None]
     loose = np.linalg.norm(berry_end - foot, axis=1) > 0.002
     loose_piece, loose_owner = on_berry[loose], owner[loose]
-    pedicel = batch(
+    pedicel = make_batch(
         CONE,
-        columns(placed(foot[loose], loose_piece, loose_owner), 0.0010),
-        b=columns(placed(berry_end[loose], loose_piece, loose_owner), 0.0014),
+        stack_columns(placed(foot[loose], loose_piece, loose_owner), 0.0010),
+        b=stack_columns(placed(berry_end[loose], loose_piece, loose_owner), 0.0014),
         material=int(materials.STEM),
         tint=_STEM,
         **common(loose_piece, loose_owner),

@@ -20,10 +20,10 @@ from vinesim.scene.state import State
 from vinesim.scene.values import Link, View
 from vinesim.sensors.camera import renderers
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.plant_primitives import Ripeness, bunches, canes, foliage, pieces_of
-from vinesim.sensors.scene.primitive_batches import CONE, KINDS, LEAF, nothing
-from vinesim.sensors.scene.rigid_primitives import rigid
-from vinesim.sensors.scene.static_primitives import fixed, litter, meadow, rows_of
+from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches, cane_batch, leaf_batches, bunch_bodies
+from vinesim.sensors.scene.primitive_batches import CONE, KINDS, LEAF, placeholder_batch
+from vinesim.sensors.scene.rigid_primitives import rigid_batches
+from vinesim.sensors.scene.static_primitives import trellis_batch, litter_batch, grass_batch, row_layout
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class Primitives:
         the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.camera.renderers`).
         """
         self.model, self.device, self._ripeness = model, device, ripeness
-        self.raster = renderers.raster_of(renderer, device)
+        self.rasterizer = renderers.create_rasterizer(renderer, device)
         """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.camera.Visibility` does so itself."""
         bodies = len(model.body_mass)
         self._still = bodies
@@ -55,27 +55,27 @@ class Primitives:
         spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
         low, high = (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
         trees = len(model.tree_first)
-        batches = [canes(model, bodies), *foliage(model)]
+        batches = [cane_batch(model, bodies), *leaf_batches(model)]
         every = np.arange(len(model.bunch_body))
-        pieces = [pieces_of(model, bunch) for bunch in every]
-        batches += bunches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
-        around = [fixed(model, bodies)]
+        pieces = [bunch_bodies(model, bunch) for bunch in every]
+        batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
+        around = [trellis_batch(model, bodies)]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
-            around += [meadow(rows_of(model), low, high, grass, bodies), litter(low, high, age, bodies)]
+            around += [grass_batch(row_layout(model), low, high, grass, bodies), litter_batch(low, high, age, bodies)]
         batches += [b for b in around if b is not None]
-        self._plants = [b for b in batches if len(b)] or [nothing(bodies)]
+        self._plants = [b for b in batches if len(b)] or [placeholder_batch(bodies)]
         self._groups = trees
         self._links: tuple[Link, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked: dict[int, np.ndarray] = {}
         self._moved = np.zeros(0, np.int64)
-        outline, hull = textures.outlines()
+        outline, hull = textures.leaf_outlines()
         self._outline, self._hull = wp.array(outline, device=device), wp.array(hull, dtype=wp.vec2, device=device)
         self._rest = self._body_q = State.at_rest(model).body_q
-        self.version = 0
+        self.pose_version = 0
         """Counts changes of any pose."""
-        self.built = 0
+        self.layout_version = 0
         """Counts changes of the set of primitives."""
         self._poses = np.zeros((0, 7), np.float32)
         self._build(())
@@ -89,16 +89,16 @@ class Primitives:
         """How many primitives there are."""
         return len(self.label)
 
-    def counts(self) -> dict[str, int]:
+    def counts_by_kind(self) -> dict[str, int]:
         """How many there are of each kind."""
         kinds = self.shapes.kind.numpy()
         return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
 
-    def shown(self) -> np.ndarray:
+    def clusters_shown(self) -> np.ndarray:
         """Whether each cluster is there at all [cluster]: what has been picked is not."""
         return self.ball.numpy()[:, 3] > 0.0
 
-    def carriers(self, primitive: np.ndarray) -> np.ndarray:
+    def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
         """Poses [..., 7] m, 1 of what carries some primitives [...]: a plant's body, a link, or the world."""
         return self._poses[self._carrier.numpy()[primitive]].astype(float)
 
@@ -106,7 +106,7 @@ class Primitives:
 
     def _build(self, links: tuple[Link, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
-        moving = rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links), self._ripeness)
+        moving = rigid_batches(self.model, links, self._still + 1, 0, self._shapes_of_picked(links), self._ripeness)
         batches = self._plants + moving
         first_rigid = len(self._plants)
         pieces: dict[str, list[np.ndarray]] = {
@@ -134,7 +134,7 @@ class Primitives:
                 pile.append(getattr(batch, name)[order])
             total += len(batch)
         whole = {name: np.concatenate(pile) for name, pile in pieces.items()}
-        if self.built:
+        if self.layout_version:
             whole["c"][: len(self._baked_c)] = self._baked_c
         self.label, self.organ = whole["label"].astype(np.int32), whole["organ"].astype(np.int32)
         self.cluster_first, self.cluster_size, self.cluster_kind, self._owner, self._cluster_bunch = (
@@ -155,11 +155,11 @@ class Primitives:
         def array(values: np.ndarray, kind: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=kind, device=self.device)
 
-        self._local, self.shapes, self.clusters, self.looks = (
+        self._local, self.shapes, self.clusters, self.materials = (
             primitives.Shapes(),
             primitives.Shapes(),
             primitives.Clusters(),
-            materials.Looks(),
+            materials.Materials(),
         )
         primitive_kind = np.repeat(self.cluster_kind, self.cluster_size)
         for name in "abcd":
@@ -176,19 +176,19 @@ class Primitives:
         self.organs = array(self.organ, wp.int32)
         self.lower, self.upper = (wp.empty(total, dtype=wp.vec3, device=self.device) for _ in range(2))
         self.ball = wp.empty(len(self.cluster_first), dtype=wp.vec4, device=self.device)
-        self.looks.material, self.looks.tint = (
+        self.materials.material, self.materials.tint = (
             array(whole["material"].astype(np.int32), wp.int32),
             array(whole["tint"], wp.vec3),
         )
-        self.lamps = np.flatnonzero(whole["material"] == int(materials.LAMP))
+        self.lamp_primitives = np.flatnonzero(whole["material"] == int(materials.LAMP))
         """Primitives that shine."""
         sky = np.full(total, 0.7, np.float32)
-        if self.built:
+        if self.layout_version:
             known = self._sky[: min(len(self._sky), total)]
             sky[: len(known)] = known
             for name in ("blade", "noise", "soil", "rows", "ground_sky", "ground_x", "ground_y", "ground_cell"):
-                setattr(self.looks, name, getattr(self._baked, name))
-        self.looks.sky = array(sky, float)
+                setattr(self.materials, name, getattr(self._baked, name))
+        self.materials.sky = array(sky, float)
         poses = np.zeros((self._still + 1 + len(links), 7), np.float32)
         poses[:, 6] = 1.0
         poses[: self._still] = self._poses[: self._still] if len(self._poses) else self._rest
@@ -196,13 +196,13 @@ class Primitives:
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._links = links
         self.plant_count = total - sum(len(b) for b in moving)
-        self.built += 1
+        self.layout_version += 1
 
     def _shapes_of_picked(self, links: tuple[Link, ...]) -> dict[int, np.ndarray]:
         """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
         picked = {}
         for bunch in (link.index for link in links if link.organ == Organ.BUNCH):
-            q = np.asarray(self._body_q[pieces_of(self.model, bunch)], float)
+            q = np.asarray(self._body_q[bunch_bodies(self.model, bunch)], float)
             picked[bunch] = self._picked.get(bunch, frames.compose(frames.inverse(q[0]), q))
         self._picked = picked
         return picked
@@ -226,7 +226,7 @@ class Primitives:
             out = wp.zeros(len(points), dtype=float, device=self.device)
             at = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device=self.device)
             wp.launch(
-                shadow_maps.see_sky,
+                shadow_maps.sky_visibility,
                 len(points),
                 inputs=[grid, wp.vec3(*map(float, corner)), float(cell), at],
                 outputs=[out],
@@ -241,17 +241,17 @@ class Primitives:
         self._local.c.assign(wood_c)
         self._baked_c = wood_c.copy()
         self._sky = seen(posed[:, :3]) if len(posed) else np.zeros(0, np.float32)
-        self.looks.sky = wp.array(self._sky, dtype=float, device=self.device)
+        self.materials.sky = wp.array(self._sky, dtype=float, device=self.device)
         step = max(0.2, float((high - low).max()) / 500.0)
         x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
         ground = seen(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1)).reshape(x.shape)
-        looks = self.looks
-        looks.rows = wp.vec2(*rows_of(self.model))
+        looks = self.materials
+        looks.rows = wp.vec2(*row_layout(self.model))
         looks.ground_sky = wp.array(ground, dtype=float, device=self.device)
         looks.ground_x, looks.ground_y, looks.ground_cell = float(low[0]), float(low[1]), float(step)
         looks.blade, looks.noise, looks.soil = (
             wp.array(t, dtype=wp.vec4, device=self.device)
-            for t in (textures.blades(), textures.noise(), textures.soil())
+            for t in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
         )
         self._baked = looks
 
@@ -315,11 +315,11 @@ class Primitives:
             outputs=[self.shapes.a, self.shapes.b, self.shapes.c, self.shapes.d, self.lower, self.upper, self.ball],
             device=self.device,
         )
-        self.version += 1
-        self.cluster_version[dirty] = self.version
+        self.pose_version += 1
+        self.cluster_version[dirty] = self.pose_version
 
 
-def still_view(model: Model, links: tuple[Link, ...] = (), link_q: np.ndarray | None = None) -> View:
+def rest_snapshot(model: Model, links: tuple[Link, ...] = (), link_q: np.ndarray | None = None) -> View:
     """A view of the vineyard at rest, for pictures and tests without physics."""
     return View(
         time=0.0,

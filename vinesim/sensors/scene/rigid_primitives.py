@@ -13,8 +13,8 @@ from vinesim.scene.appearance import smooth
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import Link, Mesh, Shape
-from vinesim.sensors.scene.plant_primitives import Ripeness, bunches
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, batch
+from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches
+from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, make_batch
 
 _MESH_FACES = 4000
 """Most triangles of one mesh; finer ones are simplified."""
@@ -37,7 +37,7 @@ _SMOOTH_STEPS = 2047
 """Levels of either coordinate of a packed normal."""
 
 
-def rigid(
+def rigid_batches(
     model: Model,
     links: tuple[Link, ...],
     first: int,
@@ -54,7 +54,7 @@ def rigid(
         if link.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
             place = shape[link.index]
             which, on = np.array([link.index]), np.full(len(place), first + k)
-            mine = bunches(model, which, [place], [on], np.array([groups + k]), ripeness)
+            mine = bunch_batches(model, which, [place], [on], np.array([groups + k]), ripeness)
             batches += [dataclasses.replace(b, bunch=np.full(len(b), -1)) for b in mine]
             continue
         usual = _USUAL.get(link.organ, "paint")
@@ -80,24 +80,24 @@ def _rigid_shape(shape: Shape, common: dict) -> Batch:
         low, high = (size[0], size[1]) if shape.kind == "cone" else (size[0], size[0])
         half = frames.rotate(turn, np.array([0.0, 0.0, size[-1]]))
         kind = CYLINDER if shape.kind == "cylinder" else CONE
-        return batch(kind, [[*(centre - half), low]], b=[[*(centre + half), high]], **common)
+        return make_batch(kind, [[*(centre - half), low]], b=[[*(centre + half), high]], **common)
     if shape.kind == "sphere":
-        return batch(ELLIPSOID, [[*centre, size[0]]], b=[turn], c=[[size[0], size[0], 0, 0]], **common)
+        return make_batch(ELLIPSOID, [[*centre, size[0]]], b=[turn], c=[[size[0], size[0], 0, 0]], **common)
     if shape.kind in ("ellipsoid", "box"):
         kind = ELLIPSOID if shape.kind == "ellipsoid" else BOX
-        return batch(kind, [[*centre, size[0]]], b=[turn], c=[[size[1], size[2], 0, 0]], **common)
+        return make_batch(kind, [[*centre, size[0]]], b=[turn], c=[[size[1], size[2], 0, 0]], **common)
     if shape.kind == "mesh":
         mesh = shape.mesh or _read(shape.file, tuple(size) if len(size) == 3 else (size[0],) * 3)
         corners = centre + frames.rotate(turn, mesh.corners)
-        normals = packed(frames.rotate(turn, mesh.normals))
+        normals = pack_normals(frames.rotate(turn, mesh.normals))
         a, b, c = (np.concatenate([corners[:, k], normals[:, k, None]], 1) for k in range(3))
-        return batch(TRIANGLE, a, b=b, c=c, **common)
+        return make_batch(TRIANGLE, a, b=b, c=c, **common)
     raise ValueError(
         f"shape kind {shape.kind!r} of a link is unknown; use capsule, cone, sphere, ellipsoid, box, cylinder or mesh"
     )
 
 
-def packed(normals: np.ndarray) -> np.ndarray:
+def pack_normals(normals: np.ndarray) -> np.ndarray:
     """Unit vectors [..., 3] each in one float, as :func:`vinesim.kernels.shading.materials.unpacked` reads them.
 
     Octahedral (Meyer et al. 2010), two times eleven bits: exact to 0.001 rad.

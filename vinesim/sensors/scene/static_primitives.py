@@ -9,7 +9,7 @@ from vinesim.scene import leaves
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.primitive_batches import CONE, LEAF, Batch, batch, columns
+from vinesim.sensors.scene.primitive_batches import CONE, LEAF, Batch, make_batch, stack_columns
 
 _CELL = 2.5
 """Side of the squares in which things that stand still are clustered [m]."""
@@ -30,7 +30,7 @@ def _cell_of(position: np.ndarray, first: int) -> np.ndarray:
     return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
 
 
-def fixed(model: Model, still: int) -> Batch | None:
+def trellis_batch(model: Model, still: int) -> Batch | None:
     if not len(model.fixed_organ):
         return None
     # long wires in pieces: a box around a whole one holds half of the vineyard
@@ -52,11 +52,11 @@ def fixed(model: Model, still: int) -> Batch | None:
         start[:, 2],
         length[whole] * ends[0][:, 0],
     )
-    return batch(
+    return make_batch(
         CONE,
-        columns(start, thick),
-        b=columns(end, thin),
-        c=columns(along, seed, 0.0, 0.0),
+        stack_columns(start, thick),
+        b=stack_columns(end, thin),
+        c=stack_columns(along, seed, 0.0, 0.0),
         material=material,
         tint=tint,
         organ=organ,
@@ -66,7 +66,7 @@ def fixed(model: Model, still: int) -> Batch | None:
     )
 
 
-def rows_of(model: Model) -> tuple[float, float]:
+def row_layout(model: Model) -> tuple[float, float]:
     """Where the first row of vines stands, and the spacing of the rows [m], both along y."""
     y = np.unique(np.round(model.fixed_start[model.fixed_organ == int(Organ.TRUNK), 1], 1))
     if len(y) == 0:
@@ -82,7 +82,7 @@ def _sown(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
     return 0.16 - 0.26 * textures.smoothstep(0.65, 0.25, away) - 0.14 * textures.smoothstep(0.22, 0.08, track)
 
 
-def litter(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch | None:
+def litter_batch(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch | None:
     """Fallen leaves, more of them when many leaves are old: ``age`` is the mean of :attr:`Model.leaf_age`."""
     low, high = low - 1.0, high + 1.0
     n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
@@ -96,14 +96,14 @@ def litter(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch |
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     dry = rng.uniform(size=(n, 1))
     tint = (1.0 - dry) * np.array([0.30, 0.24, 0.05]) + dry * np.array([0.17, 0.10, 0.045])
-    bend = columns(
+    bend = stack_columns(
         rng.normal(0.0, 0.25, n), rng.normal(0.0, 0.25, n), rng.uniform(-0.2, 0.4, n), rng.uniform(0.8, 1.0, n)
     )
-    return batch(
+    return make_batch(
         LEAF,
-        columns(spot, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
-        b=columns(rib, leaves.shape_of(np.arange(n))),
-        c=columns(up, rng.uniform(size=n)),
+        stack_columns(spot, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
+        b=stack_columns(rib, leaves.shape_of(np.arange(n))),
+        c=stack_columns(up, rng.uniform(size=n)),
         d=bend,
         material=int(materials.FOLIAGE),
         tint=tint,
@@ -114,7 +114,7 @@ def litter(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch |
     )
 
 
-def meadow(rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, still: int) -> Batch | None:
+def grass_batch(rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, still: int) -> Batch | None:
     """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
     low, high = low - 3.0, high + 3.0
     count = int(min(density * np.prod(high - low), 60_000))
@@ -122,7 +122,7 @@ def meadow(rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density
         return None
     rng = np.random.default_rng(23)
     spot = low + (high - low) * rng.uniform(size=(count, 2))
-    noise = textures.sample(spot[:, 0] * 0.21, spot[:, 1] * 0.21)
+    noise = textures.sample_noise(spot[:, 0] * 0.21, spot[:, 1] * 0.21)
     # as the ground is coloured
     green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + _sown(rows, spot[:, 1])
     spot = spot[green > 0.40 + 0.24 * rng.uniform(size=count)]
@@ -134,15 +134,15 @@ def meadow(rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density
     out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
     rib = np.sin(lean)[:, None] * out + np.cos(lean)[:, None] * np.array([0.0, 0.0, 1.0])
     up = np.cos(lean)[:, None] * out - np.sin(lean)[:, None] * np.array([0.0, 0.0, 1.0])
-    root = columns(spot, np.zeros(n)) + 0.74 * size[:, None] * rib
+    root = stack_columns(spot, np.zeros(n)) + 0.74 * size[:, None] * rib
     tint = np.array([0.075, 0.12, 0.022]) * rng.uniform(0.6, 1.35, (n, 1))
     tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
-    bend = columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
-    return batch(
+    bend = stack_columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
+    return make_batch(
         LEAF,
-        columns(root, size),
-        b=columns(rib, np.where(herb, textures.HERB, textures.GRASS)),
-        c=columns(up, rng.uniform(size=n)),
+        stack_columns(root, size),
+        b=stack_columns(rib, np.where(herb, textures.HERB_OUTLINE, textures.GRASS_OUTLINE)),
+        c=stack_columns(up, rng.uniform(size=n)),
         d=bend,
         material=int(materials.GRASS),
         tint=tint,
