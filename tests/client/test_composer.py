@@ -7,7 +7,16 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.client.composition.composer import HEAP_DENSITY, CRATE_WALL, CratePlacement, PlacementError, PersonPlacement, RobotPlacement, SceneComposer, bunch_masses
+from vinesim.client.composition.composer import (
+    CRATE_WALL,
+    HEAP_DENSITY,
+    CratePlacement,
+    PersonPlacement,
+    PlacementError,
+    RobotPlacement,
+    SceneComposer,
+    bunch_masses,
+)
 from vinesim.physics.step import Physics
 from vinesim.scene.ids import Organ, label
 
@@ -62,7 +71,11 @@ def test_crates_come_after_those_of_the_scene_and_change_no_plant() -> None:
 
 def test_whoever_is_told_of_has_the_label_of_the_links() -> None:
     model = sensor_scenes.demo()
-    stage = SceneComposer((RobotPlacement("logistic", 1.3, 1.2),), (PersonPlacement(3.0, 1.2, 0.5, "wave", 1.6),), (CratePlacement(4.0, 1.3),))
+    stage = SceneComposer(
+        (RobotPlacement("logistic", 1.3, 1.2),),
+        (PersonPlacement(3.0, 1.2, 0.5, "wave", 1.6),),
+        (CratePlacement(4.0, 1.3),),
+    )
     links = stage.compose(model).links
     told = {one["label"]: one for one in stage.actor_records(model)}
     drawn = {label(link.organ, link.index) for link in links}

@@ -20,22 +20,22 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 
 def _seen(scene, pose: np.ndarray, raster: CudaRasterizer | None) -> tuple[np.ndarray, np.ndarray]:
     """Primitive and depth of every pixel; by Warp's rasteriser for CPUs unless another is given."""
-    scene.raster = raster
+    scene.rasterizer = raster
     try:
         depth, primitive = sensor_scenes.raster(scene, pose)
     finally:
-        scene.raster = None
+        scene.rasterizer = None
     return primitive, depth
 
 
-def _pieces(**options) -> CudaRasterizer:
+def _small_rasterizer(**options) -> CudaRasterizer:
     return CudaRasterizer("cpu", **({"groups": 1, "lanes": 1} | options))
 
 
 @pytest.mark.parametrize("where", [*VIEWPOINTS, "close to a solid"])
-def test_pieces_show_what_whole_primitives_show(scene, where: str) -> None:
+def test_small_rasterizer_show_what_whole_primitives_show(scene, where: str) -> None:
     pose = look_at(*map(np.array, VIEWPOINTS.get(where, CLOSE_TO_A_SOLID)))
-    (mine, depth), (other, truth) = _seen(scene, pose, _pieces()), _seen(scene, pose, None)
+    (mine, depth), (other, truth) = _seen(scene, pose, _small_rasterizer()), _seen(scene, pose, None)
     same = mine == other
     assert same.mean() >= 0.999
     hit = same & (mine >= 0)
@@ -47,16 +47,16 @@ def test_pieces_show_what_whole_primitives_show(scene, where: str) -> None:
 
 def test_what_finds_no_room_in_a_list_is_drawn_too(scene) -> None:
     pose = look_at(*map(np.array, VIEWPOINTS["inside the canopy"]))
-    full = _pieces(room=4)
-    assert np.array_equal(_seen(scene, pose, _pieces())[0], _seen(scene, pose, full)[0])
+    full = _small_rasterizer(room=4)
+    assert np.array_equal(_seen(scene, pose, _small_rasterizer())[0], _seen(scene, pose, full)[0])
     assert full._count.numpy().max() > 4
 
 
 @pytest.mark.parametrize(("groups", "lanes"), [(1, 32), (7, 4)])
 def test_any_share_of_the_work_gives_the_same_picture(scene, groups: int, lanes: int) -> None:
     pose = look_at(*map(np.array, VIEWPOINTS["solids"]))
-    shared = _pieces(groups=groups, lanes=lanes, listers=3)
-    assert np.array_equal(_seen(scene, pose, _pieces())[0], _seen(scene, pose, shared)[0])
+    shared = _small_rasterizer(groups=groups, lanes=lanes, listers=3)
+    assert np.array_equal(_seen(scene, pose, _small_rasterizer())[0], _seen(scene, pose, shared)[0])
 
 
 def test_some_clusters_alone(scene) -> None:
@@ -65,7 +65,7 @@ def test_some_clusters_alone(scene) -> None:
         CameraRasterizer(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height),
     )
     some = np.arange(0, len(scene.cluster_first), 5)
-    _pieces().rasterize(scene, lens, some, seen.keys)
+    _small_rasterizer().rasterize(scene, lens, some, seen.keys)
     keys = seen.keys.numpy()
     numbers = keys[keys < int(camera_raster.EMPTY_KEY)] & int(camera_raster.PRIMITIVE_MASK)
     owner = np.repeat(np.arange(len(scene.cluster_first)), scene.cluster_size)

@@ -220,7 +220,7 @@ def test_a_second_build_is_the_same_to_the_bit(model, primitives) -> None:
     other = Primitives(model, grass=0.0)
     for name in "abcd":
         assert np.array_equal(getattr(primitives.shapes, name).numpy(), getattr(other.shapes, name).numpy())
-    assert np.array_equal(primitives.looks.sky.numpy(), other.materials.sky.numpy())
+    assert np.array_equal(primitives.materials.sky.numpy(), other.materials.sky.numpy())
 
 
 def test_fruit_ripens_from_green_to_its_variety() -> None:

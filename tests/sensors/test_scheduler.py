@@ -11,7 +11,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import rest_snapshot
-from vinesim.sensors.scheduler import SensorScheduler, ScheduledSensor
+from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
 
 TINY = sensor_scenes.IDEAL.info("optical", 0.1)
 
@@ -80,8 +80,13 @@ def test_the_newest_view_wins_and_the_rest_is_counted(view) -> None:
 def test_nothing_is_rendered_that_nobody_wants(view) -> None:
     wanted, unwanted, taken, listening = Inbox(), Inbox(), Inbox(), threading.Event()
     lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
-    mounts = [ScheduledSensor(_camera(), unwanted, is_wanted=listening.is_set, rate=10.0), ScheduledSensor(lidar, wanted, rate=10.0)]
-    mounts.append(ScheduledSensor(_camera("other"), taken, rate=10.0))  # the last: when it has a picture, the view was taken
+    mounts = [
+        ScheduledSensor(_camera(), unwanted, is_wanted=listening.is_set, rate=10.0),
+        ScheduledSensor(lidar, wanted, rate=10.0),
+    ]
+    mounts.append(
+        ScheduledSensor(_camera("other"), taken, rate=10.0)
+    )  # the last: when it has a picture, the view was taken
     poses = {"head": sensor_scenes.AHEAD, "other": sensor_scenes.AHEAD, "lidar": np.array([0, 0, 1.0, 0, 0, 0, 1])}
     with SensorScheduler(sensor_scenes.empty(), mounts) as eyes:
         for k in range(4):  # a revolution is over a tenth of a second after it was begun
@@ -183,7 +188,9 @@ def test_depth_is_measured_only_for_those_who_look_at_it(view) -> None:
     inbox, looked_at = Inbox(), threading.Event()
     spec = CameraSpec.load("d435")
     camera = Camera(spec, spec.info("optical", 0.1), "head")
-    with SensorScheduler(sensor_scenes.empty(), [ScheduledSensor(camera, inbox, is_depth_wanted=looked_at.is_set, rate=10.0)]) as eyes:
+    with SensorScheduler(
+        sensor_scenes.empty(), [ScheduledSensor(camera, inbox, is_depth_wanted=looked_at.is_set, rate=10.0)]
+    ) as eyes:
         for k in range(2):
             eyes.submit(dataclasses.replace(view, time=0.1 * k), {"head": sensor_scenes.AHEAD})
             inbox.wait(k + 1)

@@ -8,8 +8,8 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.ids import Organ, label
-from vinesim.sensors.lidar.lidar import MAX_SHARED_TRANSLATION, MAX_SHARED_ROTATION, Lidar, LidarSpec
-from vinesim.sensors.lidar.spinning_scan import SpinningScan, PoseHistory
+from vinesim.sensors.lidar.lidar import MAX_SHARED_ROTATION, MAX_SHARED_TRANSLATION, Lidar, LidarSpec
+from vinesim.sensors.lidar.spinning_scan import PoseHistory, SpinningScan
 
 AT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
 STEP = 0.001
@@ -74,7 +74,9 @@ def test_points_of_a_lidar_that_drives_are_in_its_frame_of_their_time() -> None:
     at_their_time = AT[:3] + np.outer(scan.offset[mine], speed) + xyz
     assert np.abs(at_their_time[:, 0] - 6.0).max() < 0.5 * MAX_SHARED_TRANSLATION + 1e-4
     at_the_first = scan.pose[:3] + xyz
-    assert 6.0 - at_the_first[:, 0] == pytest.approx(speed[0] * scan.offset[mine], abs=0.5 * MAX_SHARED_TRANSLATION + 1e-4)
+    assert 6.0 - at_the_first[:, 0] == pytest.approx(
+        speed[0] * scan.offset[mine], abs=0.5 * MAX_SHARED_TRANSLATION + 1e-4
+    )
 
 
 def test_a_lidar_that_turns_near_a_wall() -> None:

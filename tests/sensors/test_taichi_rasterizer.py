@@ -32,11 +32,11 @@ def raster():
 
 def _seen(scene, pose: np.ndarray, raster) -> tuple[np.ndarray, np.ndarray]:
     """Primitive and depth of every pixel; by Warp unless another rasteriser is given."""
-    scene.raster = raster
+    scene.rasterizer = raster
     try:
         depth, primitive = sensor_scenes.raster(scene, pose)
     finally:
-        scene.raster = None
+        scene.rasterizer = None
     return primitive, depth
 
 
@@ -84,7 +84,9 @@ def test_another_thread_may_draw(scene, raster) -> None:
 def test_some_clusters_alone(scene, raster) -> None:
     seen = CameraRasterizer(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height)
     some = np.arange(0, len(scene.cluster_first), 5)
-    raster.fill(scene, pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys)
+    raster.rasterize(
+        scene, pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys
+    )
     keys = seen.keys.numpy()
     numbers = keys[keys < int(camera_raster.EMPTY_KEY)] & int(camera_raster.PRIMITIVE_MASK)
     owner = np.repeat(np.arange(len(scene.cluster_first)), scene.cluster_size)

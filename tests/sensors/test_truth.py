@@ -313,7 +313,9 @@ def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
     body_q[bodies, 3:] = frames.multiply(turn, body_q[bodies, 3:])
     primitives.update(dataclasses.replace(view, body_q=body_q, moved=np.array([tree])))
     shift, _ = truth.optical_flow(one, truth.render_buffers(primitives, NEAR, pose))
-    carried = np.append(np.isin(one.carrier_poses[:, :3], view.body_q[bodies, :3]).all(1), [False, False])[one.primitive]
+    carried = np.append(np.isin(one.carrier_poses[:, :3], view.body_q[bodies, :3]).all(1), [False, False])[
+        one.primitive
+    ]
     mine = (one.labels == label(Organ.BUNCH, bunch)) & carried
     assert mine.sum() > 1000
     point = _points(one, mine)

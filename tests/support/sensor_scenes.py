@@ -14,7 +14,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load
 from vinesim.scene.values import CameraInfo, Link, Shape, View
-from vinesim.sensors.camera.camera import CameraSpec, CameraRasterizer, pinhole
+from vinesim.sensors.camera.camera import CameraRasterizer, CameraSpec, pinhole
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster

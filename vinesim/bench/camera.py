@@ -21,7 +21,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load
 from vinesim.scene.values import CameraInfo, Measurement
-from vinesim.sensors.camera.camera import Camera, CameraSpec, CameraRasterizer, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives

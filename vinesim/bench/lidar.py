@@ -12,7 +12,7 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from vinesim.bench.camera import median_cpu_times, demo_scene, embree_scene, triangle_mesh
+from vinesim.bench.camera import demo_scene, embree_scene, median_cpu_times, triangle_mesh
 from vinesim.scene.values import Measurement
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer

@@ -21,7 +21,7 @@ from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load
 from vinesim.scene.values import Link, Measurement, Shape, View
-from vinesim.sensors.camera.camera import Camera, CameraSpec, CameraRasterizer, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
 from vinesim.sensors.camera.renderers import RendererUnavailable
 from vinesim.sensors.export.images import depth_colours, look_at, write_png
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
@@ -236,7 +236,11 @@ def _compare(folder: pathlib.Path, pictures: dict[str, PixelView]) -> None:
 
 
 def _draw(
-    folder: pathlib.Path, spec: CameraSpec, depths: dict[str, DepthStatistics], scans: dict[str, RangeStatistics], seen: np.ndarray
+    folder: pathlib.Path,
+    spec: CameraSpec,
+    depths: dict[str, DepthStatistics],
+    scans: dict[str, RangeStatistics],
+    seen: np.ndarray,
 ) -> None:
     """``sensors-depth.png``, ``sensors-lidar.png`` and ``sensors-berries.png``."""
     import matplotlib as mpl

@@ -39,7 +39,9 @@ def run(
     if not 0.0 <= actors <= 1.0:
         raise WrongUse(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     life = SceneRandomizer(actors) if actors > 0.0 else None
-    plan = DatasetPlan(load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check_renderer(renderer))
+    plan = DatasetPlan(
+        load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check_renderer(renderer)
+    )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crew: list[Share] = []
     try:

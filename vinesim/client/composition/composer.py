@@ -74,7 +74,7 @@ class CratePlacement:
     @property
     def pose(self) -> np.ndarray:
         """[7] in the world."""
-        return _at(self.x, self.y, self.yaw)
+        return _ground_pose(self.x, self.y, self.yaw)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class SceneComposer:
         if any(crate.fill > 0.0 for crate in self.crates):
             return self.populate(Physics(furnished))
         rigid = Rigid(furnished)  # plants that nobody picks from need not be ready to move
-        self._admit(rigid)
+        self._add_actors(rigid)
         return rest_snapshot(model, rigid.links(), rigid.link_q())
 
     def with_crates(self, model: Model) -> Model:
@@ -110,31 +110,31 @@ class SceneComposer:
         """In a world that is furnished: fill the crates, then let everybody in."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             fill_crate(physics, number, crate)
-        self._admit(physics.rigid)
+        self._add_actors(physics.rigid)
         return physics.view()
 
-    def _admit(self, rigid: Rigid) -> None:
+    def _add_actors(self, rigid: Rigid) -> None:
         """Let robots and people in."""
         for index, one in enumerate(self.robots):
-            pose = _at(one.x, one.y, one.yaw)
+            pose = _ground_pose(one.x, one.y, one.yaw)
             rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
-            pose = appearance.posed(standing(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
+            pose = appearance.posed(standing(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height)
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
-        _apart(rigid)
+        _check_clearance(rigid)
 
     def actor_records(self, model: Model) -> list[dict]:
         """Everything that is set down in a vineyard, as JSON: label, kind, where."""
-        told = []
+        records = []
         for organ, things, start in (
             (Organ.ROBOT, self.robots, 0), (Organ.HUMAN, self.people, 0), (Organ.BOX, self.crates, len(model.box_size)),
         ):  # fmt: skip
             for number, one in enumerate(things, start):
-                told.append({"kind": organ.name.lower(), "label": label(organ, number), **dataclasses.asdict(one)})
-        return told
+                records.append({"kind": organ.name.lower(), "label": label(organ, number), **dataclasses.asdict(one)})
+        return records
 
 
-def _at(x: float, y: float, yaw: float) -> np.ndarray:
+def _ground_pose(x: float, y: float, yaw: float) -> np.ndarray:
     return frames.pose(np.array([x, y, 0.0]), frames.yaw(yaw))
 
 
@@ -154,19 +154,23 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
     near = near[: int(physics.state.bunch_attached.sum())]
     chosen = near[: int(np.searchsorted(np.cumsum(bunch_masses(model)[near]), wanted))]
     if len(chosen) == len(near) and wanted > 0.0:
-        raise PlacementError(f"crate {number} wants {wanted:.1f} kg of bunches, more than the vineyard bears; fill it less")
+        raise PlacementError(
+            f"crate {number} wants {wanted:.1f} kg of bunches, more than the vineyard bears; fill it less"
+        )
     rng = np.random.default_rng([number, model.bunch_seed[0] if len(model.bunch_seed) else 0])
     waiting, inside_it = chosen.tolist(), []
     for _ in range(MAX_REFILLS):
         for bunch in waiting:
             if physics.state.bunch_attached[bunch]:
                 physics.pick(bunch)
-            top = max([CRATE_WALL, *(_top(physics, other) for other in inside_it)])
-            rigid.place_bunch(bunch, frames.compose(crate.pose, _above(model, bunch, inside, top, rng)), np.zeros(6))
+            top = max([CRATE_WALL, *(_top_height(physics, other) for other in inside_it)])
+            rigid.place_bunch(
+                bunch, frames.compose(crate.pose, _drop_pose(model, bunch, inside, top, rng)), np.zeros(6)
+            )
             inside_it.append(bunch)
-            _fall(rigid, FALL_STEPS)
-        _fall(rigid, SETTLE_STEPS)
-        middle = {bunch: _ends(physics, bunch).mean(0) - crate.pose[:3] for bunch in inside_it}
+            _step_rigid(rigid, FALL_STEPS)
+        _step_rigid(rigid, SETTLE_STEPS)
+        middle = {bunch: _rachis_ends(physics, bunch).mean(0) - crate.pose[:3] for bunch in inside_it}
         level = {bunch: frames.rotate(frames.conjugate(crate.pose[3:]), at)[:2] for bunch, at in middle.items()}
         waiting = [bunch for bunch, at in level.items() if (np.abs(at) > 0.5 * inside[:2]).any()]
         inside_it = [bunch for bunch in inside_it if bunch not in waiting]
@@ -175,7 +179,7 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
     return chosen.tolist()
 
 
-def _above(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.random.Generator) -> np.ndarray:
+def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.random.Generator) -> np.ndarray:
     """Pose [7] of a bunch that lies just above ``top`` [m] of a heap in a crate, in the crate's frame."""
     length, radius = float(model.bunch_length[bunch]), float(model.bunch_radius[bunch])
     room = np.maximum(0.5 * inside[:2] - [0.5 * length + 0.02, radius + 0.01], 0.0)
@@ -185,26 +189,26 @@ def _above(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.ran
     return frames.pose(np.array([*start, top + radius + 0.01]), frames.multiply(frames.yaw(yaw), roll))
 
 
-def _ends(physics: Physics, bunch: int) -> np.ndarray:
+def _rachis_ends(physics: Physics, bunch: int) -> np.ndarray:
     """Both ends [2, 3] m of a loose bunch's rachis."""
     reach = np.array([[0.0, 0.0, 0.0], [float(physics.model.bunch_length[bunch]), 0.0, 0.0]])
     pose = physics.rigid.bunch_pose(bunch)
     return pose[:3] + frames.rotate(pose[3:], reach)
 
 
-def _top(physics: Physics, bunch: int) -> float:
+def _top_height(physics: Physics, bunch: int) -> float:
     """[m] Height of the highest point that a bunch may reach."""
-    return float(_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
+    return float(_rachis_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 
-def _fall(rigid: Rigid, ticks: int) -> None:
+def _step_rigid(rigid: Rigid, ticks: int) -> None:
     """Let loose things fall, without the plants."""
     for _ in range(ticks):
         rigid.prep()
         rigid.finish()
 
 
-def _apart(rigid: Rigid) -> None:
+def _check_clearance(rigid: Rigid) -> None:
     """:class:`NoRoom` if whoever has come stands in somebody or something."""
     rigid.prep()
     for names in rigid.overlaps():

@@ -10,7 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.client.composition.composer import CratePlacement, PlacementError, PersonPlacement, RobotPlacement, SceneComposer
+from vinesim.client.composition.composer import (
+    CratePlacement,
+    PersonPlacement,
+    PlacementError,
+    RobotPlacement,
+    SceneComposer,
+)
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
 from vinesim.scene import appearance
@@ -31,7 +37,7 @@ WIND_SPEED = (0.5, 3.5)
 """Mean wind in the canopy [m/s]: GUESSED, calm to a fresh breeze above it."""
 WIND_STEPS = (50, 130)
 """[tick] from calm to the picture."""
-_TRIES = 40
+_MAX_TRIES = 40
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -51,7 +57,7 @@ class SceneRandomizer:
             return None
         bunch = int(rng.integers(len(model.bunch_body)))
         middle = model.forward(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
-        for _ in range(_TRIES):
+        for _ in range(_MAX_TRIES):
             stage = random_composition(model, middle, rng)
             physics = Physics(stage.with_crates(model))
             try:
@@ -60,7 +66,7 @@ class SceneRandomizer:
                 continue
             happens: dict[str, Any] = {"actors": stage.actor_records(model)}
             if rng.uniform() < WIND_SHARE:
-                happens["wind"] = _blow(physics, rng)
+                happens["wind"] = _simulate_wind(physics, rng)
             return physics.view(), middle, happens
         return None
 
@@ -74,7 +80,7 @@ def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generato
     kinds += ["person"] * int(rng.integers(0, 3)) + ["crate"] * int(rng.integers(0, 3))
     robots, people, crates = [], [], []
     for kind in kinds or ["person"]:
-        spot = _room(middle, taken, FOOTPRINT_RADIUS[kind], rng)
+        spot = _free_place(middle, taken, FOOTPRINT_RADIUS[kind], rng)
         yaw = float(rng.uniform(-np.pi, np.pi))
         if spot is None:
             continue
@@ -91,11 +97,11 @@ def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generato
     return SceneComposer(tuple(robots), tuple(people), tuple(crates))
 
 
-def _room(
+def _free_place(
     middle: np.ndarray, taken: list[tuple[np.ndarray, float]], radius: float, rng: np.random.Generator
 ) -> np.ndarray | None:
     """A place [2] m for a disc, at which no other is."""
-    for _ in range(_TRIES):
+    for _ in range(_MAX_TRIES):
         away, around = rng.uniform(MIN_DISTANCE, MAX_DISTANCE), rng.uniform(0.0, 2.0 * np.pi)
         spot = middle + away * np.array([np.cos(around), np.sin(around)])
         if all(np.hypot(*(spot - other)) > radius + reach for other, reach in taken):
@@ -103,7 +109,7 @@ def _room(
     return None
 
 
-def _blow(physics: Physics, rng: np.random.Generator) -> dict[str, Any]:
+def _simulate_wind(physics: Physics, rng: np.random.Generator) -> dict[str, Any]:
     """Let wind blow for a while; what it was."""
     speed, heading = float(rng.uniform(*WIND_SPEED)), float(rng.uniform(-np.pi, np.pi))
     ticks, seed = int(rng.integers(*WIND_STEPS)), int(rng.integers(1 << 31))

@@ -135,7 +135,7 @@ class _Perception:
         from vinesim.sensors.camera.camera import Camera, CameraSpec
         from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
         from vinesim.sensors.scene.primitives import Primitives
-        from vinesim.sensors.scheduler import SensorScheduler, ScheduledSensor, load_kernels
+        from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
 
         load_kernels()
         setup, mounts = self.setup, []
@@ -186,7 +186,7 @@ class _Perception:
                 letter.time, letter.tick, self._state.body_q.copy(), self._state.bunch_attached.copy(), self._links,
                 letter.link_q, letter.trees,
             )  # fmt: skip
-            self.eyes.see(view, letter.poses)
+            self.eyes.submit(view, letter.poses)
         if letter.bodies is not None:
             self.pipe.send(("read", (letter.number, letter.links is not None)))
         if self.node is not None:
@@ -209,7 +209,7 @@ class _Perception:
     def _figures(self) -> dict[str, Any]:
         figures = {
             "sent": {},
-            "eyes": any(mount.wanted() for mount in self.eyes.mounts),
+            "eyes": any(sensor.is_wanted() for sensor in self.eyes.sensors),
             "frames": dict(self.eyes.frames),
             "frames_dropped": dict(self.eyes.dropped),
         }

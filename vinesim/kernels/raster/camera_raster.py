@@ -57,7 +57,7 @@ class Pinhole:
     """Where a camera is and how it projects. Pixel centres have whole coordinates (sensor_msgs/CameraInfo)."""
 
     eye: wp.vec3
-    turn: wp.mat33
+    rotation: wp.mat33
     """Rows: right, down, forward, in the world."""
     fx: float
     fy: float
@@ -65,9 +65,9 @@ class Pinhole:
     cy: float
     width: int
     height: int
-    reach: float
+    max_depth: float
     """Farthest depth that is drawn [m]."""
-    close: float
+    near_radius: float
     """Radius of a ball around the eye that holds all of the view within the depth CLOSE [m]."""
 
 
@@ -142,10 +142,10 @@ def cull_clusters(
     """One thread tells how near one cluster may come to the eye, or FAR if no pixel can see it."""
     i = wp.tid()
     r = ball[i][3]
-    p = lens.turn * (xyz(ball[i]) - lens.eye)
+    p = lens.rotation * (xyz(ball[i]) - lens.eye)
     distance = wp.length(p) - r
     bound = sphere_bounds(lens, p, r)
-    seen = r > 0.0 and p[2] > -r and p[2] - r < lens.reach
+    seen = r > 0.0 and p[2] > -r and p[2] - r < lens.max_depth
     seen = seen and bound[1] > -1.0 and bound[0] < float(lens.width)
     seen = seen and bound[3] > -1.0 and bound[2] < float(lens.height)
     distance_out[i] = wp.where(seen, wp.max(distance, 0.0), FAR)
@@ -173,12 +173,12 @@ def raster_spheroids(
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
-        p = lens.turn * (xyz(a4) - lens.eye)
+        p = lens.rotation * (xyz(a4) - lens.eye)
         r = a4[3] * wp.max(b4[3], 1.0)
         if p[2] > -r:
             box = clip_to_image(lens, sphere_bounds(lens, p, r))
             if box[0] < box[1] and box[2] < box[3]:
-                axis = lens.turn * xyz(b4)
+                axis = lens.rotation * xyz(b4)
                 stretch = 1.0 / b4[3] - 1.0
                 centre = scale_along(p, axis, stretch)
                 nearest = wp.int64(int(wp.max(p[2] - r, 0.0) * 1.0e6)) << wp.int64(32)
@@ -201,7 +201,7 @@ def raster_spheroids(
                         depths[m] = hit_sphere(centre, a4[3], scale_along(pixel_ray(lens, xs[m], ys[m]), axis, stretch))
                         m += 1
                     for m in range(n):
-                        depth_test(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
+                        depth_test(ys[m] * lens.width + xs[m], depths[m], i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -226,8 +226,8 @@ def raster_cones(
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
-        a = lens.turn * (xyz(a4) - lens.eye)
-        b = lens.turn * (xyz(b4) - lens.eye)
+        a = lens.rotation * (xyz(a4) - lens.eye)
+        b = lens.rotation * (xyz(b4) - lens.eye)
         r = wp.max(a4[3], b4[3])
         if wp.max(a[2], b[2]) > -r:
             # What reaches no farther than CLOSE is in view only within a small ball around the eye. An axis that
@@ -239,7 +239,7 @@ def raster_cones(
             clear = True
             if wp.min(a[2], b[2]) < cut:
                 h = wp.clamp(-wp.dot(a, ba) / wp.dot(ba, ba), 0.0, 1.0)
-                clear = wp.length(a + ba * h) - r > lens.close
+                clear = wp.length(a + ba * h) - r > lens.near_radius
                 if a[2] < cut and b[2] > cut:
                     ca = a + ba * ((cut - a[2]) / ba[2])
                 if b[2] < cut and a[2] > cut:
@@ -294,7 +294,7 @@ def raster_cones(
                     depths[m] = hit_cone(a, a4[3], b, b4[3], pixel_ray(lens, xs[m], ys[m]))
                     m += 1
                 for m in range(n):
-                    depth_test(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
+                    depth_test(ys[m] * lens.width + xs[m], depths[m], i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -319,13 +319,13 @@ def raster_leaves(
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         size = a4[3]
-        p = lens.turn * (xyz(a4) - lens.eye)
+        p = lens.rotation * (xyz(a4) - lens.eye)
         if p[2] > -1.6 * size:
             b4 = shapes.b[i]
             bend = shapes.d[i]
             number = int(b4[3])
-            rib = lens.turn * xyz(b4)
-            up = lens.turn * xyz(shapes.c[i])
+            rib = lens.rotation * xyz(b4)
+            up = lens.rotation * xyz(shapes.c[i])
             side = wp.cross(rib, up)
             # octagon around the picture of the blade: bounds of x, y, x + y, x - y
             x_low = float(UNBOUND)
@@ -400,17 +400,17 @@ def raster_leaves(
                         m += 1
                     for k in range(n):
                         t = depths[k]
-                        if t < lens.reach:
+                        if t < lens.max_depth:
                             at = ys[k] * lens.width + xs[k]
                             ray = dz + dx * float(xs[k]) + dy * float(ys[k])
                             if t < 0.0:
                                 t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
-                                depth_test(at, t, i, lens.reach, keys_out)
+                                depth_test(at, t, i, lens.max_depth, keys_out)
                             elif depth_key(t, i) < keys_out[at]:
                                 u = eye[0] + t * ray[0]
                                 v = eye[1] + t * ray[1]
                                 if inside_outline(shapes.outline, number, u, v, smooth):
-                                    depth_test(at, t, i, lens.reach, keys_out)
+                                    depth_test(at, t, i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -434,7 +434,7 @@ def raster_solids(
         a4 = shapes.a[i]
         b4 = shapes.b[i]
         c4 = shapes.c[i]
-        p = lens.turn * (xyz(a4) - lens.eye)
+        p = lens.rotation * (xyz(a4) - lens.eye)
         half = wp.vec3(a4[3], c4[0], c4[1])
         q = as_quat(b4)
         end = p
@@ -443,15 +443,15 @@ def raster_solids(
         if kind == ELLIPSOID:
             r = wp.max(wp.max(half[0], half[1]), half[2])
         if kind == CYLINDER:
-            end = lens.turn * (xyz(b4) - lens.eye)
+            end = lens.rotation * (xyz(b4) - lens.eye)
             centre = (p + end) * 0.5
             r = wp.length(wp.vec2(wp.length(end - p) * 0.5, a4[3]))
         if centre[2] > -r:
             bound = sphere_bounds(lens, centre, r)
             if kind == BOX and centre[2] - r > NEAR_DEPTH:
-                ex = lens.turn * wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
-                ey = lens.turn * wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
-                ez = lens.turn * wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
+                ex = lens.rotation * wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
+                ey = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
+                ez = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
                 bound = wp.vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND)
                 for n in range(8):
                     corner = (
@@ -465,7 +465,7 @@ def raster_solids(
                     bound = wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
             box = clip_to_image(lens, bound)
             if box[0] < box[1] and box[2] < box[3]:
-                back = wp.transpose(lens.turn)
+                back = wp.transpose(lens.rotation)
                 eye = wp.vec3(0.0, 0.0, 0.0)
                 ax = eye
                 ay = eye
@@ -489,7 +489,7 @@ def raster_solids(
                                 t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
                             else:
                                 t = hit_cylinder(p, end, a4[3], d)
-                            depth_test(at, t, i, lens.reach, keys_out)
+                            depth_test(at, t, i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -509,9 +509,9 @@ def raster_triangles(
     cluster = visible[k]
     first = clusters.first[cluster]
     for i in range(first + lane, first + clusters.size[cluster], lanes):
-        p = lens.turn * (xyz(shapes.a[i]) - lens.eye)
-        q = lens.turn * (xyz(shapes.b[i]) - lens.eye)
-        r = lens.turn * (xyz(shapes.c[i]) - lens.eye)
+        p = lens.rotation * (xyz(shapes.a[i]) - lens.eye)
+        q = lens.rotation * (xyz(shapes.b[i]) - lens.eye)
+        r = lens.rotation * (xyz(shapes.c[i]) - lens.eye)
         n = wp.cross(q - p, r - p)
         if wp.dot(p, n) < 0.0 and wp.max(wp.max(p[2], q[2]), r[2]) > 0.0:
             bound = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
@@ -533,17 +533,17 @@ def raster_triangles(
                 for x in range(box[0], box[1]):
                     at = y * lens.width + x
                     if keys_out[at] > nearest:
-                        depth_test(at, hit_triangle(p, q, r, pixel_ray(lens, x, y)), i, lens.reach, keys_out)
+                        depth_test(at, hit_triangle(p, q, r, pixel_ray(lens, x, y)), i, lens.max_depth, keys_out)
 
 
 @wp.func
 def ground_depth(lens: Pinhole, x: int, y: int) -> float:
     """Depth at which a pixel's ray meets the ground, z = 0."""
     d = pixel_ray(lens, x, y)
-    fall = lens.turn[0, 2] * d[0] + lens.turn[1, 2] * d[1] + lens.turn[2, 2]
+    fall = lens.rotation[0, 2] * d[0] + lens.rotation[1, 2] * d[1] + lens.rotation[2, 2]
     meets = fall < -1.0e-6 and lens.eye[2] > 0.0
     t = -lens.eye[2] / wp.where(meets, fall, -1.0)
-    return wp.where(meets and t < lens.reach, t, FAR)
+    return wp.where(meets and t < lens.max_depth, t, FAR)
 
 
 @wp.kernel

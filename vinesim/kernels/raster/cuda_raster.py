@@ -8,7 +8,16 @@ No kernel asks the host how long the lists have become: a frame is two launches.
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import NEAR_DEPTH, SMOOTH_SIZE, UNBOUND, Pinhole, sphere_bounds, depth_test, clip_to_image, pixel_ray
+from vinesim.kernels.raster.camera_raster import (
+    NEAR_DEPTH,
+    SMOOTH_SIZE,
+    UNBOUND,
+    Pinhole,
+    clip_to_image,
+    depth_test,
+    pixel_ray,
+    sphere_bounds,
+)
 from vinesim.kernels.raster.primitives import (
     BOX,
     CONE,
@@ -66,7 +75,7 @@ def make_outline(lens: Pinhole, bound: wp.vec4, depth: float, rising: wp.vec3, f
     o.box = clip_to_image(lens, bound)
     o.rising = rising
     o.falling = falling
-    o.depth = wp.clamp(depth, 0.0, lens.reach)
+    o.depth = wp.clamp(depth, 0.0, lens.max_depth)
     return o
 
 
@@ -75,9 +84,9 @@ def leaf_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
     a4 = s.a[i]
     b4 = s.b[i]
     size = a4[3]
-    p = lens.turn * (xyz(a4) - lens.eye)
-    rib = lens.turn * xyz(b4)
-    up = lens.turn * xyz(s.c[i])
+    p = lens.rotation * (xyz(a4) - lens.eye)
+    rib = lens.rotation * xyz(b4)
+    up = lens.rotation * xyz(s.c[i])
     side = wp.cross(rib, up)
     heights = leaf_heights(s.d[i])
     depth = float(FAR)
@@ -105,8 +114,8 @@ def leaf_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
 def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
     a4 = s.a[i]
     b4 = s.b[i]
-    a = lens.turn * (xyz(a4) - lens.eye)
-    b = lens.turn * (xyz(b4) - lens.eye)
+    a = lens.rotation * (xyz(a4) - lens.eye)
+    b = lens.rotation * (xyz(b4) - lens.eye)
     r = wp.max(a4[3], b4[3])
     bound = EMPTY_BOUNDS
     strip = UNBOUNDED_STRIP
@@ -120,7 +129,7 @@ def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
         clear = True
         if wp.min(a[2], b[2]) < cut:
             h = wp.clamp(-wp.dot(a, axis) / wp.dot(axis, axis), 0.0, 1.0)
-            clear = wp.length(a + axis * h) - r > lens.close
+            clear = wp.length(a + axis * h) - r > lens.near_radius
             if a[2] < cut and b[2] > cut:
                 start = a + axis * ((cut - a[2]) / axis[2])
             if b[2] < cut and a[2] > cut:
@@ -141,9 +150,9 @@ def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
 
 @wp.func
 def triangle_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
-    a = lens.turn * (xyz(s.a[i]) - lens.eye)
-    b = lens.turn * (xyz(s.b[i]) - lens.eye)
-    c = lens.turn * (xyz(s.c[i]) - lens.eye)
+    a = lens.rotation * (xyz(s.a[i]) - lens.eye)
+    b = lens.rotation * (xyz(s.b[i]) - lens.eye)
+    c = lens.rotation * (xyz(s.c[i]) - lens.eye)
     depth = wp.min(wp.min(a[2], b[2]), c[2])
     bound = EMPTY_BOUNDS
     if wp.dot(a, wp.cross(b - a, c - a)) < 0.0 and wp.max(wp.max(a[2], b[2]), c[2]) > 0.0:
@@ -161,7 +170,7 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
     a4 = s.a[i]
     b4 = s.b[i]
     c4 = s.c[i]
-    centre = lens.turn * (xyz(a4) - lens.eye)
+    centre = lens.rotation * (xyz(a4) - lens.eye)
     half = wp.vec3(a4[3], c4[0], c4[1])
     reach = wp.length(half)
     if kind == SPHEROID:
@@ -169,7 +178,7 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
     elif kind == ELLIPSOID:
         reach = wp.max(wp.max(half[0], half[1]), half[2])
     elif kind == CYLINDER:
-        end = lens.turn * (xyz(b4) - lens.eye)
+        end = lens.rotation * (xyz(b4) - lens.eye)
         reach = wp.length(wp.vec2(wp.length(end - centre) * 0.5, a4[3]))
         centre = (centre + end) * 0.5
     depth = centre[2] - reach
@@ -179,7 +188,7 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
             for n in range(8):
                 corner = wp.vec3(float(n & 1) * 2.0 - 1.0, float(n & 2) - 1.0, float(n & 4) * 0.5 - 1.0)
                 away = wp.quat_rotate(as_quat(b4), wp.cw_mul(half, corner))
-                bound = extend_bounds(lens, bound, centre + lens.turn * away)
+                bound = extend_bounds(lens, bound, centre + lens.rotation * away)
         else:
             bound = sphere_bounds(lens, centre, reach)
     return make_outline(lens, bound, depth, UNBOUNDED_STRIP, UNBOUNDED_STRIP)
@@ -223,18 +232,20 @@ def draw_tile(s: Shapes, lens: Pinhole, piece: wp.vec4i, lane: int, lanes: int, 
     top = piece[1] >> 16
     wide = piece[2] & 0xFFFF
     nearest = wp.int64(piece[3]) << wp.int64(32)
-    back = wp.transpose(lens.turn)
+    back = wp.transpose(lens.rotation)
     smooth = wp.int32(0)
     if s.kind[i] == LEAF:
         a4 = s.a[i]
-        if a4[3] * lens.fx > wp.dot(lens.turn[2], xyz(a4) - lens.eye) * SMOOTH_SIZE:
+        if a4[3] * lens.fx > wp.dot(lens.rotation[2], xyz(a4) - lens.eye) * SMOOTH_SIZE:
             smooth = 1
     for n in range(lane, wide * (piece[2] >> 16), lanes):
         x = left + n % wide
         y = top + n // wide
         pixel = y * lens.width + x
         if keys_out[pixel] > nearest:
-            depth_test(pixel, hit_primitive(s, i, lens.eye, back * pixel_ray(lens, x, y), smooth), i, lens.reach, keys_out)
+            depth_test(
+                pixel, hit_primitive(s, i, lens.eye, back * pixel_ray(lens, x, y), smooth), i, lens.max_depth, keys_out
+            )
 
 
 @wp.kernel
@@ -256,14 +267,16 @@ def list_tiles(
     k, lane = wp.tid()
     cluster = which[k]
     r = ball[cluster][3]
-    p = lens.turn * (xyz(ball[cluster]) - lens.eye)
+    p = lens.rotation * (xyz(ball[cluster]) - lens.eye)
     seen = clip_to_image(lens, sphere_bounds(lens, p, r))
-    if r > 0.0 and p[2] > -r and p[2] - r < lens.reach and seen[0] < seen[1] and seen[2] < seen[3]:
+    if r > 0.0 and p[2] > -r and p[2] - r < lens.max_depth and seen[0] < seen[1] and seen[2] < seen[3]:
         mine = k % TILE_LISTS
         first = clusters.first[cluster]
         for i in range(first + lane, first + clusters.size[cluster], lanes):
             o = outline_of(shapes, i, lens)
-            side = wp.where(wp.max(o.box[1] - o.box[0], o.box[3] - o.box[2]) > LARGE_PRIMITIVE, 2 * TILE_SIZE, TILE_SIZE)
+            side = wp.where(
+                wp.max(o.box[1] - o.box[0], o.box[3] - o.box[2]) > LARGE_PRIMITIVE, 2 * TILE_SIZE, TILE_SIZE
+            )
             needed = wp.int32(0)
             for top in range(o.box[2], o.box[3], side):
                 span = column_span(o, top, wp.min(top + side, o.box[3]))

@@ -108,8 +108,8 @@ def cast_camera(
 ):
     """One thread follows the ray of one pixel: what the rasteriser must find too."""
     pixel = wp.tid()
-    back = wp.transpose(lens.turn)
+    back = wp.transpose(lens.rotation)
     d = back * pixel_ray(lens, pixel % lens.width, pixel // lens.width)
-    best = first_hit(hierarchies, shapes, lens.eye, d, lens.reach, lens.fx, back * wp.vec3(0.0, 0.0, 1.0))
+    best = first_hit(hierarchies, shapes, lens.eye, d, lens.max_depth, lens.fx, back * wp.vec3(0.0, 0.0, 1.0))
     depth_out[pixel] = wp.where(best.primitive == -1, FAR, best.t)
     primitive_out[pixel] = best.primitive

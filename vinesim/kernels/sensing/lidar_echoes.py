@@ -32,12 +32,12 @@ class Receiver:
 
 
 @wp.func
-def measured_range(r: Receiver, echo: wp.vec4, luck: float) -> float:
+def measured_range(r: Receiver, echo: wp.vec4, noise: float) -> float:
     """Range of an echo [m]: noise grows as the signal comes near the weakest that is noticed."""
     sigma = r.noise
     if r.weakest > 0.0:
         sigma = wp.max(sigma, r.weak_noise * wp.sqrt(r.weakest / echo[0]))
-    range = echo[1] + sigma * luck
+    range = echo[1] + sigma * noise
     if r.step > 0.0:
         range = wp.round(range / r.step) * r.step
     return range
@@ -66,7 +66,7 @@ def detect_returns(
     primitive: wp.array(dtype=wp.int32),
     ground_label: int,
     ground_organ: int,
-    luck: wp.array2d(dtype=wp.float32),
+    noise: wp.array2d(dtype=wp.float32),
     # out
     xyz_out: wp.array2d(dtype=wp.vec3),
     intensity_out: wp.array2d(dtype=wp.float32),
@@ -124,7 +124,7 @@ def detect_returns(
                 shown = name[k]
             end = t[k]
             k += 1
-        if signal > 0.0 and signal * wp.exp(receiver.flicker * luck[shot, 2]) > receiver.weakest:
+        if signal > 0.0 and signal * wp.exp(receiver.flicker * noise[shot, 2]) > receiver.weakest:
             last = wp.vec4(signal, moment / signal, sum_light, shown)
             if signal > strongest[0]:
                 second = strongest
@@ -138,7 +138,7 @@ def detect_returns(
     label_out[shot, 0] = -1
     if echo[0] > 0.0:
         label_out[shot, 0] = label_of(primitive[int(echo[3])], label, ground_label)
-        xyz_out[shot, 0] = d * measured_range(receiver, echo, luck[shot, 0])
+        xyz_out[shot, 0] = d * measured_range(receiver, echo, noise[shot, 0])
         intensity_out[shot, 0] = wp.clamp(100.0 * echo[2], 0.0, 255.0)
     if receiver.returns == 2:
         if last[1] == strongest[1]:
@@ -146,5 +146,5 @@ def detect_returns(
         label_out[shot, 1] = -1
         if last[0] > 0.0 and wp.abs(last[1] - strongest[1]) >= receiver.separation:
             label_out[shot, 1] = label_of(primitive[int(last[3])], label, ground_label)
-            xyz_out[shot, 1] = d * measured_range(receiver, last, luck[shot, 1])
+            xyz_out[shot, 1] = d * measured_range(receiver, last, noise[shot, 1])
             intensity_out[shot, 1] = wp.clamp(100.0 * last[2], 0.0, 255.0)

@@ -21,8 +21,8 @@ SURFACE_GAP = wp.constant(1.0)
 class Stereo:
     """One kind of stereo camera (:class:`vinesim.sensors.camera.stereo.StereoSpec`)."""
 
-    reach: float
-    """Focal length times baseline [px m]: disparity = reach / depth."""
+    focal_baseline: float
+    """Focal length times baseline [px m]: disparity = focal_baseline / depth."""
     baseline: float
     scale: float
     """Imager pixels along one pixel of the picture, at most 1: a picture may be finer than what is measured."""
@@ -81,15 +81,15 @@ def measure_depth(
     disparity: wp.array(dtype=wp.float32),
     grey: wp.array(dtype=wp.uint8),
     second_depth: wp.array(dtype=wp.float32),
-    luck: wp.array3d(dtype=wp.float32),
+    noise: wp.array3d(dtype=wp.float32),
     run: int,
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
     """One thread measures ``run`` pixels of the imager for the picture; NaN where no match is found (REP-118)."""
     first = wp.tid() * run
-    columns = luck.shape[2]
-    reach = stereo.reach
+    columns = noise.shape[2]
+    focal_baseline = stereo.focal_baseline
     slope = stereo.slope
     stride = stereo.stride
     width = lens.width
@@ -134,19 +134,19 @@ def measure_depth(
         if wp.max(nearest - own, own - farthest) < surface_gap(slope, own):
             if own > 0.0:  # 1 / z is linear in the picture: its slopes are those of the surface
                 ray = pixel_ray(lens, x, y)
-                per = 1.0 / (12.0 * float(stride) * reach)
+                per = 1.0 / (12.0 * float(stride) * focal_baseline)
                 a = across * per * lens.fx
                 b = down * per * lens.fy
-                inverse = own / reach
+                inverse = own / focal_baseline
                 normal = wp.vec3(a, b, inverse - a * ray[0] - b * ray[1])
                 slant = inverse / (wp.length(normal) * wp.length(ray))
         else:  # an edge: the window goes to the surface that fills most of it
-            looks = WindowDisparities()
+            disparities = WindowDisparities()
             for k in range(WINDOW_SIDE * WINDOW_SIDE):
                 i = wp.clamp(x + (k % WINDOW_SIDE - WINDOW_SIDE // 2) * stride, 0, width - 1)
                 j = wp.clamp(y + (k // WINDOW_SIDE - WINDOW_SIDE // 2) * stride, 0, height - 1)
                 d = disparity[j * width + i]
-                looks[k] = d
+                disparities[k] = d
                 nearest = wp.max(nearest, d)
                 farthest = wp.min(farthest, d)
             best = float(-1.0)
@@ -156,9 +156,9 @@ def measure_depth(
                 votes = float(0.0)
                 mean = float(0.0)
                 for k in range(WINDOW_SIDE * WINDOW_SIDE):
-                    mine = wp.where(wp.abs(looks[k] - candidate) < within, 1.0, 0.0)
+                    mine = wp.where(wp.abs(disparities[k] - candidate) < within, 1.0, 0.0)
                     votes += mine
-                    mean += mine * looks[k]
+                    mean += mine * disparities[k]
                 weight = votes * wp.where(c == 0, stereo.fattening, 1.0)
                 if weight > best:
                     best = weight
@@ -173,21 +173,21 @@ def measure_depth(
             level = wp.clamp(level, 0, second.height - 1)
             if there < 0 or there >= second.width:
                 kept = False
-            elif reach > second_depth[level * second.width + there] * (own + surface_gap(slope, own)):
+            elif focal_baseline > second_depth[level * second.width + there] * (own + surface_gap(slope, own)):
                 kept = False  # something else stands before it there
             lost = 1.0 - linear_step(stereo.slant_lost, stereo.slant_kept, slant)
             if brightest - darkest < stereo.contrast:
-                lost = wp.max(lost, linear_step(stereo.projector, 2.0 * stereo.projector, reach / own))
+                lost = wp.max(lost, linear_step(stereo.projector, 2.0 * stereo.projector, focal_baseline / own))
             if bright >= stereo.saturation:
                 lost = 1.0
-        kept = kept and normal_cdf(luck[1, row, column]) >= lost
+        kept = kept and normal_cdf(noise[1, row, column]) >= lost
         z = float(wp.inf)
         if found > 0.0:
-            noisy = found + stereo.sigma * luck[0, row, column]
+            noisy = found + stereo.sigma * noise[0, row, column]
             if stereo.step > 0.0:
                 noisy = wp.round(noisy / stereo.step) * stereo.step
             if noisy > 0.0:
-                z = reach / noisy
+                z = focal_baseline / noisy
         if z > stereo.farthest:
             z = float(wp.inf)
         elif z < stereo.nearest:

@@ -265,7 +265,9 @@ def raster_shadow_map(
 
 
 @wp.func
-def sun_visibility(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.array(dtype=wp.vec2), taps: int) -> float:
+def sun_visibility(
+    m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.array(dtype=wp.vec2), taps: int
+) -> float:
     """Share of the sun's disc seen from ``p``; -1 outside the map. Soft by the distance of what stands between."""
     facing = wp.abs(wp.dot(n, m.sun))
     e = p + n * (m.texel * (1.0 + 1.6 * (1.0 - facing))) - m.corner

@@ -29,14 +29,16 @@ from vinesim.sensors.scene.primitives import Primitives
 
 MAX_DEPTH = 500.0
 """Nothing is drawn beyond this depth [m]."""
-_RASTER = (
+_KERNELS = (
     (camera_raster.raster_cones, (CONE,)),
     (camera_raster.raster_spheroids, (SPHEROID,)),
     (camera_raster.raster_triangles, (TRIANGLE,)),
     (camera_raster.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
     (camera_raster.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
 )
-_STAGE = np.array([next(i for i, (_, kinds) in enumerate(_RASTER) if kind in kinds) for kind in range(TRIANGLE + 1)])
+_KERNEL_OF_KIND = np.array(
+    [next(i for i, (_, kinds) in enumerate(_KERNELS) if kind in kinds) for kind in range(TRIANGLE + 1)]
+)
 """Which of these draws a kind."""
 
 
@@ -98,12 +100,12 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> camera_raster.Pinhole:
         raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
     lens = camera_raster.Pinhole()
     lens.eye = wp.vec3(*map(float, pose[:3]))
-    lens.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+    lens.rotation = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
     lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
-    lens.width, lens.height, lens.reach = int(info.width), int(info.height), MAX_DEPTH
+    lens.width, lens.height, lens.max_depth = int(info.width), int(info.height), MAX_DEPTH
     wide = max(info.cx, info.width - info.cx) / info.fx
     high = max(info.cy, info.height - info.cy) / info.fy
-    lens.close = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
+    lens.near_radius = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
     return lens
 
 
@@ -140,7 +142,7 @@ class CameraRasterizer:
         if primitives.rasterizer is None:
             distance = self.cluster_distances(primitives, lens)
             seen = np.flatnonzero(distance < float(shapes.FAR))
-            self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+            self._rasterize(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
         else:
             primitives.rasterizer.rasterize(primitives, lens, None, self.keys)
         run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
@@ -168,25 +170,29 @@ class CameraRasterizer:
         if len(self._distance) != clusters:
             self._distance = wp.empty(clusters, dtype=float, device=self.device)
         wp.launch(
-            camera_raster.cull_clusters, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
+            camera_raster.cull_clusters,
+            clusters,
+            inputs=[primitives.ball, lens],
+            outputs=[self._distance],
+            device=self.device,
         )
         return self._distance.numpy()
 
     def coverage(self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray) -> np.ndarray:
         """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
         if primitives.rasterizer is None:
-            self._raster(primitives, lens, clusters)
+            self._rasterize(primitives, lens, clusters)
         else:
             primitives.rasterizer.rasterize(primitives, lens, clusters, self.keys)
         return self.keys.numpy().reshape(self.height, self.width) < int(camera_raster.EMPTY_KEY)
 
-    def _raster(self, primitives: Primitives, lens: camera_raster.Pinhole, seen: np.ndarray) -> None:
+    def _rasterize(self, primitives: Primitives, lens: camera_raster.Pinhole, seen: np.ndarray) -> None:
         """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
         self._keys.fill(int(camera_raster.EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
-        stage = _STAGE[kind]
-        for number, (kernel, _) in enumerate(_RASTER):
+        stage = _KERNEL_OF_KIND[kind]
+        for number, (kernel, _) in enumerate(_KERNELS):
             mine = seen[stage == number]
             if len(mine):
                 wp.launch(
@@ -249,12 +255,14 @@ class Camera:
         if period is None:
             period = 0.0 if self.quality == "still" else 0.2
         self.rasterizer = CameraRasterizer(width, height, self.device)
-        self._samples = self.rasterizer
+        self._supersampled = self.rasterizer
         if samples > 1:
-            self._samples = CameraRasterizer(width * samples, height * samples, self.device)
-        self._sunlight = Sunlight(self.sun, taps=quality.taps, period=period, fine=quality.shadow_texel_divisor, device=self.device)
+            self._supersampled = CameraRasterizer(width * samples, height * samples, self.device)
+        self._sunlight = Sunlight(
+            self.sun, taps=quality.taps, period=period, fine=quality.shadow_texel_divisor, device=self.device
+        )
         self._exposure = Exposure(width, height, samples, self.exposure, self.device)
-        self._landing: list[wp.array] = []
+        self._host_buffers: list[wp.array] = []
         reach = self.spec.nearest.value, self.spec.farthest.value
         self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, CameraRasterizer, self.device)
 
@@ -273,7 +281,7 @@ class Camera:
         pose = np.array(pose, float)
         picture = self.render_on_device(primitives, pose, time)
         shape = (self.info.height, self.info.width)
-        rgb, exact, labels = self._fetch(picture, self.rasterizer.depth, self.rasterizer.labels)
+        rgb, exact, labels = self._download(picture, self.rasterizer.depth, self.rasterizer.labels)
         rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
         if self._stereo and measure_depth:
             lens, dice = pinhole(self.info, pose), spec_file.noise_rng(self.seed, self.name, self.image_index)
@@ -293,15 +301,15 @@ class Camera:
             exact_depth=exact,
         )
 
-    def _fetch(self, *arrays: wp.array) -> list[np.ndarray]:
+    def _download(self, *arrays: wp.array) -> list[np.ndarray]:
         """Copies for the host: from a GPU through memory that it can write to, all at once."""
         if self.device != "cpu":
-            if not self._landing:
-                self._landing = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
-            for array, place in zip(arrays, self._landing, strict=True):
+            if not self._host_buffers:
+                self._host_buffers = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
+            for array, place in zip(arrays, self._host_buffers, strict=True):
                 wp.copy(place, array)
             wp.synchronize_stream(self.device)
-            arrays = tuple(self._landing)
+            arrays = tuple(self._host_buffers)
         return [a.numpy().copy() for a in arrays]
 
     def render_on_device(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> wp.array:
@@ -310,7 +318,7 @@ class Camera:
         lens = pinhole(self.info, pose)
         seen = self.rasterizer
         seen.draw(primitives, lens)
-        seen, quality = self._samples, self._quality
+        seen, quality = self._supersampled, self._quality
         if quality.samples > 1:
             lens = pinhole(supersampled(self.info, quality.samples), pose)
             seen.draw(primitives, lens)

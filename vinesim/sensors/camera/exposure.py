@@ -22,9 +22,9 @@ MIN_EXPOSURE, MAX_EXPOSURE = 0.25, 8.0
 """Exposure stays within these."""
 ADAPTATION_TIME = 0.25
 """Time in which exposure comes within a factor e, in stops, of what it should be [s]."""
-_STEP = 8
+_METERING_STRIDE = 8
 """One of so many pixels, squared, is metered."""
-_HALO = ((2.0, 0.5), (9.0, 0.12))
+_GLARE = ((2.0, 0.5), (9.0, 0.12))
 """Widths [share of a hundredth of the picture's height] and strengths of the light that a lens scatters."""
 
 
@@ -52,7 +52,7 @@ class Exposure:
             since = np.inf if self._time is None else time - self._time
             keep = float(np.exp(-since / ADAPTATION_TIME)) if since >= 0.0 else 0.0
             self._time = time
-            step = _STEP * self.samples
+            step = _METERING_STRIDE * self.samples
             across, down = self.width * self.samples, self.height * self.samples
             if min(across, down) < step:
                 step = 1
@@ -66,7 +66,14 @@ class Exposure:
             wp.launch(
                 deferred.update_exposure,
                 1,
-                inputs=[NOON_EXPOSURE * max(brightness, 0.01) ** -LOW_SUN_SHARE, KEY_VALUE, ADAPTED_SHARE, MIN_EXPOSURE, MAX_EXPOSURE, keep],
+                inputs=[
+                    NOON_EXPOSURE * max(brightness, 0.01) ** -LOW_SUN_SHARE,
+                    KEY_VALUE,
+                    ADAPTED_SHARE,
+                    MIN_EXPOSURE,
+                    MAX_EXPOSURE,
+                    keep,
+                ],
                 outputs=[self._sum, self._exposure],
                 device=self.device,
             )
@@ -100,7 +107,7 @@ class Exposure:
         radiance = self.radiance.numpy()
         lamp = (radiance * lit[:, None]).reshape(*shape, 3)
         spread = np.zeros_like(lamp)
-        for width, strength in _HALO:
+        for width, strength in _GLARE:
             spread += strength * cv2.GaussianBlur(lamp, (0, 0), width * shape[0] / 100.0)
         radiance += spread.reshape(-1, 3)
         if self.device != "cpu":

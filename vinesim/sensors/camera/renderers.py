@@ -35,7 +35,9 @@ def check_renderer(renderer: str) -> str:
     if renderer not in RENDERERS:
         raise RendererUnavailable(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
     if renderer != "warp" and importlib.util.find_spec("taichi") is None:
-        raise RendererUnavailable(f"renderer {renderer!r}: Taichi is not installed; type: pip install 'vinesim[taichi]'")
+        raise RendererUnavailable(
+            f"renderer {renderer!r}: Taichi is not installed; type: pip install 'vinesim[taichi]'"
+        )
     return renderer
 
 
@@ -43,7 +45,9 @@ def create_rasterizer(renderer: str, device: str) -> PrimitiveRasterizer | None:
     """The rasteriser of that name for primitives on ``device``; None for Warp's own on a CPU."""
     if check_renderer(renderer) != "warp":
         if device != "cpu":
-            raise RendererUnavailable(f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out")
+            raise RendererUnavailable(
+                f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out"
+            )
         from vinesim.sensors.camera.taichi_rasterizer import TaichiRasterizer
 
         try:

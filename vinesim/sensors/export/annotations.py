@@ -15,7 +15,7 @@ from vinesim.scene.ids import Kind, Organ, thing, thing_name
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
 
-_FURTHER = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
+_EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
 """What annotations tell of a bunch beside what COCO asks for."""
 MIN_ANNOTATED_PIXELS = 16
 """A bunch is annotated (COCO, YOLO) if at least so many pixels show it; records name all."""
@@ -47,7 +47,9 @@ def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, A
     }
 
 
-def bunch_records(truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray | None = None) -> list[dict[str, Any]]:
+def bunch_records(
+    truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray | None = None
+) -> list[dict[str, Any]]:
     """Bunches of one picture as JSON: metres in world axes; boxes are [column, row, width, height] px.
 
     ``ripeness`` [bunch], 0 green to 1 ripe; all are ripe unless given.
@@ -83,10 +85,10 @@ def bunch_records(truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.n
     ]
 
 
-def actor_records(told: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
+def actor_records(actors: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
     """What else was set down in a picture of these ``labels`` [height, width]: with its pixels and its visible box."""
     found = []
-    for one in told:
+    for one in actors:
         rows, columns = np.nonzero(labels == one["label"])
         box = (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())) if len(rows) else None
         found.append({**one, "pixels": len(rows), "box": _xywh(box)})
@@ -154,7 +156,7 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
         "num_keypoints": int(within),
         "amodal_bbox": bunch["amodal_box"],
         "amodal_segmentation": bunch["amodal_mask"],
-        **{name: bunch[name] for name in _FURTHER},
+        **{name: bunch[name] for name in _EXTRA_FIELDS},
     }
 
 

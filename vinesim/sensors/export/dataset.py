@@ -49,7 +49,7 @@ LATITUDE = np.radians(41.6)
 """Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
 MIN_ACTOR_SHARE = 0.01
 """Share of the pixels that show somebody or something else than the vineyard, where something happens."""
-_TRIES, _SOCIABLE = 60, 30
+_MAX_TRIES, _TRIES_WITH_ACTORS = 60, 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 
 
@@ -61,7 +61,9 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
     """Intrinsics of a camera at another size [px]: the same horizontal field of view, square pixels kept so."""
     width, height = size or (int(spec.width.value), int(spec.height.value))
     if not (MIN_IMAGE_SIZE <= width <= MAX_IMAGE_SIZE and MIN_IMAGE_SIZE <= height <= MAX_IMAGE_SIZE):
-        raise SensorError(f"size is {width}x{height}; give WxH from {MIN_IMAGE_SIZE}x{MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}x{MAX_IMAGE_SIZE}")
+        raise SensorError(
+            f"size is {width}x{height}; give WxH from {MIN_IMAGE_SIZE}x{MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}x{MAX_IMAGE_SIZE}"
+        )
     if size is None:
         return spec.info("camera_optical_frame")
     scale = width / spec.width.value
@@ -139,9 +141,9 @@ class VineyardRenderer:
     def write_image(self, image: int, folder: pathlib.Path) -> None:
         """Write everything about one image; its record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
-        hour, sun = _daylight(rng)
-        view, near, happens = self._happening(image)
-        seen = self._look(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
+        hour, sun = _random_sun(rng)
+        view, near, happens = self._pose_scene(image)
+        seen = self._choose_view(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
         truths = truth.bunch_truths(self.primitives, view, seen, self.caster)
         camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image)
         frame = camera.render(self.primitives, seen.pose)
@@ -171,14 +173,14 @@ class VineyardRenderer:
             "berries": formats.encode_berry_numbers(seen),
         }
         for kind, pixels in images.items():
-            with _part(folder / kind / f"{name}.png") as part:
+            with _atomic_file(folder / kind / f"{name}.png") as part:
                 picture.write_png(part, pixels)
-        with _part(folder / "labels" / f"{name}.txt") as part:
+        with _atomic_file(folder / "labels" / f"{name}.txt") as part:
             part.write_text(formats.yolo_labels(bunches, self.info.width, self.info.height))
-        with _part(_record(folder, image)) as part:
+        with _atomic_file(_record_path(folder, image)) as part:
             formats.write_json(part, record)
 
-    def _happening(self, image: int) -> tuple[View, np.ndarray | None, dict[str, Any]]:
+    def _pose_scene(self, image: int) -> tuple[View, np.ndarray | None, dict[str, Any]]:
         """What there is in an image, drawn; whatever was there in the image before leaves no trace."""
         every = np.arange(len(self.model.tree_first))
         self.primitives.update(self.still, every)
@@ -189,12 +191,12 @@ class VineyardRenderer:
         self.primitives.update(happens[0], every)
         return happens
 
-    def _look(
-        self, rng: np.random.Generator, view: View, near: np.ndarray | None, company: list[tuple[float, float]]
+    def _choose_view(
+        self, rng: np.random.Generator, view: View, near: np.ndarray | None, actors: list[tuple[float, float]]
     ) -> truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 
-        If something happens, the bunch hangs ``near`` there, and somebody of the ``company`` [m] is seen too, if a
+        If something happens, the bunch hangs ``near`` there, and somebody of the ``actors`` [m] is seen too, if a
         place for that is soon found.
         """
         model = self.model
@@ -204,13 +206,17 @@ class VineyardRenderer:
             hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
         if not len(hanging):
             raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
-        for attempt in range(_TRIES):
+        for attempt in range(_MAX_TRIES):
             bunch = int(hanging[rng.integers(len(hanging))])
             pose = view.body_q[model.bunch_body[bunch]].astype(float)
             middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
-            height, away, around = rng.uniform(*CAMERA_HEIGHT), rng.uniform(*BUNCH_DISTANCE), rng.uniform(0.0, 2.0 * np.pi)
-            if company and attempt < _SOCIABLE:  # somebody is behind the bunch
-                behind = np.array(company[rng.integers(len(company))]) - middle[:2]
+            height, away, around = (
+                rng.uniform(*CAMERA_HEIGHT),
+                rng.uniform(*BUNCH_DISTANCE),
+                rng.uniform(0.0, 2.0 * np.pi),
+            )
+            if actors and attempt < _TRIES_WITH_ACTORS:  # somebody is behind the bunch
+                behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
             rise = height - middle[2]
             level = np.sqrt(max(away**2 - rise**2, rise**2))  # never steeper than 45 degrees
@@ -223,14 +229,18 @@ class VineyardRenderer:
             optical[3:] = frames.multiply(optical[3:], roll)
             seen = truth.render_buffers(self.primitives, self.info, optical)
             shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
-            if company and attempt < _SOCIABLE and (seen.labels >= label(Organ.BOX, 0)).mean() < MIN_ACTOR_SHARE:
+            if (
+                actors
+                and attempt < _TRIES_WITH_ACTORS
+                and (seen.labels >= label(Organ.BOX, 0)).mean() < MIN_ACTOR_SHARE
+            ):
                 continue
             if (seen.depth < MIN_CLEARANCE).mean() < 0.02 and shown >= formats.MIN_ANNOTATED_PIXELS:
                 return seen
-        raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_TRIES} tries")
+        raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_MAX_TRIES} tries")
 
 
-def _daylight(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
+def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
     """An hour of solar time [h] on a day from August to October, and where the sun stands: 6 degrees up or more."""
     declination = np.radians(rng.uniform(-8.0, 16.0))
     lowest = np.sin(np.radians(6.0)) - np.sin(LATITUDE) * np.sin(declination)
@@ -242,7 +252,7 @@ def _daylight(rng: np.random.Generator) -> tuple[float, tuple[float, float, floa
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-class _part:  # noqa: N801  (reads as a word where it is used)
+class _atomic_file:  # noqa: N801  (reads as a word where it is used)
     """A file under another name until it is whole."""
 
     def __init__(self, path: pathlib.Path) -> None:
@@ -259,7 +269,7 @@ class _part:  # noqa: N801  (reads as a word where it is used)
             self.part.unlink(missing_ok=True)
 
 
-def _record(folder: pathlib.Path, image: int) -> pathlib.Path:
+def _record_path(folder: pathlib.Path, image: int) -> pathlib.Path:
     return folder / "records" / f"{image:06d}.json"
 
 
@@ -268,20 +278,20 @@ def prepare_folder(plan: DatasetPlan, folder: pathlib.Path) -> None:
     file, settings = folder / "dataset.json", plan.settings()
     try:
         if file.exists():
-            _same(json.loads(file.read_text(encoding="utf-8")), settings, folder)
+            _check_same_settings(json.loads(file.read_text(encoding="utf-8")), settings, folder)
         elif folder.exists() and any(folder.iterdir()):
             raise DatasetError(f"{folder} holds other things than a data set; give an empty folder or a new one")
         for name in _FOLDERS:
             (folder / name).mkdir(parents=True, exist_ok=True)
         remove_partial_files(folder)
         if not file.exists():
-            with _part(file) as part:
+            with _atomic_file(file) as part:
                 formats.write_json(part, settings)
     except (OSError, json.JSONDecodeError) as bad:
         raise DatasetError(f"{folder} cannot be used: {bad}; give a folder that can be written") from None
 
 
-def _same(there: dict[str, Any], wanted: dict[str, Any], folder: pathlib.Path) -> None:
+def _check_same_settings(there: dict[str, Any], wanted: dict[str, Any], folder: pathlib.Path) -> None:
     wanted = json.loads(json.dumps(wanted))
     for name, value in wanted.items():
         if there.get(name) != value:
@@ -299,7 +309,7 @@ def remove_partial_files(folder: pathlib.Path) -> None:
 
 def missing_images(folder: pathlib.Path, images: int) -> list[int]:
     """Which of the first images are not there yet."""
-    return [n for n in range(images) if not _record(folder, n).exists()]
+    return [n for n in range(images) if not _record_path(folder, n).exists()]
 
 
 def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]) -> Iterator[int]:
@@ -324,13 +334,13 @@ def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
 
     def read() -> Iterator[dict[str, Any]]:
         for number in range(images):
-            yield json.loads(_record(folder, number).read_text(encoding="utf-8"))
+            yield json.loads(_record_path(folder, number).read_text(encoding="utf-8"))
 
     try:
-        with _part(folder / "data.yaml") as part:
+        with _atomic_file(folder / "data.yaml") as part:
             part.write_text("path: .\ntrain: images\nval: images\nnames:\n  0: bunch\n")
         target = folder / "annotations.json"
-        with _part(target) as part, part.open("w", encoding="utf-8") as file:
+        with _atomic_file(target) as part, part.open("w", encoding="utf-8") as file:
             for piece in formats.coco_json(read):
                 file.write(piece)
     except OSError as bad:

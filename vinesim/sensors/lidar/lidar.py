@@ -4,7 +4,7 @@ Each shot is a handful of rays over the beam's footprint. What they meet closer 
 is long comes back as one echo, whose range lies in between: mixed returns at the edges of leaves. Points are raw, as
 drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
 
-Two halves, so that either can be exchanged: a :class:`Grid` tells what rays meet, a :class:`Lidar` what is reported.
+Two halves, so that either can be exchanged: a :class:`RayGrid` tells what rays meet, a :class:`Lidar` what is reported.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class RayGrid(Protocol):
-    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.Sweep` unless another one is given."""
+    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer` unless another one is given."""
 
     direction: wp.array
     """[column * row] unit vectors in the head's frame."""
@@ -151,7 +151,7 @@ class Lidar:
     ) -> None:
         """Noise follows from (``seed``, ``name``, number of the revolution).
 
-        ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits: see :class:`Sweep`.
+        ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits: see :class:`LidarRasterizer`.
         """
         self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
         self.revolution = 0
@@ -179,9 +179,9 @@ class Lidar:
             device,
         )
         """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
-        self._receiver = self._made_of()
+        self._receiver = self._receiver_parameters()
         kept = 2 if spec.returns == "dual" else 1
-        self._luck = wp.zeros((len(self.offset), 3), dtype=float, device=device)
+        self._noise = wp.zeros((len(self.offset), 3), dtype=float, device=device)
         self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
         self._intensity = wp.zeros((len(self.offset), kept), dtype=float, device=device)
         self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
@@ -198,7 +198,7 @@ class Lidar:
         wide, high = (0.5 * leaving / FOOTPRINT_RANGE + 0.5e-3 * growing for leaving, growing in sizes)
         return tuple(np.append(0.0, ring * size * wave(turn)) for size, wave in ((wide, np.cos), (high, np.sin)))
 
-    def _made_of(self) -> lidar_echoes.Receiver:
+    def _receiver_parameters(self) -> lidar_echoes.Receiver:
         spec, receiver = self.spec, lidar_echoes.Receiver()
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
@@ -223,8 +223,10 @@ class Lidar:
 
     def begin_revolution(self) -> None:
         """A new revolution."""
-        luck = spec_file.noise_rng(self.seed, self.name, self.revolution).standard_normal((len(self.offset), 3), np.float32)
-        self._luck.assign(luck)
+        noise = spec_file.noise_rng(self.seed, self.name, self.revolution).standard_normal(
+            (len(self.offset), 3), np.float32
+        )
+        self._noise.assign(noise)
 
     def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
         """Firings from ``first`` on, one for each pose [firing, 7] of the lidar."""
@@ -233,12 +235,12 @@ class Lidar:
             wrong = poses[~np.isfinite(poses).all(1)][0]
             raise ValueError(f"lidar {self.name!r} has the pose {wrong.tolist()}; give finite numbers")
         poses[:, 3:] = frames.normalize(poses[:, 3:])
-        together = self._together(poses)
+        together = self._firings_per_pose(poses)
         for start in range(0, len(poses), together):
             part = poses[start : start + together]
             self._fire(primitives, first + start, len(part), part[len(part) // 2])
 
-    def _together(self, poses: np.ndarray) -> int:
+    def _firings_per_pose(self, poses: np.ndarray) -> int:
         """How many firings may be taken from one place, so slowly does the lidar move."""
         if len(poses) < 2:
             return 1
@@ -264,7 +266,7 @@ class Lidar:
                 grid.primitive,
                 label(Organ.GROUND, 0),
                 int(Organ.GROUND),
-                self._luck,
+                self._noise,
             ],
             outputs=[self._xyz, self._intensity, self._label],
             device=self.device,

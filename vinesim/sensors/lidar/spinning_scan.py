@@ -59,10 +59,10 @@ class SpinningScan:
         self.pose_history = PoseHistory()
         self.dropped = 0
         """Revolutions that were over before they were begun."""
-        self._turn = 1.0 / lidar.rate
-        self._period = max(self._turn, 1.0 / rate if rate else 0.0)
+        self._revolution_period = 1.0 / lidar.rate
+        self._period = max(self._revolution_period, 1.0 / rate if rate else 0.0)
         self._start: float | None = None
-        self._fired = 0
+        self._next_column = 0
 
     def cancel(self, now: float) -> None:
         """Forget the present revolution: at ``now`` [s] nobody wants it."""
@@ -80,10 +80,10 @@ class SpinningScan:
         while self._start is not None:
             lidar, start, step = self.lidar, self._start, self.lidar.spec.firing_period.value
             due = min(int((now - start) / step + 1e-6) + 1, lidar.firings) if now >= start - 1e-9 else 0
-            if due > self._fired:
-                times = start + step * np.arange(self._fired, due)
-                lidar.fire(primitives, self._fired, self.pose_history.interpolate(times))
-                self._fired = due
+            if due > self._next_column:
+                times = start + step * np.arange(self._next_column, due)
+                lidar.fire(primitives, self._next_column, self.pose_history.interpolate(times))
+                self._next_column = due
             if due < lidar.firings:
                 return
             yield lidar.finish_revolution(self.pose_history.interpolate(np.array([start]))[0], start)
@@ -94,6 +94,6 @@ class SpinningScan:
             self._begin(start + late * self._period)
 
     def _begin(self, start: float) -> None:
-        self._start, self._fired = start, 0
+        self._start, self._next_column = start, 0
         self.pose_history.discard_before(start)
         self.lidar.begin_revolution()

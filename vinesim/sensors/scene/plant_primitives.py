@@ -116,9 +116,9 @@ def leaf_batches(model: Model) -> list[Batch]:
 
 _UNRIPE = {"green": np.array([0.085, 0.150, 0.022]), "shot": 0.45}
 """Colour of a hard green berry (linear RGB reflectance, GUESSED by eye), and the size of a berry without seeds."""
-_SPREAD = 0.10
+_RIPENESS_SPREAD = 0.10
 """Standard deviation of ripeness within a bunch: berries soften and colour one by one. GUESSED."""
-_SHOT = 0.06
+_SHOT_BERRY_SHARE = 0.06
 """Share of the berries of a quite unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
 
 
@@ -152,17 +152,17 @@ def bunch_batches(
     without clusters is one piece. ``group`` [k]; without ``ripeness`` all are ripe.
     """
     found: list[Batch] = []
-    for first in range(0, len(which), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        found += _bunches(model, which[part], place and place[part], carrier[part], group[part], ripeness)
+    for first in range(0, len(which), _BATCH_SIZE):
+        part = slice(first, first + _BATCH_SIZE)
+        found += _bunch_group_batches(model, which[part], place and place[part], carrier[part], group[part], ripeness)
     return found
 
 
-_AT_ONCE = 256
+_BATCH_SIZE = 256
 """Bunches that are laid out together: numpy then works on rows, and temporary arrays stay small."""
 
 
-def _bunches(
+def _bunch_group_batches(
     model: Model,
     which: np.ndarray,
     place: list[np.ndarray] | None,
@@ -214,13 +214,13 @@ def _bunches(
     reddish = (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(0.5 * blush[:, None], 0.0, 1.0)
     colour = colour + np.array([0.055, 0.014, 0.010]) * reddish
     if ripeness is not None:
-        colour, radius = _unripe(colour, radius, ripeness, which, count)
+        colour, radius = _apply_ripeness(colour, radius, ripeness, which, count)
     away = np.hypot(*position[:, 1:].T)
-    edge = np.array([_reach(a) for a in np.split(away, np.cumsum(count)[:-1])])[owner]
+    edge = np.array([_quantile_80(a) for a in np.split(away, np.cumsum(count)[:-1])])[owner]
     depth = np.clip(0.35 + 0.65 * away / np.maximum(edge, 1e-6), 0.0, 1.0)
     start_row = (np.cumsum(count) - count)[owner][:, None]
-    near = np.concatenate([_padded(one.neighbours) for one in ones])
-    crowding = _crowding(position, radius, np.where(near >= 0, near + start_row, -1))
+    near = np.concatenate([_padded_neighbours(one.neighbours) for one in ones])
+    crowding = _neighbour_occlusion(position, radius, np.where(near >= 0, near + start_row, -1))
     names = label(Organ.BUNCH, 0) + which
     on_berry = piece_at(position, owner)
 
@@ -267,7 +267,7 @@ def _bunches(
     return [b for b in (fruit, rachis, pedicel) if len(b)]
 
 
-def _unripe(
+def _apply_ripeness(
     colour: np.ndarray, radius: np.ndarray, ripeness: Ripeness, which: np.ndarray, count: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours and radii of berries that are not all ripe: each on its way from green, and some that never set out."""
@@ -275,15 +275,15 @@ def _unripe(
     draws = zip(which, count, strict=True)
     draw = np.concatenate([np.random.default_rng([ripeness.seed, 4, int(b)]).uniform(size=(n, 2)) for b, n in draws])
     mean = ripeness.bunch[which][owner]
-    own = mean + _SPREAD * np.sqrt(12.0) * (draw[:, 0] - 0.5) * np.minimum(4.0 * (1.0 - mean), 1.0)
-    shot = draw[:, 1] < _SHOT * (1.0 - mean)
+    own = mean + _RIPENESS_SPREAD * np.sqrt(12.0) * (draw[:, 0] - 0.5) * np.minimum(4.0 * (1.0 - mean), 1.0)
+    shot = draw[:, 1] < _SHOT_BERRY_SHARE * (1.0 - mean)
     own = np.where(shot, 0.0, np.clip(own, 0.0, 1.0))
     share = (own * own * (3.0 - 2.0 * own))[:, None]
     size = np.where(shot, _UNRIPE["shot"], 0.9 + 0.1 * own)
     return _UNRIPE["green"] * (1.0 - share) + colour * share, radius * size
 
 
-def _reach(away: np.ndarray) -> float:
+def _quantile_80(away: np.ndarray) -> float:
     """The 80 % quantile, without the ceremony of np.quantile."""
     at = 0.8 * (len(away) - 1)
     low = int(at)
@@ -291,13 +291,13 @@ def _reach(away: np.ndarray) -> float:
     return float(ends[low] + (at - low) * (ends[min(low + 1, len(away) - 1)] - ends[low]))
 
 
-def _padded(neighbours: np.ndarray) -> np.ndarray:
+def _padded_neighbours(neighbours: np.ndarray) -> np.ndarray:
     """Eight neighbours of each berry [n, 8], -1 where there are fewer."""
     missing = 8 - neighbours.shape[1]
     return np.pad(neighbours, ((0, 0), (0, missing)), constant_values=-1) if missing else neighbours
 
 
-def _crowding(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Light that the nearest neighbours take from each berry: share(n) = w + v . n as (v, w) [n, 4].
 
     A touching sphere of equal size takes (1/4 + 0.85 cos) r^2 / l^2 as seen from the berry's surface.

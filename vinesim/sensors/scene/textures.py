@@ -17,8 +17,8 @@ GRASS_OUTLINE, HERB_OUTLINE = leaves.SHAPES, leaves.SHAPES + 1
 OUTLINE_COUNT = leaves.SHAPES + 2
 TEXTURE_SIZE = 256
 """Texels along each side of the tables."""
-_EDGE_SCALE = 400.0
-_SUPER = 4
+_DISTANCE_STEPS = 400.0
+_SUPERSAMPLING = 4
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -34,17 +34,19 @@ def leaf_scale(shape: np.ndarray) -> np.ndarray:
     return tips[shape]
 
 
-def _distance(mask: np.ndarray) -> np.ndarray:
+def _signed_distance(mask: np.ndarray) -> np.ndarray:
     """Signed distance to the edge of a finely sampled mask, positive inside [leaf units], [SIDE, SIDE]."""
     inside = mask.astype(np.uint8)
     pixels = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
-    return cv2.resize(pixels, (TEXTURE_SIZE, TEXTURE_SIZE), interpolation=cv2.INTER_AREA) * (2.0 / (TEXTURE_SIZE * _SUPER))
+    return cv2.resize(pixels, (TEXTURE_SIZE, TEXTURE_SIZE), interpolation=cv2.INTER_AREA) * (
+        2.0 / (TEXTURE_SIZE * _SUPERSAMPLING)
+    )
 
 
-def _tuft() -> np.ndarray:
+def _grass_mask() -> np.ndarray:
     """Mask of a tuft of grass: bent blades that taper, rooted along the lower edge."""
     rng = np.random.default_rng(31)
-    side = TEXTURE_SIZE * _SUPER
+    side = TEXTURE_SIZE * _SUPERSAMPLING
     mask = np.zeros((side, side), np.uint8)
     along = np.linspace(0.0, 1.0, 20)
     for _ in range(30):
@@ -62,16 +64,16 @@ def _tuft() -> np.ndarray:
 @functools.cache
 def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
     """Signed distances [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and octagons around them [outline, 8, 2]."""
-    u, v = _grid(TEXTURE_SIZE * _SUPER)
+    u, v = _grid(TEXTURE_SIZE * _SUPERSAMPLING)
     theta, radius = np.arctan2(u, v), np.hypot(u, v)
     table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE))
     knots = np.linspace(-np.pi, np.pi, 8193)
     for shape in range(leaves.SHAPES):
         edge = leaves.outline(knots, shape) / leaf_scale(shape)
-        table[shape] = _distance(radius < np.interp(theta, knots, edge))
-    table[GRASS_OUTLINE] = _distance(_tuft())
-    table[HERB_OUTLINE] = _distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
-    table = np.clip(table * _EDGE_SCALE, -127, 127).astype(np.int8)
+        table[shape] = _signed_distance(radius < np.interp(theta, knots, edge))
+    table[GRASS_OUTLINE] = _signed_distance(_grass_mask())
+    table[HERB_OUTLINE] = _signed_distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
+    table = np.clip(table * _DISTANCE_STEPS, -127, 127).astype(np.int8)
     angle = (np.arange(8) + 0.5) * np.pi / 4.0
     normal = np.stack([np.sin(angle), np.cos(angle)], 1)
     hull = np.zeros((OUTLINE_COUNT, 8, 2), np.float32)
@@ -85,7 +87,7 @@ def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
     return table, hull
 
 
-def _blurred(rng: np.random.Generator, sigma: float) -> np.ndarray:
+def _smooth_noise(rng: np.random.Generator, sigma: float) -> np.ndarray:
     """Smooth noise of unit variance [SIDE, SIDE]."""
     noise = cv2.GaussianBlur(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE)).astype(np.float32), (0, 0), sigma)
     return noise / noise.std()
@@ -113,7 +115,7 @@ def leaf_texture() -> np.ndarray:
                     away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
                     vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
                     crease += 0.009 * np.exp(-((away / 0.03) ** 2))
-        fine, wide = _blurred(rng, 3.0), _blurred(rng, 8.0)
+        fine, wide = _smooth_noise(rng, 3.0), _smooth_noise(rng, 8.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
         slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / TEXTURE_SIZE)
         table[shape] = np.stack([np.maximum(vein, 0.25 * net), slope_u, slope_v, 0.5 + 0.2 * wide + 0.12 * fine], -1)
@@ -131,7 +133,7 @@ def _segment(u: np.ndarray, v: np.ndarray, a: np.ndarray, b: np.ndarray) -> tupl
     return np.hypot(u - a[0] - along * d[0], v - a[1] - along * d[1]), along
 
 
-def _tileable(rng: np.random.Generator, lowest: float, power: float) -> np.ndarray:
+def _periodic_noise(rng: np.random.Generator, lowest: float, power: float) -> np.ndarray:
     """Periodic noise with a 1/f^power spectrum above a lowest frequency; zero mean, unit variance."""
     cycles = np.fft.fftfreq(TEXTURE_SIZE) * TEXTURE_SIZE
     f = np.hypot(*np.meshgrid(cycles, cycles))
@@ -144,7 +146,7 @@ def _tileable(rng: np.random.Generator, lowest: float, power: float) -> np.ndarr
 def noise_texture() -> np.ndarray:
     """Four octaves of periodic noise around 0.5, coarse to fine: [SIDE, SIDE, 4] float32 in 0..1."""
     rng = np.random.default_rng(17)
-    bands = [_tileable(rng, low, power) for low, power in ((1, 1.6), (3, 1.4), (10, 1.1), (30, 0.4))]
+    bands = [_periodic_noise(rng, low, power) for low, power in ((1, 1.6), (3, 1.4), (10, 1.1), (30, 0.4))]
     return np.clip(0.5 + 0.2 * np.stack(bands, -1), 0.0, 1.0).astype(np.float32)
 
 
@@ -152,8 +154,12 @@ def noise_texture() -> np.ndarray:
 def soil_texture() -> np.ndarray:
     """Clods, sod, slope along x and y of 1.25 m of ground: [SIDE, SIDE, 4] float32."""
     rng = np.random.default_rng(43)
-    clods = 0.55 * _tileable(rng, 3, 1.5) + 0.6 * np.abs(_tileable(rng, 4, 1.5)) + 0.35 * _tileable(rng, 20, 1.0)
-    sod = _tileable(rng, 25, 0.7)
+    clods = (
+        0.55 * _periodic_noise(rng, 3, 1.5)
+        + 0.6 * np.abs(_periodic_noise(rng, 4, 1.5))
+        + 0.35 * _periodic_noise(rng, 20, 1.0)
+    )
+    sod = _periodic_noise(rng, 25, 0.7)
     straw = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE), np.float32)
     for x, y, turn, length in zip(*rng.uniform(size=(4, 90)), strict=True):
         start = np.array([x, y]) * TEXTURE_SIZE
@@ -170,9 +176,9 @@ SKY_ROWS, SKY_COLUMNS = 512, 1024
 
 
 @functools.cache
-def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
+def _sky_layers() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
     """What of the sky no sun changes: the share of cloud, and layers in front of it, each a colour and a share."""
-    height, azimuth = _directions()
+    height, azimuth = _sky_directions()
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
     cover = sample_noise(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
@@ -183,7 +189,9 @@ def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
         (np.array([0.36, 0.47, 0.62]), 0.045, 0.085, 2.0),
         (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
     ):
-        ridge = base + rise * (sample_noise(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35)
+        ridge = base + rise * (
+            sample_noise(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35
+        )
         layers.append((tone, smoothstep(0.004, -0.004, height - ridge)))
     crowns = 0.014 + 0.020 * sample_noise(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
     leafy = sample_noise(turns * 20.0, height * 8.0, slice(2, 3))
@@ -192,7 +200,7 @@ def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
     return cloud, tuple(layers)
 
 
-def _directions() -> tuple[np.ndarray, np.ndarray]:
+def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
     """Sine of elevation and azimuth [rad] of the sky's table."""
     height = (np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2) * np.ones((1, SKY_COLUMNS))
     return height, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
@@ -205,7 +213,7 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
     Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
     hills in the haze.
     """
-    (height, azimuth), (cloud, layers) = _directions(), _scenery()
+    (height, azimuth), (cloud, layers) = _sky_directions(), _sky_layers()
     flat = np.sqrt(1.0 - height**2)
     x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
     horizon = np.exp(-5.5 * height)[..., None]

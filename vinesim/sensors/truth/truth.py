@@ -98,10 +98,12 @@ def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -
     depth[primitive == -1] = np.inf
     numbers = np.append(_berry_numbers(primitives), [-1, -1])  # so that -1 and -2 find no berry
     everything = primitives.carrier_poses(np.arange(primitives.count))
-    return PixelBuffers(info, np.array(pose, float), primitive, depth, labels, numbers[primitive], everything, primitives.layout_version)
+    return PixelBuffers(
+        info, np.array(pose, float), primitive, depth, labels, numbers[primitive], everything, primitives.layout_version
+    )
 
 
-def _shown(primitives: Primitives) -> np.ndarray:
+def _primitives_shown(primitives: Primitives) -> np.ndarray:
     """Whether each primitive is there [primitive]."""
     return np.repeat(primitives.clusters_shown(), primitives.cluster_size)
 
@@ -109,7 +111,7 @@ def _shown(primitives: Primitives) -> np.ndarray:
 def _berry_numbers(primitives: Primitives) -> np.ndarray:
     """Number of the berry in its bunch [primitive], -1 for all that is no berry."""
     kind = np.repeat(primitives.cluster_kind, primitives.cluster_size)
-    fruit = np.flatnonzero((kind == SPHEROID) & (primitives.organ == int(Organ.BUNCH)) & _shown(primitives))
+    fruit = np.flatnonzero((kind == SPHEROID) & (primitives.organ == int(Organ.BUNCH)) & _primitives_shown(primitives))
     bunch = primitives.label[fruit]
     starts = np.flatnonzero(np.diff(bunch, prepend=-1))
     numbers = np.full(primitives.count, -1, np.int32)
@@ -205,7 +207,7 @@ def bunch_truths(
         for bunch in np.unique(named[fruit] % LABEL_STRIDE)
         if view.bunch_attached[bunch]
     }
-    clear = _unhidden(caster, seen.pose[:3], cuts)
+    clear = _visible_cut_points(caster, seen.pose[:3], cuts)
     found = []
     for bunch in np.unique(named[fruit] % LABEL_STRIDE).tolist():
         mine = fruit[named[fruit] % LABEL_STRIDE == bunch]
@@ -301,7 +303,7 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
     return shift, shown
 
 
-def _unhidden(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
+def _visible_cut_points(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
     """Bunches between whose cut point and the eye there is nothing but their own peduncle."""
     if not points:
         return set()
