@@ -1,4 +1,4 @@
-"""The Taichi twin of the rasteriser finds what Warp's finds."""
+"""The Taichi rasteriser finds what Warp's finds."""
 
 import threading
 
@@ -13,7 +13,7 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitive_batches import KINDS
 
 pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
-twin = pytest.importorskip("vinesim.sensors.camera.taichi_rasterizer")
+taichi_rasterizer = pytest.importorskip("vinesim.sensors.camera.taichi_rasterizer")
 NEAR_PLANE = {
     "through the canopy, a solid beside the lens": ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62]),
     "a leaf through the pinhole": ([1.1, 0.2, 1.97], [1.4, 0.5, 1.9]),
@@ -27,7 +27,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def raster():
-    return twin.Twin()
+    return taichi_rasterizer.TaichiRasterizer()
 
 
 def _seen(scene, pose: np.ndarray, raster) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +41,7 @@ def _seen(scene, pose: np.ndarray, raster) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("where", [*VIEWPOINTS, *NEAR_PLANE])
-def test_the_twin_sees_the_same(scene, raster, where: str) -> None:
+def test_it_sees_the_same(scene, raster, where: str) -> None:
     pose = look_at(*map(np.array, (VIEWPOINTS | NEAR_PLANE)[where]))
     (mine, depth), (other, truth) = _seen(scene, pose, raster), _seen(scene, pose, None)
     same = mine == other
@@ -64,7 +64,7 @@ def test_every_kind_is_seen(scene, raster) -> None:
 
 def test_two_passes_find_what_one_finds(scene, raster) -> None:
     """As on a GPU without 64-bit atomics: depth first, then whose it is."""
-    phased = twin.Twin()
+    phased = taichi_rasterizer.TaichiRasterizer()
     phased._gpu = True
     for where in ("along the rows", "solids", "inside the canopy"):
         pose = look_at(*map(np.array, VIEWPOINTS[where]))
@@ -72,7 +72,7 @@ def test_two_passes_find_what_one_finds(scene, raster) -> None:
 
 
 def test_another_thread_may_draw(scene, raster) -> None:
-    """Eyes have a thread of their own, which is not the one that started Taichi."""
+    """The sensor scheduler has its own thread, which is not the one that started Taichi."""
     pose = look_at(*map(np.array, VIEWPOINTS["solids"]))
     found = []
     thread = threading.Thread(target=lambda: found.append(_seen(scene, pose, raster)[0]))

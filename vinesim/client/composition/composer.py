@@ -1,6 +1,9 @@
 """Robots, people and crates set down in a vineyard for a picture: what a simulation would show at that instant.
 
-    view = Stage(robots=(RobotAt("vinebot", 1.5, 0.8),), crates=(CrateAt(3.0, 0.5, fill=0.6),)).set(model)
+    composer = SceneComposer(
+        robots=(RobotPlacement("vinebot", 1.5, 0.8),), crates=(CratePlacement(3.0, 0.5, fill=0.6),)
+    )
+    snapshot = composer.compose(model)
 
 Bunches in a crate were picked from the nearest vines and fell in one after another, by the rigid world that clients
 simulate.
@@ -87,7 +90,7 @@ class SceneComposer:
     """After those of the scene."""
 
     def compose(self, model: Model) -> View:
-        """The vineyard with all of it at rest; :class:`NoRoom` if two would stand in each other."""
+        """The vineyard with all of it at rest; :class:`PlacementError` if two would stand in each other."""
         furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
             return self.populate(Physics(furnished))
@@ -209,7 +212,7 @@ def _step_rigid(rigid: Rigid, ticks: int) -> None:
 
 
 def _check_clearance(rigid: Rigid) -> None:
-    """:class:`NoRoom` if whoever has come stands in somebody or something."""
+    """:class:`PlacementError` if whoever has come stands in somebody or something."""
     rigid.prep()
     for names in rigid.overlaps():
         one, other = sorted(names[:2], key=rigid.actors.__contains__, reverse=True)

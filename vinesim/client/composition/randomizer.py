@@ -42,7 +42,7 @@ _MAX_TRIES = 40
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SceneRandomizer:
-    """What may happen in an image; see :class:`vinesim.sensors.export.dataset.Life`."""
+    """What may happen in an image; see :class:`vinesim.sensors.export.dataset.SnapshotSource`."""
 
     share: float = 0.4
     """Of the images in which anything does."""
@@ -52,7 +52,7 @@ class SceneRandomizer:
         return {"share": self.share, "robots": list(ROBOT_NAMES)}
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
-        """See :meth:`vinesim.sensors.export.dataset.Life.view`."""
+        """See :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
         if rng.uniform() >= self.share:
             return None
         bunch = int(rng.integers(len(model.bunch_body)))

@@ -31,7 +31,7 @@ class PrimitiveRasterizer(Protocol):
 
 
 def check_renderer(renderer: str) -> str:
-    """Its name, if it is known and installed; :class:`NoRenderer` in words if not."""
+    """Its name, if it is known and installed; :class:`RendererUnavailable` in words if not."""
     if renderer not in RENDERERS:
         raise RendererUnavailable(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
     if renderer != "warp" and importlib.util.find_spec("taichi") is None:

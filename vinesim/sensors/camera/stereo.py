@@ -55,7 +55,7 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class DepthRenderer(Protocol):
-    """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.Visibility`)."""
+    """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.CameraRasterizer`)."""
 
     depth: wp.array
 

@@ -48,7 +48,7 @@ class Primitives:
         """
         self.model, self.device, self._ripeness = model, device, ripeness
         self.rasterizer = renderers.create_rasterizer(renderer, device)
-        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.camera.Visibility` does so itself."""
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.camera.CameraRasterizer` does so itself."""
         bodies = len(model.body_mass)
         self._static_carrier = bodies
         """Carrier of what stands still; links follow it."""
