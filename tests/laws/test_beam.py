@@ -106,7 +106,7 @@ def test_first_three_frequencies() -> None:
 def test_damping_seen_is_damping_asked() -> None:
     """100 Hz, shipping phi, first mode (joint damping beta K gives zeta = beta w / 2), zeta 0 to 0.2: 0.005.
 
-    Below its floor the solver shows the floor, and ``Plants.damping_floor`` says which it is.
+    Below its floor the solver shows the floor, and ``ArticulationSolver.damping_floor`` says which it is.
     """
     seen, frequency, floor = beam_theory.damping_sweep()
     asked = np.maximum(beam_theory.ZETAS, floor)
@@ -129,7 +129,7 @@ def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
     plants.body_load[15] = [0.0, load, 0.0, 0.0, 0.0, load / 16]
     before = plants.state.body_q[15].copy()
     beam_theory.run(plants, 1500)
-    plants.kinematics()
+    plants.forward_kinematics()
     tips = [
         frames.compose(pose.astype(float), frames.pose([1 / 16, 0, 0])) for pose in (before, plants.state.body_q[15])
     ]
@@ -177,6 +177,6 @@ def test_greenhill(share: float, stands: bool) -> None:
     plants = beam_theory.standing([beam.tree()])
     plants.state.joint_qd[0, 1] = 0.02
     beam_theory.run(plants, 6000)
-    plants.kinematics()
+    plants.forward_kinematics()
     lean = np.hypot(*plants.state.body_q[beam.pieces, :2])
     assert lean < 0.02 if stands else lean > 0.2

@@ -10,8 +10,8 @@ from tests.laws.test_trees import energy, forked
 from tests.support import beam_theory
 from tests.support.beam_theory import Rod
 from vinesim import frames
-from vinesim.bench.mujoco_reference import compile_plants, copy_state
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import Tree, Wood, assemble
 from vinesim.scene.state import State
 
@@ -98,17 +98,17 @@ def test_forked_trees_rest_where_mujocos_do() -> None:
     """Crooked, forked, sagging by decimetres: every body within 1e-4 m of MuJoCo's at rest."""
     rng = np.random.default_rng(23)
     model = assemble([forked(rng, beta=0.1, soft=soft) for soft in (0.3, 0.5, 1.0, 3.0)])
-    plants = Plants(model, State.at_rest(model), phi=1.0)
+    plants = ArticulationSolver(model, State.at_rest(model), phi=1.0)
     plants.wake(np.arange(4))
     peer = compile_plants(model)
     data = mujoco.MjData(peer)
-    copy_state(plants.state, data)
+    copy_state_to_mujoco(plants.state, data)
     drawn = model.forward(plants.state.joint_q)[:, :3]
     for _ in range(4000):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
         mujoco.mj_step(peer, data)
-    plants.kinematics()
+    plants.forward_kinematics()
     mujoco.mj_kinematics(peer, data)
     assert plants.tree_rate.max() < 1e-3
     assert np.abs(data.qvel).max() < 1e-3
@@ -120,15 +120,15 @@ def drift(tree: Tree, kick: np.ndarray, *, phi: float = 0.5, seconds: float = 60
     """Energy above that at rest [J] every 50 ms of an undamped tree whose joints start with ``kick`` [rad/s], and the
     fastest turning of any body in all that time [rad/s]."""
     rest, plants = (beam_theory.standing([tree], phi=phi) for _ in range(2))
-    rest.free()
+    rest.predict()
     plants.state.joint_qd[:] = kick
     seen, fastest = [], 0.0
     for tick in range(int(seconds / plants.dt)):
-        plants.free()
+        plants.predict()
         if tick % 5 == 0:
             seen.append(energy(plants) - energy(rest))
             fastest = max(fastest, np.linalg.norm(plants.state.body_qd[:, 3:], axis=1).max())
-        plants.commit()
+        plants.integrate()
     return np.array(seen), float(fastest)
 
 
@@ -192,16 +192,16 @@ def test_survives_violence_for_ten_seconds(phi: float, rate: float) -> None:
         tree.settle()
     loaded = [beam_theory.Beam(beta=0.004, tip=tip).tree() for tip in (0.05, 0.2, 0.5, 0.05, 0.2, 0.5)]
     plants = beam_theory.standing(light + loaded, phi=phi)
-    plants.kinematics()
+    plants.forward_kinematics()
     home = plants.state.body_q[:, :3].copy()
     plants.state.joint_qd[:] = rate * frames.normalize(rng.normal(size=plants.state.joint_qd.shape))
     for _ in range(1000):
-        plants.free()
-        plants.commit()
-        assert (plants.tree_rate < plants.bound).all()
+        plants.predict()
+        plants.integrate()
+        assert (plants.tree_rate < plants.fault_rate).all()
     assert plants.tree_rate[: len(light)].max() < 0.5
     assert plants.tree_rate.max() < 3.0
-    plants.kinematics()
+    plants.forward_kinematics()
     bare = plants.model.body_tree < len(light)
     assert np.abs(plants.state.body_q[bare, :3] - home[bare]).max() < 0.05
 
@@ -235,16 +235,16 @@ def test_limp_threads_calm_down(beta: float) -> None:
         for _ in range(3)
     ]
     rest, plants = (beam_theory.standing(trees) for _ in range(2))
-    rest.free()
+    rest.predict()
     rng = np.random.default_rng(31)
     plants.state.joint_qd[:] = 20.0 * frames.normalize(rng.normal(size=plants.state.joint_qd.shape))
     rates, seen = np.zeros((2000, len(trees))), np.zeros(2000)
     for tick in range(2000):
-        plants.free()
+        plants.predict()
         seen[tick] = energy(plants) - energy(rest)
-        plants.commit()
+        plants.integrate()
         rates[tick] = plants.tree_rate
-    assert rates.max() < plants.bound
+    assert rates.max() < plants.fault_rate
     assert np.median(rates[-200:], axis=0).max() < 6.0
     assert seen[-500:].mean() < 0.35 * seen[:100].mean()
 
@@ -260,11 +260,11 @@ def test_a_thrown_tree_keeps_phi_1_until_it_has_been_calm_for_a_second() -> None
     plants.state.joint_qd[quiet, 2] = plants.state.joint_qd[touched, 2] = 0.2
     phi, rate = np.zeros((400, 3), np.float32), np.zeros((400, 3))
     for tick in range(400):
-        plants.free()
+        plants.predict()
         push = np.array([[0.0, 0.1, 0.0, 0.0, 0.0, 0.0]]) * (50 <= tick < 60)
-        plants.commit(np.array([touched.start + 12]), push) if push.any() else plants.commit()
+        plants.integrate(np.array([touched.start + 12]), push) if push.any() else plants.integrate()
         phi[tick], rate[tick] = plants.phi_used, plants.tree_rate
-    wild = np.flatnonzero(rate[:, 0] > 0.06 * plants.limit)
+    wild = np.flatnonzero(rate[:, 0] > 0.06 * plants.max_rate)
     assert (phi[: wild[-1] + 101, 0] == 1.0).all()
     assert (phi[wild[-1] + 102 :, 0] == np.float32(0.55)).all()
     assert wild[-1] < 250

@@ -33,7 +33,7 @@ def test_a_cut_bunch_keeps_its_momentum_and_falls():
     physics.state.joint_qd[4] = 0.0, 0.5, 0.3
     for _ in range(7):
         physics.step()
-    physics.plants.kinematics()
+    physics.plants.forward_kinematics()
     pose, velocity = physics.state.body_q[body].astype(float), physics.state.body_qd[body].astype(float)
     com = frames.rotate(pose[3:], model.body_com[body].astype(float))
     before = 0.5 * (velocity[:3] + np.cross(velocity[3:], com))

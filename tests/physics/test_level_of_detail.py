@@ -77,10 +77,10 @@ def test_touched_pushed_released_coarsened_without_a_jump():
     refine, coarsen = physics.plants.refine, physics.plants.coarsen
 
     def seen(change, trees):
-        physics.plants.kinematics(np.array([0]))
+        physics.plants.forward_kinematics(np.array([0]))
         pose, before = physics.state.body_q.copy(), momentum(physics, moving(physics))
         change(trees)
-        physics.plants.kinematics(np.array([0]))
+        physics.plants.forward_kinematics(np.array([0]))
         assert np.array_equal(pose, physics.state.body_q)
         switches.append((physics.tick, change.__name__, momentum(physics, moving(physics)) - before, before))
 
@@ -91,7 +91,7 @@ def test_touched_pushed_released_coarsened_without_a_jump():
     for tick in pushed(physics, middle(model)):
         if first_touch is None and any(c.actor == "bar" for c in physics.contacts):
             first_touch = tick
-        if first_touch is not None and gone is None and not len(physics.touching.near):
+        if first_touch is not None and gone is None and not len(physics.contact_solver.near_trees):
             gone = tick
         turn = frames.log(frames.multiply(
             frames.conjugate(model.joint_settled[clusters(model)]), physics.state.joint_q[clusters(model)]
@@ -106,7 +106,7 @@ def test_touched_pushed_released_coarsened_without_a_jump():
     assert bent > 0.05
     assert np.abs(jump).max() < 1e-6
     assert np.linalg.norm(drop) < 1e-6 + 0.02 * np.linalg.norm(before)
-    assert len(detail.fine) == 0
+    assert len(detail.fine_trees) == 0
 
 
 def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
@@ -139,15 +139,15 @@ def test_looking_closely_refines_what_moves_and_looking_away_coarsens_it():
     physics = Physics(model)
     physics.watch(middle(model, 1)[None], 0.2)
     physics.step()
-    assert len(physics.detail.fine) == 0  # asleep: nothing of it moves
+    assert len(physics.detail.fine_trees) == 0  # asleep: nothing of it moves
     physics.plants.wake(np.arange(3))
     for _ in range(3):
         physics.step()
-    assert physics.detail.fine.tolist() == [1]
+    assert physics.detail.fine_trees.tolist() == [1]
     physics.watch(np.zeros((0, 3)), 0.0)
     for _ in range(LINGER + 40):
         physics.step()
-    assert len(physics.detail.fine) == 0
+    assert len(physics.detail.fine_trees) == 0
 
 
 def test_a_tree_stays_fine_while_somebody_is_there_and_not_once_its_bunch_is_gone():

@@ -16,7 +16,7 @@ from scipy.optimize import brentq, curve_fit
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import Tree, Wood, assemble
 from vinesim.scene.state import State
 
@@ -265,30 +265,30 @@ def first_shape(tree: Tree) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- the solver
 
 
-def standing(trees: list[Tree], **options: float) -> Plants:
+def standing(trees: list[Tree], **options: float) -> ArticulationSolver:
     """All awake, as drawn."""
     model = assemble(trees)
-    plants = Plants(model, State.at_rest(model), **options)
+    plants = ArticulationSolver(model, State.at_rest(model), **options)
     plants.wake(np.arange(len(trees)))
     return plants
 
 
-def run(plants: Plants, ticks: int, watch: np.ndarray | None = None) -> np.ndarray:
+def run(plants: ArticulationSolver, ticks: int, watch: np.ndarray | None = None) -> np.ndarray:
     """Step; positions of the watched bodies at the start of every tick [tick, body, 3]."""
     seen = np.zeros((ticks, 0 if watch is None else len(watch), 3))
     for tick in range(ticks):
-        plants.free()
+        plants.predict()
         if watch is not None:
             seen[tick] = plants.state.body_q[watch, :3]
-        plants.commit()
+        plants.integrate()
     return seen
 
 
-def settle(trees: list[Tree], seconds: float = 30.0) -> Plants:
+def settle(trees: list[Tree], seconds: float = 30.0) -> ArticulationSolver:
     """At rest after so long with phi 1 (which changes no equilibrium)."""
     plants = standing(trees, phi=1.0, dt=0.02)
     run(plants, int(seconds / plants.dt))
-    plants.kinematics()
+    plants.forward_kinematics()
     assert plants.tree_rate.max() < 2e-3, f"tree {plants.tree_rate.argmax()} still moves"
     return plants
 
@@ -309,7 +309,7 @@ def grown(parts: list[Beam], side: float = 0.0) -> Tree:
     return tree
 
 
-def last_bodies(plants: Plants) -> np.ndarray:
+def last_bodies(plants: ArticulationSolver) -> np.ndarray:
     """The last body of each tree."""
     return np.cumsum(plants.model.tree_size) - 1
 
@@ -451,7 +451,7 @@ ZETAS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2)
 @functools.cache
 def damping_sweep() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First mode of canes at 100 Hz and the shipping phi, for each of ``ZETAS``: damping ratio seen, frequency over
-    theory, and the floor that the solver names (``Plants.damping_floor``)."""
+    theory, and the floor that the solver names (``ArticulationSolver.damping_floor``)."""
     f = cantilever_frequencies(Beam(), 1)[0]
     trees = [Beam(beta=zeta / (np.pi * f)).tree(i) for i, zeta in enumerate(ZETAS)]
     plants = standing(trees)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import GRAVITY, Tree, Wood, assemble, settle
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -65,14 +65,16 @@ def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = No
     return model
 
 
-def moving(plants: Plants, trees: np.ndarray) -> np.ndarray:
+def moving(plants: ArticulationSolver, trees: np.ndarray) -> np.ndarray:
     """The bodies that the kernels visit."""
     fine = plants.state.tree_fine[trees]
     size = np.where(fine, plants.model.tree_size[trees], plants.model.tree_core[trees])
     return np.concatenate([np.arange(f, f + n) for f, n in zip(plants.model.tree_first[trees], size, strict=True)])
 
 
-def momenta(plants: Plants, bodies: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def momenta(
+    plants: ArticulationSolver, bodies: np.ndarray, about: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Of bodies, as ``kinematics`` shows them: linear, angular about a point, centre of mass, kinetic energy."""
     pose, speed = plants.state.body_q[bodies].astype(float), plants.state.body_qd[bodies].astype(float)
     mass = plants.body_mass[bodies].astype(float)

@@ -10,9 +10,9 @@ from multiprocessing.connection import Connection, wait
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vinesim.cli.render import pixels
-from vinesim.cli.robot_client import WrongUse
+from vinesim.cli.render import parse_size
 from vinesim.client.composition.randomizer import SceneRandomizer
+from vinesim.errors import UsageError
 from vinesim.scene.spec import load
 from vinesim.sensors.camera import renderers
 from vinesim.sensors.export import dataset
@@ -35,12 +35,12 @@ def run(
 ) -> int:
     """Draw what is not there yet, then gather the annotations of all images."""
     if seed < 0:
-        raise WrongUse(f"--seed is {seed}: give 0 or more")
+        raise UsageError(f"--seed is {seed}: give 0 or more")
     if not 0.0 <= actors <= 1.0:
-        raise WrongUse(f"--actors is {actors:g}: give a share of the images, 0 to 1")
+        raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     life = SceneRandomizer(actors) if actors > 0.0 else None
     plan = DatasetPlan(
-        load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check_renderer(renderer)
+        load(scene), seed, camera, None if size is None else parse_size(size), life, renderers.check_renderer(renderer)
     )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crew: list[Share] = []

@@ -21,7 +21,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import human_posture as kernels
-from vinesim.kernels.launch import bind
+from vinesim.kernels.launch import bind_launch
 from vinesim.physics.rigid.static_world import ALL, GROUND, GUEST, ROUGH
 from vinesim.scene import appearance
 from vinesim.scene.appearance import PHALANGES
@@ -158,20 +158,20 @@ class _Motion:
         def shared(data: np.ndarray) -> wp.array:
             return wp.array(data, dtype=wp.float64, device="cpu", copy=False)
 
-        self._stand = bind(
-            kernels.stand,
+        self._stand = bind_launch(
+            kernels.pose_torso_and_legs,
             [THIGH * height, SHANK * height, HIP * height, wp.vec3d(-_BACK, 0.0, _NECK), shared(self._tracked)],
             [shared(self._parts)],
         )
-        self._differ = bind(
-            kernels.differ, [shared(self._start), shared(self._goal)], [shared(rows) for rows in self._apart]
+        self._differ = bind_launch(
+            kernels.pose_difference, [shared(self._start), shared(self._goal)], [shared(rows) for rows in self._apart]
         )
         looks = appearance.person(height)
         self._held, self._closed = np.zeros((4, 7)), np.zeros(2 * len(appearance.FINGERS))
         self._limbs, limbs = np.zeros((len(LIMBS), 7)), looks.limbs
         bones = [np.ascontiguousarray(table) for table in (looks.root, looks.length, looks.bent)]
-        self._hang = bind(
-            kernels.hang,
+        self._hang = bind_launch(
+            kernels.pose_arms_and_fingers,
             [
                 limbs.upper_arm, limbs.forearm, *map(wp.vec3d, (limbs.shoulder, limbs.wrist, limbs.elbow)), limbs.neck,
                 wp.vec3d(limbs.nape), *map(shared, bones), shared(self._held), shared(self._closed),
