@@ -19,7 +19,7 @@ import trimesh
 from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, Measurement
 from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
 from vinesim.sensors.export.images import look_at
@@ -88,7 +88,7 @@ def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
 
 def demo_scene() -> tuple[Model, Primitives]:
     """The vineyard of both benches, without grass."""
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     return model, Primitives(model, grass=0.0)
 
 

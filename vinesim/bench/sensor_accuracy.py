@@ -19,7 +19,7 @@ from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Link, Measurement, Shape, View
 from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
 from vinesim.sensors.camera.renderers import RendererUnavailable
@@ -191,7 +191,7 @@ def compare_renderers(spec: CameraSpec, model: Model, view: View) -> dict[str, P
 
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     """Figures of all sensor models; ``plot``: a folder for the pictures."""
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     primitives, view = Primitives(model), rest_snapshot(model)
     spec = CameraSpec.load("d435")
     depths = {"plane": measure_plane(spec), **measure_plants(spec, model, primitives, view)}

@@ -122,7 +122,9 @@ class SceneComposer:
             pose = _ground_pose(one.x, one.y, one.yaw)
             rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
-            pose = appearance.posed(standing(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height)
+            pose = appearance.apply_posture(
+                standing(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height
+            )
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
         _check_clearance(rigid)
 
@@ -138,7 +140,7 @@ class SceneComposer:
 
 
 def _ground_pose(x: float, y: float, yaw: float) -> np.ndarray:
-    return frames.pose(np.array([x, y, 0.0]), frames.yaw(yaw))
+    return frames.pose(np.array([x, y, 0.0]), frames.from_yaw(yaw))
 
 
 def bunch_masses(model: Model) -> np.ndarray:
@@ -189,7 +191,7 @@ def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np
     yaw = rng.choice([0.0, np.pi]) + rng.uniform(-0.35, 0.35)
     start = rng.uniform(-room, room) - 0.5 * length * np.array([np.cos(yaw), np.sin(yaw)])
     roll = frames.exp(np.array([rng.uniform(-np.pi, np.pi), 0.0, 0.0]))
-    return frames.pose(np.array([*start, top + radius + 0.01]), frames.multiply(frames.yaw(yaw), roll))
+    return frames.pose(np.array([*start, top + radius + 0.01]), frames.multiply(frames.from_yaw(yaw), roll))
 
 
 def _rachis_ends(physics: Physics, bunch: int) -> np.ndarray:

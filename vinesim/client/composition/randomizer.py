@@ -56,7 +56,7 @@ class SceneRandomizer:
         if rng.uniform() >= self.share:
             return None
         bunch = int(rng.integers(len(model.bunch_body)))
-        middle = model.forward(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
+        middle = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
         for _ in range(_MAX_TRIES):
             stage = random_composition(model, middle, rng)
             physics = Physics(stage.with_crates(model))
@@ -87,7 +87,7 @@ def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generato
         taken.append((spot, FOOTPRINT_RADIUS[kind]))
         x, y = (round(float(v), 4) for v in spot)
         if kind == "person":
-            posture = appearance.postures()[rng.integers(len(appearance.postures()))]
+            posture = appearance.posture_names()[rng.integers(len(appearance.posture_names()))]
             people.append(PersonPlacement(x, y, round(yaw, 4), posture, round(float(rng.normal(1.72, 0.07)), 3)))
         elif kind == "crate":
             fill = round(float(rng.choice([0.0, rng.uniform(0.1, 0.5)])), 3)

@@ -100,7 +100,7 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> camera_raster.Pinhole:
         raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
     lens = camera_raster.Pinhole()
     lens.eye = wp.vec3(*map(float, pose[:3]))
-    lens.rotation = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+    lens.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
     lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
     lens.width, lens.height, lens.max_depth = int(info.width), int(info.height), MAX_DEPTH
     wide = max(info.cx, info.width - info.cx) / info.fx

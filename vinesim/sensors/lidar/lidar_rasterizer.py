@@ -74,7 +74,7 @@ class LidarRasterizer:
         part = slice(first * self.rows, (first + count) * self.rows)
         head = self._head
         head.eye = wp.vec3(*map(float, pose[:3]))
-        head.rotation = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+        head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
         head.first_column, head.end_column, head.max_range = first, first + count, float(reach)
         low, high = self._azimuth_range
         turn = 0.5 * (low + high) + (first + 0.5 * (count - 1)) * self.step

@@ -102,7 +102,7 @@ def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: 
     return make_batch(
         LEAF,
         stack_columns(position, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
-        b=stack_columns(rib, leaves.shape_of(np.arange(n))),
+        b=stack_columns(rib, leaves.blade_shape(np.arange(n))),
         c=stack_columns(up, rng.uniform(size=n)),
         d=bend,
         material=int(materials.FOLIAGE),
