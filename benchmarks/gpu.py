@@ -21,7 +21,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -30,12 +30,12 @@ TICKS = 100
 PER_TREE = 17
 
 
-def cane(side: float) -> Tree:
+def cane(side: float) -> TreeBuilder:
     """A horizontal cane with a bunch on its tip."""
-    tree = Tree(frames.pose(np.array([0.0, side, 2.0])))
-    last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
-    tree.add(
-        last, offset=(1 / 16, 0, 0), rest=frames.aligned(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH), mass=0.5,
+    tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
+    last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
+    tree.add_body(
+        last, offset=(1 / 16, 0, 0), rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH), mass=0.5,
         com=(0.1, 0, 0), inertia=(5e-4, 5e-4, 5e-4), length=0.15, radius=(0.05, 0.05), damping=(0.002, 0.002, 0.002),
     )  # fmt: skip
     return tree
@@ -46,7 +46,7 @@ def forest(count: int) -> Model:
     one = assemble([cane(0.0)])
     counts = one.counts()
     model = Model.allocate(**{axis: n * count if axis in ("tree", "body") else n for axis, n in counts.items()})
-    for name, dim in Model.dims().items():
+    for name, dim in Model.array_fields().items():
         if dim.shape[0] in ("tree", "body"):
             value = getattr(one, name)
             getattr(model, name)[:] = np.tile(value, (count,) + (1,) * (value.ndim - 1))

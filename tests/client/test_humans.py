@@ -21,7 +21,7 @@ from vinesim.robot.description.description import Description, load
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.values import HumanPose
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import looking
@@ -31,7 +31,7 @@ from vinesim.sensors.scene.primitives import Primitives
 DT = 0.01
 FOREARM = np.array([0.2, 0.36, 0.885])
 """A point of the vinebot's left forearm, when it stands at the origin with its arms at home."""
-SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.yaw(-0.5 * np.pi))
+SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.from_yaw(-0.5 * np.pi))
 """Beside that arm, facing it."""
 
 
@@ -185,8 +185,8 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     """F59, F62: points with the label of each lie where it is on its own client."""
     world = World()
     anna = world.join("anna", vinebot, frames.pose(np.zeros(3)))
-    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.yaw(2.0)))
-    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.yaw(1.0)))
+    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.from_yaw(2.0)))
+    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.from_yaw(1.0)))
     world.run(0.8)
     view = anna.physics.view()
     primitives = Primitives(world.model, grass=0.0)

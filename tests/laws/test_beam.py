@@ -15,7 +15,7 @@ from scipy.special import jv
 from tests.support import beam_theory
 from tests.support.beam_theory import Beam
 from vinesim import frames
-from vinesim.scene.builder import Tree, Wood
+from vinesim.scene.builder import RodMaterial, TreeBuilder
 
 
 @pytest.mark.parametrize("alpha", [0.1, 1.0, 5.0, 20.0])
@@ -122,7 +122,7 @@ def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
     """A side load on the tip: P/3E1I (L^3 - l^3) + P l^3 / 3E2I, each joint with its own spring."""
     load, half = 0.002, 0.5
     tree = beam_theory.two_woods(stiff_first, density=8.0)  # too light for its weight to matter
-    tree.settle()
+    tree.solve_rest_pose()
     for body in tree.bodies:
         body["damping"] = 0.3 * np.asarray(body["stiffness"])
     plants = beam_theory.standing([tree], phi=1.0, dt=0.02)
@@ -142,11 +142,11 @@ def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
 @pytest.mark.parametrize("pieces", [2, 8])
 def test_a_cane_of_two_thicknesses_twists_as_two(pieces: int) -> None:
     """A small weight beside the tip: W a (l / GJ + l' / G'J'), exactly, since the moment is the same all along."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
-    thick = tree.rod(-1, 0.4, (0.005, 0.005), Wood(5e9, 8.0, 0.3), pieces)
-    thin = tree.rod(thick[-1], 0.6, (0.003, 0.003), Wood(2e9, 8.0, 0.3, shear=1e9), pieces)
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
+    thick = tree.add_rod(-1, 0.4, (0.005, 0.005), RodMaterial(5e9, 8.0, 0.3), pieces)
+    thin = tree.add_rod(thick[-1], 0.6, (0.003, 0.003), RodMaterial(2e9, 8.0, 0.3, shear_modulus=1e9), pieces)
     mass, beside, half = 0.002, 0.05, tree.bodies[thin[-1]]["far"]
-    tree.add(
+    tree.add_body(
         thin[-1], offset=(0.6 / pieces, 0, 0), mass=mass, com=(0, beside, 0), inertia=[mass * 1e-4] * 3, length=1e-3,
         stiffness=half, damping=0.3 * half,
     )  # fmt: skip

@@ -11,18 +11,18 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.plants.rollout import Rollout, Trajectory
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 
 
 def forked() -> Model:
     """A cane that forks in space, a bunch on one arm; at the origin, where single precision is finest."""
-    wood = Wood(4e9, 800.0, 0.03)
-    tree = Tree(frames.pose(np.zeros(3)))
-    stem = tree.rod(-1, 0.5, (0.004, 0.0035), wood, 6)
-    arm = tree.rod(stem[-1], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.3, 0.0, 0.6])))
-    tree.rod(stem[2], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.0, 0.7, -0.5])))
-    tree.add(
+    wood = RodMaterial(4e9, 800.0, 0.03)
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    stem = tree.add_rod(-1, 0.5, (0.004, 0.0035), wood, 6)
+    arm = tree.add_rod(stem[-1], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.3, 0.0, 0.6])))
+    tree.add_rod(stem[2], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.0, 0.7, -0.5])))
+    tree.add_body(
         arm[-1], offset=(0.075, 0.0, 0.0), mass=0.1, com=(0.05, 0.01, 0.0), inertia=(2e-4, 3e-4, 3e-4), length=0.1,
         radius=(0.03, 0.03), stiffness=(0.05, 0.05, 0.05), damping=(0.002, 0.002, 0.002),
     )  # fmt: skip

@@ -12,23 +12,23 @@ from tests.support.clustered_trees import fall, momenta
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import GRAVITY, Tree, Wood, assemble
+from vinesim.scene.builder import GRAVITY, RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
 DT = 0.01
 
 
-def forked(rng: np.random.Generator, *, beta: float = 0.012, isotropic: bool = True, soft: float = 1.0) -> Tree:
+def forked(rng: np.random.Generator, *, beta: float = 0.012, isotropic: bool = True, soft: float = 1.0) -> TreeBuilder:
     """Thirteen crooked bodies with two forks, nothing aligned with anything."""
-    tree = Tree(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
+    tree = TreeBuilder(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
 
     def grow(parent: int, count: int) -> list[int]:
         grown = []
         for _ in range(count):
             mass = rng.uniform(0.01, 0.05)
             stiffness = soft * rng.uniform(2.0, 20.0, 1 if isotropic else 3) * np.ones(3)
-            parent = tree.add(
+            parent = tree.add_body(
                 parent, offset=(0.06, *rng.normal(size=2) * 0.004), rest=frames.exp(rng.normal(size=3) * 0.4),
                 mass=mass, com=(0.03, 0.004, -0.003), inertia=mass * rng.uniform(5e-4, 9e-4, 3), length=0.06,
                 stiffness=stiffness, damping=beta * stiffness,
@@ -98,7 +98,7 @@ def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
     stiffness = model.joint_stiffness.astype(float)
     damping = np.maximum(model.joint_damping - (2 * phi - 1) * DT * stiffness, 0.0)
     metric = phi * DT * (phi * DT * stiffness + damping)
-    axes = frames.matrix(state.joint_q.astype(float))
+    axes = frames.to_matrix(state.joint_q.astype(float))
     for body in range(len(metric)):
         block = slice(3 * body, 3 * body + 3)
         inertia[block, block] += axes[body].T @ np.diag(metric[body]) @ axes[body]
@@ -147,10 +147,10 @@ def energy(plants: ArticulationSolver) -> float:
     return kinetic - model.body_mass @ ((pose[:, :3] + com) @ GRAVITY) + 0.5 * (model.joint_stiffness * theta**2).sum()
 
 
-def pendulum(stiffness: float = 0.0) -> Tree:
+def pendulum(stiffness: float = 0.0) -> TreeBuilder:
     """A bunch of 0.5 kg on a massless string of 15 cm, 17 degrees out."""
-    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, -1.0]))))
-    tree.add(-1, mass=0.5, com=(0.15, 0, 0), inertia=(1e-4, 3e-4, 3e-4), length=0.2, stiffness=[stiffness] * 3)
+    tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, -1.0]))))
+    tree.add_body(-1, mass=0.5, com=(0.15, 0, 0), inertia=(1e-4, 3e-4, 3e-4), length=0.2, stiffness=[stiffness] * 3)
     return tree
 
 
@@ -177,9 +177,9 @@ def test_a_hanging_bunch_gains_no_energy(phi: float, loss: float) -> None:
 
 def test_energy_of_an_undamped_cane() -> None:
     """phi 1/2, 60 s, swings below 1 rad/s: within 1 %."""
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0), 16)
-    tree.settle()
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0), 16)
+    tree.solve_rest_pose()
     model = assemble([tree])
     rest = awake(model, State.at_rest(model), phi=0.5)
     rest.predict()
@@ -198,10 +198,10 @@ def test_energy_of_an_undamped_cane() -> None:
 @pytest.mark.parametrize("radius", [0.0015, 0.0025])
 def test_a_heavy_bunch_on_a_thin_peduncle_stays(mass: float, radius: float) -> None:
     """Springs softer than the weight they carry, pulled by 60 N for a second, then let go: calm after 10 s."""
-    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, -1.0]))))
-    last = tree.rod(-1, 0.06, (radius, radius), Wood(0.5e9, 900.0, 0.02), 3)[-1]
+    tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, -1.0]))))
+    last = tree.add_rod(-1, 0.06, (radius, radius), RodMaterial(0.5e9, 900.0, 0.02), 3)[-1]
     spring = tree.bodies[last]
-    bunch = tree.add(
+    bunch = tree.add_body(
         last, offset=(0.02, 0, 0), mass=mass, com=(0.08, 0, 0), inertia=np.array([1, 2, 2]) * 1e-3 * mass, length=0.16,
         stiffness=spring["stiffness"], damping=spring["damping"],
     )  # fmt: skip
@@ -223,8 +223,8 @@ def test_survives_violence(phi: float, rate: float) -> None:
     rng = np.random.default_rng(11)
     trees = []
     for i in range(4):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 1.0, (0.004, 0.003), Wood(5e9, 800.0, 0.004), 16)
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 1.0, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.004), 16)
         trees.append(tree)
     model = assemble([*trees, forked(rng, beta=0.004)])
     plants = awake(model, random_state(model, rng, rate), phi=phi)
@@ -282,13 +282,13 @@ def test_two_runs_are_equal_bit_for_bit() -> None:
 # ---- what has been cut off
 
 
-def cane(**wood: float) -> Tree:
-    tree = Tree(frames.pose(np.array([0.0, 0.0, 3.0])))
-    tree.rod(-1, 1.0, (0.004, 0.003), Wood(**{"modulus": 2e9, "density": 800.0, "damping": 0.01} | wood), 12)
+def cane(**wood: float) -> TreeBuilder:
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 3.0])))
+    tree.add_rod(-1, 1.0, (0.004, 0.003), RodMaterial(**{"modulus": 2e9, "density": 800.0, "damping": 0.01} | wood), 12)
     return tree
 
 
-def spun(tree: Tree, rng: np.random.Generator, body: int = 0, **options: float) -> ArticulationSolver:
+def spun(tree: TreeBuilder, rng: np.random.Generator, body: int = 0, **options: float) -> ArticulationSolver:
     """A tree cut at a body, bent, every joint turning and the whole of it spinning and thrown."""
     model = assemble([tree])
     plants = awake(model, State.at_rest(model), **options)
@@ -375,7 +375,7 @@ def test_response_of_a_cut_tree_is_that_of_a_free_joint(phi: float) -> None:
     used = float(plants.phi_used[0])
     metric = used * DT * (used * DT * stiffness + np.maximum(damping, 0.0))
     assert used == pytest.approx(phi)
-    axes = frames.matrix(state.joint_q.astype(float))
+    axes = frames.to_matrix(state.joint_q.astype(float))
     for body, at in enumerate(peer.jnt_dofadr):
         if plants._parent[body] >= 0:
             inertia[at : at + 3, at : at + 3] += axes[body].T @ np.diag(metric[body]) @ axes[body]
@@ -435,22 +435,26 @@ def test_a_violently_cut_tree_calms_down() -> None:
 
 
 def bound(
-    tree: Tree, body: int, stiffness: float, damping: float = 0.0, point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tree: TreeBuilder,
+    body: int,
+    stiffness: float,
+    damping: float = 0.0,
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Model:
     """A tree with one tie that is slack as the tree is drawn."""
     drawn = assemble([tree])
-    at = frames.compose(drawn.forward(drawn.joint_settled)[body], frames.pose(np.array(point)))[:3]
+    at = frames.compose(drawn.forward_kinematics(drawn.joint_settled)[body], frames.pose(np.array(point)))[:3]
     return assemble(
         [tree], tie_body=[body], tie_point=[point], tie_anchor=[at], tie_stiffness=[stiffness], tie_damping=[damping]
     )
 
 
-def flat(mass: float = 0.0, beta: float = 0.01) -> Tree:
+def flat(mass: float = 0.0, beta: float = 0.01) -> TreeBuilder:
     """A horizontal cane of 1 m, settled, with a mass at its tip."""
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, beta), 16)
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, beta), 16)
     tree.bodies[-1]["mass"] += mass
-    tree.settle()
+    tree.solve_rest_pose()
     return tree
 
 
@@ -469,7 +473,7 @@ def test_a_tied_cane_bends_like_a_propped_beam(stiffness: float) -> None:
     alone = load * a * a * (3.0 - a) / (6.0 * bend)
     held = stiffness * alone / (1.0 + stiffness * a**3 / (3.0 * bend))
     tip = load / (3.0 * bend) - held * a * a * (3.0 - a) / (6.0 * bend)
-    rest = model.forward(model.joint_settled)
+    rest = model.forward_kinematics(model.joint_settled)
     seen = [
         frames.compose(plants.state.body_q[b], frames.pose([1 / 16, 0, 0]))[1]
         - frames.compose(rest[b], frames.pose([1 / 16, 0, 0]))[1]
@@ -505,8 +509,8 @@ def test_a_tied_cane_gains_no_energy(stiffness: float, mass: float, beta: float)
 def test_a_tie_damps_as_asked(zeta: float) -> None:
     """A balanced wheel of 0.02 kg m^2 on a spring of 50 N/m at a lever of 0.2 m: 10 rad/s."""
     inertia, lever, stiffness = 0.02, 0.2, 50.0
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.add(-1, mass=1.0, inertia=[inertia] * 3, length=0.2)
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_body(-1, mass=1.0, inertia=[inertia] * 3, length=0.2)
     damping = 2.0 * zeta * np.sqrt(stiffness * inertia) / lever
     model = bound(tree, 0, stiffness, damping, point=(lever, 0.0, 0.0))
     state = State.at_rest(model)
@@ -535,7 +539,7 @@ def test_a_tie_follows_its_anchor_and_can_be_undone() -> None:
         plants.predict()
         plants.integrate()
     plants.forward_kinematics()
-    drawn = model.forward(model.joint_settled)
+    drawn = model.forward_kinematics(model.joint_settled)
     assert plants.state.body_q[15, 1] == pytest.approx(0.05, abs=0.002)
     plants.tie_stiffness[0] = plants.tie_damping[0] = 0.0
     for _ in range(1500):
@@ -567,20 +571,25 @@ def test_what_is_tied_hangs_by_its_tie_when_it_is_cut() -> None:
 # ---- trunk, arms, canes: all one tree
 
 
-def vine() -> tuple[Tree, list[int]]:
+def vine() -> tuple[TreeBuilder, list[int]]:
     """A trunk of 7 cm and 1.5 m, two arms, eight canes, a bunch on each: one tree, parents of like kind."""
-    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
-    trunk = tree.rod(-1, 1.5, (0.035, 0.035), Wood(10e9, 900.0, 0.004), 6)
+    tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
+    trunk = tree.add_rod(-1, 1.5, (0.035, 0.035), RodMaterial(10e9, 900.0, 0.004), 6)
     bunches = []
     for side in (-1.0, 1.0):
-        arm = tree.rod(
-            trunk[-1], 1.0, (0.02, 0.015), Wood(8e9, 900.0, 0.005), 5, rest=frames.exp(np.array([0.0, 0.0, 1.5 * side]))
+        arm = tree.add_rod(
+            trunk[-1],
+            1.0,
+            (0.02, 0.015),
+            RodMaterial(8e9, 900.0, 0.005),
+            5,
+            rest=frames.exp(np.array([0.0, 0.0, 1.5 * side])),
         )
         for i in range(4):
             out = frames.exp(np.array([0.0, 0.8 * (-1) ** i, 0.2 * side]))
-            cane = tree.rod(arm[1 + i], 0.8, (0.005, 0.003), Wood(4e9, 800.0, 0.008), 8, rest=out)
+            cane = tree.add_rod(arm[1 + i], 0.8, (0.005, 0.003), RodMaterial(4e9, 800.0, 0.008), 8, rest=out)
             bunches.append(
-                tree.add(
+                tree.add_body(
                     cane[2],
                     offset=(0.1, 0.0, 0.0),
                     rest=frames.exp(np.array([0.3 * i, 1.0, 0.2])),
@@ -598,10 +607,10 @@ def vine() -> tuple[Tree, list[int]]:
 def test_a_whole_vine_is_one_tree_and_stands() -> None:
     """Drawn at rest it stays; shaken hard it calms down where it was; its foot bears all its weight."""
     tree, bunches = vine()
-    tree.settle()
+    tree.solve_rest_pose()
     model = assemble([tree])
     assert len(bunches) == 8
-    drawn = model.forward(model.joint_settled)
+    drawn = model.forward_kinematics(model.joint_settled)
     plants = awake(model, State.at_rest(model))
     for _ in range(200):
         plants.predict()
@@ -623,10 +632,15 @@ def test_a_whole_vine_is_one_tree_and_stands() -> None:
 def test_sag_of_an_arm_on_its_trunk() -> None:
     """A stiff arm sideways on a trunk: its tip sinks by w L^4 / 8EI and by what the trunk's head turns, (w L^2 / 2) h /
     EI L."""
-    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
-    trunk = tree.rod(-1, 1.5, (0.035, 0.035), Wood(10e9, 900.0, 0.05), 12)
-    arm = tree.rod(
-        trunk[-1], 1.0, (0.02, 0.02), Wood(8e9, 900.0, 0.05), 12, rest=frames.exp(np.array([0.0, 0.0, np.pi / 2]))
+    tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
+    trunk = tree.add_rod(-1, 1.5, (0.035, 0.035), RodMaterial(10e9, 900.0, 0.05), 12)
+    arm = tree.add_rod(
+        trunk[-1],
+        1.0,
+        (0.02, 0.02),
+        RodMaterial(8e9, 900.0, 0.05),
+        12,
+        rest=frames.exp(np.array([0.0, 0.0, np.pi / 2])),
     )
     model = assemble([tree])
     plants = awake(model, State.at_rest(model), phi=1.0)
@@ -646,8 +660,8 @@ def test_sag_of_an_arm_on_its_trunk() -> None:
 
 def test_a_trunks_first_frequency() -> None:
     """A bare trunk under its own stiffness, 10 Hz and more: free swings at 1 ms against Euler-Bernoulli, 1 %."""
-    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
-    tree.rod(-1, 1.5, (0.035, 0.035), Wood(10e9, 900.0), 12)
+    tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
+    tree.add_rod(-1, 1.5, (0.035, 0.035), RodMaterial(10e9, 900.0), 12)
     model = assemble([tree])
     plants = ArticulationSolver(model, State.at_rest(model), dt=0.001, phi=0.5)
     plants.wake(0)

@@ -13,7 +13,7 @@ from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ONSET, ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers, DeviceUnavailable
 from vinesim.physics.plants.fault_guard import FaultGuard
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -21,9 +21,9 @@ from vinesim.scene.state import State
 def canes(count: int) -> Model:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 5)
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), 5)
+        tree.solve_rest_pose()
         trees.append(tree)
     return assemble(trees)
 
@@ -53,11 +53,11 @@ def test_state_is_shared_memory_and_kinematics_follow_it(plants: ArticulationSol
     state.joint_q[:] = frames.exp(rng.normal(size=(20, 3)))
     state.joint_qd[:] = rng.normal(size=(20, 3))
     plants.forward_kinematics(np.arange(4))
-    np.testing.assert_allclose(state.body_q, plants.model.forward(state.joint_q), atol=2e-6)
+    np.testing.assert_allclose(state.body_q, plants.model.forward_kinematics(state.joint_q), atol=2e-6)
     ahead = state.joint_q.astype(float)
     h = 1e-5
-    there = plants.model.forward(frames.multiply(frames.exp(h * state.joint_qd.astype(float)), ahead))
-    here = plants.model.forward(ahead)
+    there = plants.model.forward_kinematics(frames.multiply(frames.exp(h * state.joint_qd.astype(float)), ahead))
+    here = plants.model.forward_kinematics(ahead)
     np.testing.assert_allclose(state.body_qd[:, :3], (there - here)[:, :3] / h, atol=1e-3)
     turn = frames.log(frames.multiply(there[:, 3:], frames.conjugate(here[:, 3:]))) / h
     np.testing.assert_allclose(state.body_qd[:, 3:], turn, atol=1e-3)
@@ -123,9 +123,9 @@ def test_wrenches_on_one_body_add_up_and_do_not_linger() -> None:
 
 def test_steady_load_bends_by_the_beam_formula() -> None:
     """A small sideways force on the tip: deflection F L^3 / 3 EI."""
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.2), 16)
-    tree.settle()
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.2), 16)
+    tree.solve_rest_pose()
     model = assemble([tree])
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(0)
@@ -270,7 +270,7 @@ def test_clusters_of_a_coarse_tree_ride(fruit: ArticulationSolver) -> None:
     riding = np.setdiff1d(np.arange(len(still)), moving(fruit, np.arange(3)))
     assert len(riding) == 15
     np.testing.assert_array_equal(state.joint_q[riding], still[riding])
-    np.testing.assert_allclose(state.body_q, model.forward(state.joint_q), atol=3e-6)
+    np.testing.assert_allclose(state.body_q, model.forward_kinematics(state.joint_q), atol=3e-6)
     cluster, bunch = model.bunch_cluster[1], model.bunch_body[1]
     offset = state.body_q[cluster, :3] - state.body_q[bunch, :3]
     velocity = state.body_qd[bunch, :3] + np.cross(state.body_qd[bunch, 3:], offset)
@@ -456,8 +456,8 @@ def test_a_stump_moves_as_if_it_had_grown_that_way() -> None:
     plants.state.joint_qd[:, 1] = 1.0
     plants.forward_kinematics()
     plants.cut(3)
-    short = Model(**{name: getattr(whole, name).copy() for name in Model.dims()})
-    for name, dim in Model.dims().items():
+    short = Model(**{name: getattr(whole, name).copy() for name in Model.array_fields()})
+    for name, dim in Model.array_fields().items():
         if dim.shape[0] == "body":
             setattr(short, name, getattr(whole, name)[:3].copy())
     short.tree_size[:] = short.tree_core[:] = 3
@@ -497,7 +497,7 @@ def test_cuts_of_cuts_of_roots_and_of_bunches(fruit: ArticulationSolver) -> None
     before = state.copy()
     fruit.forward_kinematics()
     pose = state.body_q.copy()
-    for name in State.dims():
+    for name in State.array_fields():
         getattr(state, name)[:] = getattr(before, name)
     again.forward_kinematics()
     np.testing.assert_array_equal(state.body_q, pose)
@@ -541,10 +541,12 @@ def grove(rng: np.random.Generator, count: int = 7) -> Model:
     """Trees of unlike size: the shares of threads and the rows of a device's copies are uneven."""
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        rod = tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), int(rng.integers(2, 9)))
-        tree.rod(rod[1], 0.3, (0.003, 0.002), Wood(5e9, 800.0, 0.01), 3, rest=frames.exp(np.array([0.0, 0.4, 0.9])))
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        rod = tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), int(rng.integers(2, 9)))
+        tree.add_rod(
+            rod[1], 0.3, (0.003, 0.002), RodMaterial(5e9, 800.0, 0.01), 3, rest=frames.exp(np.array([0.0, 0.4, 0.9]))
+        )
+        tree.solve_rest_pose()
         trees.append(tree)
     return assemble(trees)
 
@@ -676,8 +678,8 @@ def test_a_gpu_agrees_with_the_cpu() -> None:
     ],
 )
 def test_wrong_ties_and_drag_are_refused_in_words(change: dict[str, float], says: str) -> None:
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0), 10)
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0), 10)
     model = assemble([tree], tie_body=[3, 4], tie_point=np.zeros((2, 3)), tie_stiffness=[10.0, 10.0])
     state = State.at_rest(model)
     for name, value in change.items():
@@ -689,7 +691,7 @@ def test_wrong_ties_and_drag_are_refused_in_words(change: dict[str, float], says
 def test_a_cluster_is_not_tied() -> None:
     model = clustered(1)
     ties = Model.allocate(**(model.counts() | {"tie": 1}))
-    for name in Model.dims():
+    for name in Model.array_fields():
         if not name.startswith("tie_"):
             setattr(ties, name, getattr(model, name))
     ties.tie_body[0] = model.bunch_cluster[0]

@@ -13,7 +13,7 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.fault_guard import FaultGuard
 from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.scene import spec
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.state import State
 
@@ -21,9 +21,9 @@ from vinesim.scene.state import State
 def row(count: int) -> ArticulationSolver:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 6)
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), 6)
+        tree.solve_rest_pose()
         trees.append(tree)
     model = assemble(trees)
     return ArticulationSolver(model, State.at_rest(model))
@@ -167,21 +167,21 @@ def test_a_cut_body_without_a_place_is_put_back_where_it_grew() -> None:
     assert not state.joint_xd[9].any()
 
 
-def wild(rng: np.random.Generator) -> Tree:
+def wild(rng: np.random.Generator) -> TreeBuilder:
     """Any tree that the model can say: lengths 1 mm to 3 m, E 1e5 to 1e11 Pa, masses 1 mg to 1 t, damped or not."""
-    tree = Tree(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
+    tree = TreeBuilder(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
     ends = [-1]
     for _ in range(rng.integers(1, 4)):
         length = 10 ** rng.uniform(-3.0, 0.5)
         radius = length * 10 ** rng.uniform(-3.5, -0.5)
         beta = rng.choice([0.0, 10 ** rng.uniform(-4.0, 3.0)])
-        wood = Wood(10 ** rng.uniform(5.0, 11.0), 10 ** rng.uniform(1.0, 4.3), beta)
+        wood = RodMaterial(10 ** rng.uniform(5.0, 11.0), 10 ** rng.uniform(1.0, 4.3), beta)
         turn = frames.exp(rng.normal(size=3))
         tapered = (radius, rng.uniform(0.2, 1.0) * radius)
-        ends += tree.rod(int(rng.choice(ends)), length, tapered, wood, int(rng.integers(1, 9)), rest=turn)
+        ends += tree.add_rod(int(rng.choice(ends)), length, tapered, wood, int(rng.integers(1, 9)), rest=turn)
     if rng.random() < 0.5:
         mass, reach = 10 ** rng.uniform(-6.0, 3.0), 10 ** rng.uniform(-3.0, -0.5)
-        tree.add(
+        tree.add_body(
             int(rng.choice(ends[1:])), offset=(0.01, 0, 0), mass=mass, com=(reach, 0, 0), length=reach,
             inertia=[0.4 * mass * reach**2] * 3, stiffness=[rng.choice([0.0, 10 ** rng.uniform(-4.0, 4.0)])] * 3,
             damping=[rng.choice([0.0, 10 ** rng.uniform(-6.0, 2.0)])] * 3,
@@ -193,7 +193,7 @@ def wild(rng: np.random.Generator) -> Tree:
     return tree
 
 
-def thrown(seed: int, trees: list[Tree], ticks: int, start: int = 0) -> tuple[ArticulationSolver, FaultGuard]:
+def thrown(seed: int, trees: list[TreeBuilder], ticks: int, start: int = 0) -> tuple[ArticulationSolver, FaultGuard]:
     """Trees in any pose, up to 1e4 rad/s, under loads and pushes up to 1e6 N, half the time; checked every tick.
 
     Each tree draws from its own stream, numbered from ``start``: it meets the same whoever is beside it.
@@ -257,7 +257,7 @@ def test_neighbours_of_wild_trees_are_equal_to_the_bit() -> None:
 def test_a_vineyard_calms_down_after_any_load() -> None:
     """Every shoot of the demo under loads up to 1e6 N, ten ticks at a time: ten seconds later all hang quietly."""
     rng = np.random.default_rng(1)
-    model = generate(spec.load("demo"))
+    model = generate(spec.load_scene("demo"))
     plants = ArticulationSolver(model, State.at_rest(model))
     guard, sleep = FaultGuard(plants), SleepMonitor(plants)
     everyone = np.arange(len(model.tree_first))
@@ -282,7 +282,7 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
     assert guard.count.sum() == before
     assert plants.tree_rate.max() < 2.0
     plants.forward_kinematics()
-    fallen = np.linalg.norm(plants.state.body_q[:, :3] - model.forward(model.joint_settled)[:, :3], axis=1)
+    fallen = np.linalg.norm(plants.state.body_q[:, :3] - model.forward_kinematics(model.joint_settled)[:, :3], axis=1)
     assert np.median(fallen) < 0.02
 
 
@@ -291,13 +291,19 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
     [
         ({"length": 0.0}, r"rod of length 0.0 m, .*all must be positive"),
         ({"radius": (0.004, -0.001)}, r"rod of .*radius \(0.004, -0.001\) m.*all must be positive"),
-        ({"wood": Wood(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
-        ({"wood": Wood(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
+        ({"wood": RodMaterial(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
+        ({"wood": RodMaterial(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
         ({"pieces": 0}, r"rod of .* 0 pieces.*all must be positive"),
         ({"parent": 3, "offset": (0, 0, 0)}, r"body 0 names parent 3, which does not stand before it"),
     ],
 )
 def test_wood_that_cannot_be_is_refused_in_words(change: dict, says: str) -> None:
-    given = {"parent": -1, "length": 1.0, "radius": (0.004, 0.004), "wood": Wood(5e9, 800.0), "pieces": 4} | change
+    given = {
+        "parent": -1,
+        "length": 1.0,
+        "radius": (0.004, 0.004),
+        "wood": RodMaterial(5e9, 800.0),
+        "pieces": 4,
+    } | change
     with pytest.raises(ValueError, match=says):
-        Tree(frames.pose(np.zeros(3))).rod(**given)
+        TreeBuilder(frames.pose(np.zeros(3))).add_rod(**given)

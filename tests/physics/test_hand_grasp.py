@@ -15,9 +15,9 @@ from vinesim.physics.rigid.human_body import THICK
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.state import State
-from vinesim.scene.values import POINTS, Drive, HumanPose, HumanSpec
+from vinesim.scene.values import POINT_NAMES, Drive, HumanPose, HumanSpec
 
-FORWARD = frames.multiply(frames.yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
+FORWARD = frames.multiply(frames.from_yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
 """Fingers up, palm along +y."""
 SIGNS = {"left": 1.0, "right": -1.0}
 SOFT = (Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), Drive("press", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0))
@@ -78,7 +78,7 @@ def test_a_body_that_walks_takes_canes_along():
     furthest = 0.0
     for tick in range(60):
         walk = np.array([0.0, 0.014 * tick, 0, 0, 0, 0, 0])
-        moved = {name: getattr(spec.pose, name) + walk for name in POINTS}
+        moved = {name: getattr(spec.pose, name) + walk for name in POINT_NAMES}
         physics.move_human("eva", dataclasses.replace(spec.pose, **moved))
         physics.step()
         furthest = max(furthest, *(-contact.distance for contact in physics.contacts), 0.0)
@@ -97,10 +97,10 @@ def test_a_tie_holds_a_body_beside_its_own_ties():
     tree = cane((0.0, 0.0, 2.0))
     model = assemble([tree], tie_body=[15], tie_point=np.zeros((1, 3)), tie_anchor=np.zeros((1, 3)),
                      tie_stiffness=[500.0], tie_damping=[5.0])  # fmt: skip
-    model.tie_anchor[0] = model.forward(model.joint_settled)[15, :3]
+    model.tie_anchor[0] = model.forward_kinematics(model.joint_settled)[15, :3]
     twin = assemble([tree], tie_body=[15, 15], tie_point=[[0.0, 0, 0], [0.05, 0, 0]], tie_anchor=np.zeros((2, 3)),
                     tie_stiffness=[500.0, 200.0], tie_damping=[5.0, 10.0])  # fmt: skip
-    at = model.forward(model.joint_settled)[15]
+    at = model.forward_kinematics(model.joint_settled)[15]
     twin.tie_anchor[:] = model.tie_anchor[0], at[:3] + frames.rotate(at[3:], np.array([0.05, 0.0, 0.0]))
     held, drawn = ArticulationSolver(model, State.at_rest(model)), ArticulationSolver(twin, State.at_rest(twin))
     tie = held.add_tie(15, np.array([0.05, 0.0, 0.0]), 200.0, 10.0)

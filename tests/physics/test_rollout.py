@@ -7,7 +7,7 @@ from tests.support.clustered_trees import clustered
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.rollout import Rollout, RolloutDiverged
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -15,8 +15,8 @@ from vinesim.scene.state import State
 def canes(count: int = 2) -> Model:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.02), 4 + i)
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.02), 4 + i)
         trees.append(tree)
     return assemble(trees)
 

@@ -5,16 +5,16 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.sleep import SleepMonitor
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
 
 def row(count: int) -> ArticulationSolver:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 6)
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), 6)
+        tree.solve_rest_pose()
         trees.append(tree)
     model = assemble(trees)
     return ArticulationSolver(model, State.at_rest(model))
@@ -45,7 +45,7 @@ def test_a_kicked_tree_swings_then_sleeps_and_the_others_never_woke() -> None:
     after = [getattr(state, name)[others].tobytes() for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
     assert before == after
     np.testing.assert_allclose(
-        state.body_q, plants.model.forward(state.joint_q), atol=1e-5
+        state.body_q, plants.model.forward_kinematics(state.joint_q), atol=1e-5
     )  # up to date, not a tick old
 
 

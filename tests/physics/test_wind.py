@@ -8,7 +8,7 @@ from vinesim import frames
 from vinesim.physics.plants.articulation_solver import AIR_DENSITY, ArticulationSolver
 from vinesim.physics.plants.wind import ROUND, Wind
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -17,8 +17,12 @@ def leafy(count: int, area: float = 0.004, **wood: float) -> Model:
     """Upright canes of half a metre, side by side a metre apart, each body with a leaf or two."""
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 0.0]), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
-        tree.rod(-1, 0.5, (0.003, 0.003), Wood(**{"modulus": 3e9, "density": 800.0, "damping": 0.02} | wood), 8)
+        tree = TreeBuilder(
+            frames.pose(np.array([0.0, i, 0.0]), frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.eye(3)[0]))
+        )
+        tree.add_rod(
+            -1, 0.5, (0.003, 0.003), RodMaterial(**{"modulus": 3e9, "density": 800.0, "damping": 0.02} | wood), 8
+        )
         trees.append(tree)
     model = assemble(trees)
     model.body_drag[:] = area
@@ -216,7 +220,7 @@ def test_a_tick_blows_on_what_is_near_a_robot() -> None:
     for _ in range(200):
         physics.step()
     model = physics.model
-    grown = model.forward(model.joint_settled)
+    grown = model.forward_kinematics(model.joint_settled)
     first, last = model.bodies_of(0), model.bodies_of(9)
     assert 0 in physics.plants.awake
     assert 9 not in physics.plants.awake

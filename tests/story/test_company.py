@@ -14,7 +14,7 @@ from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.description import load as load_robot
 from vinesim.robot.tasks.push import ReachAndPush
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 DT = 0.01
 
@@ -24,7 +24,7 @@ class Farm:
 
     def __init__(self, visitor_back: float = 0.0) -> None:
         self.now = 100.0
-        self.scene = load("demo")
+        self.scene = load_scene("demo")
         self.model = generate(self.scene)
         self.hub = MemoryHub(delay=0.02)
         self.vinebot = load_robot("vinebot")
@@ -103,7 +103,7 @@ def test_a_companion_is_nobody_that_must_be_told():
 
 
 def test_robots_of_one_client_start_side_by_side_then_in_line():
-    scene = load("demo")
+    scene = load_scene("demo")
     poses = [start_pose(scene, 0, 0.0, i) for i in range(2 * len(scene.spawns))]
     first, behind = poses[0], poses[len(scene.spawns)]
     assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE)

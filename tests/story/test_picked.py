@@ -15,8 +15,8 @@ from vinesim.robot.description.description import load
 from vinesim.robot.tasks.pick import Pick
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Kind, thing
-from vinesim.scene.spec import load as load_scene
-from vinesim.scene.spec import reseeded
+from vinesim.scene.spec import load_scene as load_scene
+from vinesim.scene.spec import with_seed
 
 DT = 0.01
 GRAVITY = 9.81
@@ -25,7 +25,7 @@ GRAVITY = 9.81
 @pytest.mark.slow
 def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_weighed_on_the_vine():
     now = [100.0]
-    scene = reseeded(load_scene("harvest"), 7)
+    scene = with_seed(load_scene("harvest"), 7)
     model, vinebot, hub = generate(scene), load("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
     task = next(pick_planning.tasks(model, start_poses.spawn_pose(scene, 0)[:2]))
     box = thing(Kind.BOX, task.box)

@@ -10,7 +10,7 @@ from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.description import load as load_robot
 from vinesim.robot.tasks.push import ReachAndPush
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 DT = 0.01
 DELAY = 0.02
@@ -21,7 +21,7 @@ class World:
 
     def __init__(self, visitor_back=0.0):
         self.now = 100.0
-        self.scene = load("demo")
+        self.scene = load_scene("demo")
         self.model = generate(self.scene)
         self.hub = MemoryHub(delay=DELAY, jitter=0.005, seed=1)
         vinebot = load_robot("vinebot")
@@ -145,7 +145,7 @@ def test_twice_the_same_bits():
 
 
 def test_the_chosen_bunch_can_be_reached():
-    scene = load("demo")
+    scene = load_scene("demo")
     model = generate(scene)
     pose = spawn_pose(scene, 0)
     centre = bunch_centres(model)[bunch_in_reach(model, pose)]

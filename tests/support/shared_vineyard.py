@@ -19,7 +19,7 @@ from vinesim.robot.description.description import Description, load
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 
 DT = 0.01
 SIZE = (0.5, 0.3, 0.2)
@@ -131,7 +131,7 @@ class World:
         self.clients: dict[str, Client] = {}
 
     def join(self, name: str, x: float, y: float, heading: float = 0.0) -> Client:
-        pose = frames.pose([x, y, 0.0], frames.yaw(heading))
+        pose = frames.pose([x, y, 0.0], frames.from_yaw(heading))
         scene = self.scene
         client = Client(scene, self.model, cart(), self.hub.bus(name), name=name, pose=pose, clock=lambda: self.now)
         client.physics.wind = None

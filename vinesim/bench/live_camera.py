@@ -17,7 +17,7 @@ from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.description import load as load_robot
 from vinesim.robot.tasks.push import ReachAndPush
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
 SECONDS = 8.0
@@ -38,7 +38,7 @@ class _Run:
 
 def _run(pictures: bool) -> _Run:
     """One robot pushes a bunch again and again, and its head follows with the camera."""
-    plan = load("demo")
+    plan = load_scene("demo")
     model = generate(plan)
     description = load_robot("vinebot")
     with contextlib.ExitStack() as stack:

@@ -35,7 +35,7 @@ from vinesim.robot.drives import RemoteRobot
 from vinesim.robot.tasks.push import Phase, ReachAndPush
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import Scene, load
+from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.values import Measurement, TreeUpdate
 
 DT = 0.01
@@ -60,7 +60,7 @@ SEEN = 0.001
 
 @functools.cache
 def _stage() -> tuple[Scene, Model, Description]:
-    scene = msgspec.structs.replace(load("demo"), boxes=())  # in their place the second robot will stand
+    scene = msgspec.structs.replace(load_scene("demo"), boxes=())  # in their place the second robot will stand
     model = generate(scene)
     model.bunch_pull[:] = model.bunch_bend[:] = 1e6  # who fights by the wrong rule would tear the bunch off
     return scene, model, load_robot("vinebot")
@@ -82,7 +82,7 @@ class Pair:
         middle = bunch_centres(self.model)[self.bunch]
         opposite = 2.0 * middle[:2] - start[:2]
         heading = np.arctan2(*(middle[:2] - opposite)[::-1])
-        poses = {"first": start, "second": frames.pose([*opposite, 0.0], frames.yaw(heading))}
+        poses = {"first": start, "second": frames.pose([*opposite, 0.0], frames.from_yaw(heading))}
         for name, pose in poses.items():
             client = Client(
                 self.scene, self.model, robot, self.hub.bus(name), name=name, pose=pose, clock=lambda: self.now

@@ -143,11 +143,10 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
     """Run the demo and write ``out``; 0 if all went well."""
     from vinesim.robot.description.description import load as load_robot
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load as load_scene
-    from vinesim.scene.spec import reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     console = Console(stderr=True)
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     robot_named = load_robot(robot)  # say now, and once, what is wrong with it
     model = generate(plan)
     bunch, places = choose_poses(plan, model)
@@ -211,14 +210,13 @@ def run_job(
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     from vinesim.client.tasks.tasks import UnknownJob
     from vinesim.robot.description.description import load as load_robot
-    from vinesim.scene.spec import load as load_scene
-    from vinesim.scene.spec import reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     if job not in JOBS:
         raise UnknownJob(f"no job {job!r}; give push, {' or '.join(JOBS)}")
     console = Console(stderr=True)
     robot, scene = robot or JOBS[job][0], scene or "harvest"
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     load_robot(robot)  # say now, and once, what is wrong with it
     out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)

@@ -34,12 +34,12 @@ def run(
     from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")
     sys.setswitchinterval(SWITCH_INTERVAL)
-    plan = reseeded(load(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     if place is not None:
         plan, spawn = placed(plan, *place), 0
     model = generate(plan)

@@ -34,7 +34,7 @@ def run(
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
     from vinesim.sensors.camera import renderers
     from vinesim.sensors.camera.camera import Camera, CameraSpec
     from vinesim.sensors.export import annotations as formats
@@ -52,7 +52,7 @@ def run(
         raise UsageError(f"--at {at} lies in the ground; give a height above 0")
     spec = CameraSpec.load(camera)
     info = sized(spec, None if size is None else parse_size(size))
-    plan, staged = reseeded(load(scene), seed), parse_composition(robots, people, crates)
+    plan, staged = with_seed(load_scene(scene), seed), parse_composition(robots, people, crates)
     sun = plan.sun if hour is None else msgspec.structs.replace(plan.sun, hour=hour)
     model = generate(plan)
     view = staged.set(model)
@@ -107,8 +107,8 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
     for text in people:
         parts = text.split(",")
         posture = parts.pop() if len(parts) > 1 and parts[-1].strip().isidentifier() else "stand"
-        if posture not in appearance.postures():
-            raise UsageError(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.postures())}")
+        if posture not in appearance.posture_names():
+            raise UsageError(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.posture_names())}")
         x, y, yaw = (*_parse_place("--person", ",".join(parts), 3), 0.0)[:3]
         placed_people.append(PersonAt(x, y, yaw, posture))
     for text in crates:

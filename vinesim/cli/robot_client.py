@@ -69,11 +69,10 @@ def run(
     from vinesim.robot.description.description import load as load_robot
     from vinesim.robot.tasks.push import ReachAndPush
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load as load_scene
-    from vinesim.scene.spec import reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     checked_job(job)
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:
         plan = placed(plan, *place)

@@ -28,7 +28,7 @@ def run(
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.net.transport.zenoh_bus import ZenohBus
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
     from vinesim.sensors.camera import renderers
 
     if status not in ("text", "json", "none"):
@@ -36,7 +36,7 @@ def run(
     if tls is not None and connect is None:
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
     renderers.check(renderer)
-    plan = reseeded(load(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     if place is None:
         start = spawn_pose(plan, spawn)
         place = float(start[0]), float(start[1]), 2.0 * float(np.arctan2(start[5], start[6]))

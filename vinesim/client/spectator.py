@@ -34,7 +34,7 @@ MIDDLE = 1.2
 
 def standing_view(x: float, y: float, heading: float) -> np.ndarray:
     """Pose [7] of the eyes of somebody who stands at (x, y) [m] and looks along ``heading`` [rad]."""
-    return frames.pose([x, y, EYE_HEIGHT], frames.yaw(heading))
+    return frames.pose([x, y, EYE_HEIGHT], frames.from_yaw(heading))
 
 
 def follow_view(base: np.ndarray) -> np.ndarray:

@@ -80,7 +80,7 @@ def plant_capsules(model: Model) -> PlantCapsules:
         for i, (first, count) in enumerate(zip(model.bunch_cluster, model.bunch_clusters, strict=True))
         for k in range(count)
     }
-    stalk_of = model.bunch_of().tolist()
+    stalk_of = model.bunch_of_body().tolist()
     lengths, radii = model.body_length.tolist(), model.body_radius.mean(1).tolist()
     for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
         if b in of_body:
@@ -169,7 +169,7 @@ class ContactSolver:
         self._awake = np.zeros(0, np.int32)
         self._allocate()
         self._renew()
-        drawn = model.forward(model.joint_settled)[self.capsules.body]
+        drawn = model.forward_kinematics(model.joint_settled)[self.capsules.body]
         for kept, end in ((self._start_drawn, self.capsules.start), (self._end_drawn, self.capsules.end)):
             kept[:] = drawn[:, :3] + frames.rotate(drawn[:, 3:], end.astype(float))
         self._bound(np.arange(len(model.tree_first), dtype=np.int32))

@@ -342,7 +342,7 @@ class ArticulationSolver:
             speed[has, number + 1, 3:] = motion[:, 3:] + turn
             mass[has, number + 1] = self.body_mass[body]
             com[has, number + 1], inertia[has, number + 1] = self.body_com[body], self.body_inertia[body]
-        axes = frames.matrix(here[..., 3:])
+        axes = frames.to_matrix(here[..., 3:])
         tensor = np.einsum("...ij,...j,...kj->...ik", axes, inertia, axes)
         arm = np.einsum("...ij,...j->...i", axes, com)
         linear = mass[..., None] * (speed[..., :3] + np.cross(speed[..., 3:], arm))

@@ -52,7 +52,7 @@ class DetachmentMonitor:
         """Hands that hold plants, as contacts; who holds a bunch may be the one who pulled it off."""
         model = plants.model
         self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
-        self._bunch_of = model.bunch_of()
+        self._bunch_of = model.bunch_of_body()
         trees = model.body_tree[model.bunch_body]
         order = np.argsort(trees, kind="stable")
         self._bunches = order.astype(np.int32)

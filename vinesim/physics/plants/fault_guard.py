@@ -58,7 +58,7 @@ class FaultGuard:
         state.joint_xd[cut] = 0.0
         lost = cut[~np.isfinite(state.joint_x[cut]).all(-1)]
         if len(lost):
-            state.joint_x[lost] = plants.model.forward(plants.model.joint_settled)[lost, :3]  # where it grew
+            state.joint_x[lost] = plants.model.forward_kinematics(plants.model.joint_settled)[lost, :3]  # where it grew
         loads = plants.body_load[bodies]
         plants.body_load[bodies] = np.where(np.isfinite(loads), loads, 0.0)
         plants.put_to_sleep(stopped)
