@@ -11,11 +11,11 @@ from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import Trace
 from vinesim.client.sensing.sensor_process import SensorProcess
-from vinesim.client.tasks.start_poses import bunch_in_reach, spawn_pose, start_pose
+from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, start_pose
 from vinesim.client.tasks.tasks import LookAt
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load as load_robot
-from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
@@ -50,10 +50,10 @@ def _run(pictures: bool) -> _Run:
         client = Client(plan, model, description, bus, name="robot", pose=start_pose(plan, 0), executor=arrivals)
         stack.callback(client.leave)
         senses.attach(client)
-        bunch = bunch_in_reach(model, spawn_pose(plan, 0))
+        bunch = find_reachable_bunch(model, spawn_pose(plan, 0))
         body = int(model.bunch_body[bunch])
         client.trace = Trace(model, bunch, client.physics.state.body_q[body].copy(), 1 << 14)
-        reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
+        reach = PushBunch(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
         client.pre_step += [reach.control, LookAt(client.robot, client.trace.centre)]
         warm, pace = RateLoop(client.physics.dt), RateLoop(client.physics.dt)
         camera = description.cameras[0].name

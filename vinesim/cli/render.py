@@ -102,7 +102,7 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
         name, mark, where = text.rpartition("@")
         if not (mark and name):
             raise UsageError(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
-        description.load(name)  # says what is wrong with it
+        description.load_description(name)  # says what is wrong with it
         placed_robots.append(RobotPlacement(name, *_parse_place("--robot", where, 3)))
     for text in people:
         parts = text.split(",")

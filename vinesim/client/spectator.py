@@ -12,7 +12,7 @@ from vinesim.client.client import Client, label_index
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.exchange import ONLOOKER, Exchange
 from vinesim.net.transport.bus import Bus
-from vinesim.robot.description.description import Description
+from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import images
@@ -51,7 +51,7 @@ class Spectator(Client):
     picking = False  # it is told what parts
 
     def _enter(
-        self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
+        self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
         height: float, bus: Bus,
     ) -> None:  # fmt: skip
         self.pose = np.asarray(pose, float)

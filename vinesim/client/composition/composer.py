@@ -120,7 +120,7 @@ class SceneComposer:
         """Let robots and people in."""
         for index, one in enumerate(self.robots):
             pose = _ground_pose(one.x, one.y, one.yaw)
-            rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
+            rigid.add_robot(description.load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
             pose = appearance.apply_posture(
                 standing(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height

@@ -19,7 +19,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.sensing.latest_value import LatestValue, poller
-from vinesim.robot.description.description import Description
+from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -42,7 +42,7 @@ class SensorConfig:
 
     name: str
     model: Model
-    description: Description
+    description: RobotDescription
     sun: SunPath
     namespace: str
     ros: bool
@@ -117,7 +117,7 @@ class SensorWorker:
         from vinesim.ros.node import Node
 
         setup, description = self.setup, self.setup.description
-        fixed = [(p, c, q) for (p, c), q in zip(description.fixed, description.fixed_q, strict=True)]
+        fixed = [(p, c, q) for (p, c), q in zip(description.fixed_frames, description.fixed_poses, strict=True)]
         node = stack.enter_context(
             Node(
                 setup.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=setup.namespace,
