@@ -24,7 +24,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.values import HumanPose
 from vinesim.sensors.camera.camera import Camera, CameraSpec
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import Primitives
 
@@ -193,10 +193,10 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     primitives.update(view)
     eye = np.array([0.0, 0.0, 1.3])
     scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, frames.pose(eye))
-    gaze = looking(eye, np.array([3.0, -0.4, 1.0]))
+    gaze = look_at(eye, np.array([3.0, -0.4, 1.0]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, gaze)
     d435 = CameraSpec.load("d435")
-    clear = looking(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both its imagers, of her own robot
+    clear = look_at(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both its imagers, of her own robot
     measured = Camera(d435, d435.info("optical", 0.5)).render(primitives, clear)
     seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
     for organ, name, at in (

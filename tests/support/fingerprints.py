@@ -30,7 +30,7 @@ from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
 def _hash(*parts: bytes) -> str:
@@ -101,7 +101,7 @@ def scan() -> str:
     """One revolution of each lidar in the demo's vineyard."""
     model = generate(load_scene("demo"))
     primitives = Primitives(model)
-    primitives.update(still_view(model))
+    primitives.update(rest_snapshot(model))
     pose = np.array([1.2, 0.9, 0.8, 0.0, 0.0, 0.0, 1.0])
     parts = []
     for name in ("vlp16", "os1_64"):

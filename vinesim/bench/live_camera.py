@@ -20,9 +20,9 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
-SECONDS = 8.0
+RUN_TIME = 8.0
 """Real time of one run [s]; each kind is run twice, in turn."""
-SETTLED = 100
+WARMUP_STEPS = 100
 """Ticks before the count begins."""
 
 
@@ -58,7 +58,7 @@ def _run(pictures: bool) -> _Run:
         warm, pace = RateLoop(client.physics.dt), RateLoop(client.physics.dt)
         camera = description.cameras[0].name
         before = {"frames": 0, "frames_dropped": 0}
-        for beat, ticks in ((warm, SETTLED), (pace, round(SECONDS / client.physics.dt))):
+        for beat, ticks in ((warm, WARMUP_STEPS), (pace, round(RUN_TIME / client.physics.dt))):
             if beat is pace:
                 before = {key: counts.get(camera, 0) for key, counts in senses.report().items() if key in before}
             for _ in range(ticks):
@@ -82,6 +82,6 @@ def eyes() -> Iterator[Measurement]:
     yield Measurement("eyes", "tick p50", seeing.p50, "ms", peer, blind.p50, blind.p50 / seeing.p50)
     yield Measurement("eyes", "tick p99", seeing.p99, "ms", peer, blind.p99, blind.p99 / seeing.p99)
     yield Measurement("eyes", "ticks a second", seeing.hz, "Hz", peer, blind.hz, seeing.hz / blind.hz)
-    yield Measurement("eyes", f"ticks over 10 ms in {SECONDS:g} s", seeing.overruns, "1", peer, blind.overruns, None)
+    yield Measurement("eyes", f"ticks over 10 ms in {RUN_TIME:g} s", seeing.overruns, "1", peer, blind.overruns, None)
     yield Measurement("eyes", "pictures 640x480 a second, of 30 asked for", seeing.frames, "Hz")
     yield Measurement("eyes", "pictures dropped a second", seeing.dropped, "Hz")

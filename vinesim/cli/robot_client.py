@@ -50,7 +50,7 @@ def run(
     from vinesim.sensors.camera import renderers
 
     find_device(device)  # refused before anything is built
-    renderers.check(renderer)
+    renderers.check_renderer(renderer)
     if threads > 1 and device != "cpu":
         raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 

@@ -113,7 +113,7 @@ class PictureWriter:
         self._primitives.update(view, np.flatnonzero(self._moved))
         self._moved[:] = False
         ahead = frames.rotate(spectator.pose[3:], np.array([1.0, 0.0, 0.0]))
-        eye = images.looking(spectator.pose[:3], spectator.pose[:3] + ahead)
+        eye = images.look_at(spectator.pose[:3], spectator.pose[:3] + ahead)
         self.last = self._camera.render(self._primitives, eye, view.time)
         self.count += 1
         images.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
@@ -122,4 +122,4 @@ class PictureWriter:
         """Draw what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
         self._draw(spectator)
         assert self.last is not None
-        images.save(self.last, self.folder, "")
+        images.save_frame(self.last, self.folder, "")
