@@ -229,7 +229,7 @@ def test_joint_state_round_trip_is_exact():
 
 
 def test_odometry_velocity_is_in_the_axes_of_the_base():
-    turned = frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(math.pi / 2))
+    turned = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(math.pi / 2))
     ahead = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.3])  # it looks along world y, and drives there
     sample = RobotSample("r", joint_sample(), turned, ahead, turned, (), np.zeros((0, 7)))
     twist = over_the_wire(convert.odometry(sample, "base_footprint")).twist.twist
@@ -238,7 +238,7 @@ def test_odometry_velocity_is_in_the_axes_of_the_base():
 
 
 def test_wrench_is_the_same_force_seen_from_the_link():
-    link = frames.pose(np.array([1.0, 0.0, 1.0]), frames.yaw(math.pi / 2))
+    link = frames.pose(np.array([1.0, 0.0, 1.0]), frames.from_yaw(math.pi / 2))
     force, position = np.array([0.0, 2.0, 0.0]), np.array([1.5, 0.0, 1.0])
     contact = Contact("r", "finger", 3, position, force, -0.001)
     message = over_the_wire(convert.wrench(contact, 1.0, "finger", link)).wrench

@@ -65,7 +65,7 @@ def wait_until(condition: Callable[[], object], meanwhile: Callable[[], object] 
 def robot_sample(t: float, actor: str = "vinebot", contacts: tuple[Contact, ...] = ()) -> RobotSample:
     zeros = np.zeros(len(JOINTS))
     joints = JointSample(t, JOINTS, zeros + t, zeros, zeros, zeros)
-    base = frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(np.pi / 2))
+    base = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(np.pi / 2))
     return RobotSample(actor, joints, base, np.zeros(6), REST, FRAMES, np.tile(REST, (len(FRAMES), 1)), contacts)
 
 

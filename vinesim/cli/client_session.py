@@ -19,12 +19,12 @@ from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import Trace
 from vinesim.client.status import Status
-from vinesim.client.tasks.start_poses import placed
+from vinesim.client.tasks.start_poses import with_start_pose
 from vinesim.net.transport.bus import Bus, MemoryHub
-from vinesim.robot.tasks.task import Script
+from vinesim.robot.tasks.task import Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load, reseeded
+from vinesim.scene.spec import load_scene, with_seed
 
 SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
@@ -46,11 +46,11 @@ class ClientSession:
         sys.setswitchinterval(SWITCH_INTERVAL)
         self.options = options
         self.name = options.name or f"{options.role}-{os.getpid()}"
-        self.scene = reseeded(load(options.scene), options.seed)
+        self.scene = with_seed(load_scene(options.scene), options.seed)
         self.spawn = options.spawn
         """Index of the start pose in the scene."""
         if options.pose is not None:
-            self.scene, self.spawn = placed(self.scene, *options.pose), 0
+            self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
         self.model = generate(self.scene)
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()
@@ -74,11 +74,11 @@ class ClientSession:
 
         return self.enter(ZenohBus(name, connect=self.options.connect, certificates=self.options.tls))
 
-    def client_options(self) -> dict[str, Any]:
-        """Keyword arguments that :class:`Client` takes for every role."""
+    def client_options(self, name: str | None = None) -> dict[str, Any]:
+        """Keyword arguments that :class:`Client` takes for every role; ``name`` instead of the session's."""
         options = self.options
         return {
-            "name": self.name,
+            "name": name or self.name,
             "interest_radius": options.interest_radius,
             "jitter_buffer": 1e-3 * options.jitter_buffer,
             "device": options.device,
@@ -96,7 +96,7 @@ class ClientSession:
         return client.trace
 
     def run(
-        self, client: Client, *, task: Script | None = None, sent: Callable[[], dict[str, int]] = dict,
+        self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
         publish: Callable[[dict[str, Any]], None] = lambda _: None,
     ) -> Status:  # fmt: skip
         """Step in real time until a signal, the time limit or the end of the ``task``; returns the final status.
@@ -111,7 +111,7 @@ class ClientSession:
         reporter.start()
         self._stack.callback(reporter.join)
         self._stack.callback(self._stop.set)
-        is_done = (lambda: False) if task is None else (lambda: task.done)
+        is_done = (lambda: False) if task is None else (lambda: task.is_done)
         run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
         return status
 

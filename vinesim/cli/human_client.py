@@ -10,7 +10,7 @@ from vinesim.avatar.scripted_human import Walker
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
-from vinesim.client.tasks.start_poses import bunch_centres, checked_bunch, start_pose
+from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch
 
 REACH = 0.55
 """Horizontal distance from a bunch at which a human stands to take hold of it [m]. GUESSED."""
@@ -19,7 +19,7 @@ REACH = 0.55
 def run(options: ClientOptions) -> int:
     """Walk, reach for a bunch, hold it, pull at it, let go, until told to stop; then write report.json; the exit code."""
     with ClientSession(options) as session:
-        checked_bunch(session.model, options.reach)
+        validate_bunch(session.model, options.reach)
         start = start_pose(session.scene, session.spawn)
         human = Walker(start, options.height)
         client = Client(

@@ -8,27 +8,27 @@ from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
 from vinesim.client.sensing.sensor_process import SensorProcess
-from vinesim.client.tasks.start_poses import checked_bunch, start_pose
-from vinesim.client.tasks.tasks import DriveTo, LookAt, checked_job, plan_job
-from vinesim.robot.description.description import Description
-from vinesim.robot.description.description import load as load_robot
-from vinesim.robot.tasks.push import ReachAndPush
-from vinesim.robot.tasks.task import Script
+from vinesim.client.tasks.start_poses import start_pose, validate_bunch
+from vinesim.client.tasks.tasks import DriveTo, LookAt, plan_task, validate_task_name
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.tasks.push import PushBunch
+from vinesim.robot.tasks.task import Task
 from vinesim.ros.names import ros_name
 
 
 def run(options: ClientOptions) -> int:
     """Build the client from its options, step until told to stop, then write what was asked for; the exit code."""
-    checked_job(options.job)
+    validate_task_name(options.job)
     descriptions = [load_robot(robot) for robot in options.robot or ["vinebot"]]
     with ClientSession(options) as session:
         start = start_pose(session.scene, session.spawn, options.approach)
         begin, approach = None, options.approach
         if options.job is not None:
-            begin, start = plan_job(options.job, session.model, start_pose(session.scene, session.spawn))
+            begin, start = plan_task(options.job, session.model, start_pose(session.scene, session.spawn))
             approach = 0.0
         for bunch in (options.push, options.watch):
-            checked_bunch(session.model, bunch)
+            validate_bunch(session.model, bunch)
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
         names = [session.name]
@@ -54,7 +54,9 @@ def run(options: ClientOptions) -> int:
     return 0
 
 
-def _start_sensors(session: ClientSession, names: list[str], descriptions: list[Description]) -> list[SensorProcess]:
+def _start_sensors(
+    session: ClientSession, names: list[str], descriptions: list[RobotDescription]
+) -> list[SensorProcess]:
     """A sensor process for each robot; of several robots each publishes under its own namespace."""
     options, processes = session.options, []
     for i, (name, description) in enumerate(zip(names, descriptions, strict=True)):
@@ -69,12 +71,12 @@ def _start_sensors(session: ClientSession, names: list[str], descriptions: list[
 
 
 def _build_client(
-    session: ClientSession, names: list[str], descriptions: list[Description], start: np.ndarray, approach: float
+    session: ClientSession, names: list[str], descriptions: list[RobotDescription], start: np.ndarray, approach: float
 ) -> Client:
     """A client that simulates all robots, the first at ``start`` [7], the others at the next start poses."""
     client = Client(
         session.scene, session.model, descriptions[0], session.bus(names[0]), pose=start,
-        **session.client_options() | {"name": names[0]},
+        **session.client_options(names[0]),
     )  # fmt: skip
     for i in range(1, len(names)):
         pose = start_pose(session.scene, session.spawn, approach, i)
@@ -83,7 +85,7 @@ def _build_client(
     return client
 
 
-def _add_behaviour(session: ClientSession, client: Client, task: Script | None, approach: float) -> None:
+def _add_behaviour(session: ClientSession, client: Client, task: Task | None, approach: float) -> None:
     """Let the robots drive to their start poses, push the bunch of ``--push``, do the ``task``, and look at it."""
     options = session.options
     watched = options.watch if options.watch is not None else options.push
@@ -94,10 +96,10 @@ def _add_behaviour(session: ClientSession, client: Client, task: Script | None, 
             client.pre_step.append(DriveTo(robot, start_pose(session.scene, session.spawn, queue=i)))
     if options.push is not None and client.trace is not None:
         side = client.side_of(client.trace.centre())
-        client.pre_step.append(ReachAndPush(client.robot, side, client.trace.centre).control)
+        client.pre_step.append(PushBunch(client.robot, side, client.trace.centre).control)
     if task is not None:
         client.pre_step.append(task.control)
-        client.frame_score = task.worth
+        client.frame_score = task.frame_score
         client.pre_step.append(LookAt(client.robot, task.focus))
     elif client.trace is not None:
         client.pre_step.append(LookAt(client.robot, client.trace.centre))

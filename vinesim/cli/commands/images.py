@@ -61,9 +61,11 @@ def render(
     """  # a command line that can be copied
     from vinesim.cli.render import run
 
-    composition = {"robots": robot or (), "people": person or (), "crates": crate or ()}
-    view = {"camera": camera, "at": at, "look": look, "size": size, "hour": hour}
-    raise typer.Exit(run(scene, **view, seed=seed, out=out, renderer=renderer, **composition))
+    code = run(
+        scene, camera=camera, at=at, look=look, size=size, hour=hour, seed=seed, out=out, renderer=renderer,
+        robots=robot or (), people=person or (), crates=crate or (),
+    )  # fmt: skip
+    raise typer.Exit(code)
 
 
 def dataset(

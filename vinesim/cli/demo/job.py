@@ -11,11 +11,10 @@ from vinesim.cli.demo.placement import visitor_pose
 from vinesim.cli.demo.processes import START_TIMEOUT, process_group
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
-from vinesim.client.tasks.tasks import UnknownJob
-from vinesim.robot.description.description import load as load_robot
+from vinesim.client.tasks.tasks import UnknownTask
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.ros import ros_setup
-from vinesim.scene.spec import load as load_scene
-from vinesim.scene.spec import reseeded
+from vinesim.scene.spec import load_scene, with_seed
 
 JOBS = {"pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged")}
 """Jobs: the robot that does them unless another is named, and the key of ``summary.json`` for whether it was done."""
@@ -29,11 +28,11 @@ def run_job(
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     if job not in JOBS:
-        raise UnknownJob(f"no job {job!r}; give push, {' or '.join(JOBS)}")
+        raise UnknownTask(f"no job {job!r}; give push, {' or '.join(JOBS)}")
     console = Console(stderr=True)
     default_robot, done_key = JOBS[job]
     robot, scene = robot or default_robot, scene or "harvest"
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     load_robot(robot)  # refused once, and before any process starts
     out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)

@@ -20,10 +20,10 @@ def choose_poses(scene: Scene, model: Model) -> tuple[int, tuple[list[str], list
     """The bunch to push, and the start poses of picker and visitor: the scene's own if a bunch is in reach there."""
     start = start_poses.spawn_pose(scene, 0)
     try:
-        return start_poses.bunch_in_reach(model, start), (["--spawn", "0"], ["--spawn", "1"])
-    except start_poses.NoPlace:
-        bunch, picker = start_poses.stand_before_a_bunch(model, start[:2])
-    visitor = start_poses.way_to(model, picker, APPROACH_DISTANCE)
+        return start_poses.find_reachable_bunch(model, start), (["--spawn", "0"], ["--spawn", "1"])
+    except start_poses.PlacementError:
+        bunch, picker = start_poses.find_push_pose(model, start[:2])
+    visitor = start_poses.find_approach_pose(model, picker, APPROACH_DISTANCE)
     return bunch, (_pose_option(picker), _pose_option(visitor))
 
 

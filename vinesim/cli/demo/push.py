@@ -13,12 +13,11 @@ from vinesim.cli.demo.placement import APPROACH_DISTANCE, choose_poses
 from vinesim.cli.demo.processes import REPORT_TIMEOUT, START_TIMEOUT, process_group
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import push_summary, push_table, write_summary
-from vinesim.robot.description.description import Description
-from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.ros import ros_setup
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load as load_scene
-from vinesim.scene.spec import reseeded
+from vinesim.scene.spec import load_scene, with_seed
 
 READY_TIMEOUT = 120.0
 """Longest wait for the first message of every sensor topic [s of wall time]; then the demo measures without them."""
@@ -29,7 +28,7 @@ CAMERA_TOPICS = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/c
 def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
     """Run the demo for ``seconds`` of simulated time after all sensors publish, and write ``out``; the exit code."""
     console = Console(stderr=True)
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     description = load_robot(robot)  # refused once, and before any process starts
     bunch, poses = choose_poses(plan, generate(plan))
     for folder in (out, out / PICKER, out / VISITOR):
@@ -72,13 +71,13 @@ def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headle
     return 0
 
 
-def sensor_topics(robot: Description) -> list[str]:
+def sensor_topics(robot: RobotDescription) -> list[str]:
     """Topics of a robot's sensors, relative to its namespace."""
     points = [f"{lidar.name}/points" for lidar in robot.lidars]
     return points + [f"{camera.name}/{topic}" for camera in robot.cameras for topic in CAMERA_TOPICS]
 
 
-def monitored_topics(robot: Description) -> list[str]:
+def monitored_topics(robot: RobotDescription) -> list[str]:
     """The topics that the monitor counts: all of the picker's, of the visitor's its joints and first picture."""
     topics = [
         "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",
