@@ -67,8 +67,8 @@ class World:
 
 def parts_of(client: Client, name: str) -> np.ndarray:
     """[part, 7] as sensors see them."""
-    links = [link.name for link in client.physics.rigid.links()]
-    return client.physics.rigid.link_q()[[links.index(f"{name}/{part}") for part in PARTS]]
+    links = [link.name for link in client.physics.rigid.visuals()]
+    return client.physics.rigid.visual_q()[[links.index(f"{name}/{part}") for part in PARTS]]
 
 
 # ---------------------------------------------------------------------- seen
@@ -85,16 +85,16 @@ def test_people_and_robots_meet_and_part(vinebot):
     assert set(eva.others) == {"anna", "ida"}
     assert set(ida.others) == {"anna", "eva"}
     for client in world.clients:
-        assert len(client.physics.rigid.people) == 2
-        assert client.physics.rigid.person("eva").spec.height == pytest.approx(1.6)
-        assert client.physics.rigid.person("ida").spec.height == pytest.approx(1.9)
+        assert len(client.physics.rigid.humans) == 2
+        assert client.physics.rigid.human("eva").spec.height == pytest.approx(1.6)
+        assert client.physics.rigid.human("ida").spec.height == pytest.approx(1.9)
     for name in ("eva", "ida"):
         np.testing.assert_allclose(parts_of(anna, name), parts_of(world.clients[1 + (name == "ida")], name), atol=2e-3)
     ida.exchange.bus.close()
     world.clients.remove(ida)
     world.run(0.2)
     assert set(anna.others) == {"eva"}
-    assert anna.physics.rigid.people == ("eva",)
+    assert anna.physics.rigid.humans == ("eva",)
 
 
 def test_who_stands_still_is_the_same_everywhere_to_the_bit():
@@ -106,7 +106,7 @@ def test_who_stands_still_is_the_same_everywhere_to_the_bit():
     world.run(4.0)
     seen, here = parts_of(ida, "eva"), parts_of(world.clients[0], "eva")
     np.testing.assert_allclose(seen, here, atol=1e-12)
-    turned = ida.physics.rigid.person("eva").hand("left")
+    turned = ida.physics.rigid.human("eva").hand("left")
     np.testing.assert_allclose(ida.physics.hand("eva", turned.side).pose, pose.left, atol=1e-9)
 
 
@@ -140,13 +140,13 @@ def test_legs_that_each_client_makes_up_differ():
     world.run(0.5)
     walker.do(walker.walk((2.0, 0.0)))
     world.run(0.4)
-    seen = ida.physics.rigid.person("eva").parts
+    seen = ida.physics.rigid.human("eva").parts
     guess = Legs(standing(frames.pose(np.array([seen[0, 0] - 0.09, seen[0, 1], 0.0]))))
     feet = [PARTS.index("left_foot"), PARTS.index("right_foot")]
     guessed = []
     for _ in range(250):
         world.run(DT)
-        head = ida.physics.rigid.person("eva").parts[PARTS.index("head")]
+        head = ida.physics.rigid.human("eva").parts[PARTS.index("head")]
         guessed.append(guess.under(head)[1:, :3] - parts_of(eva, "eva")[feet, :3])
     apart = np.linalg.norm(guessed, axis=-1)
     assert apart.max() > 0.2, "in mid-stride"
@@ -188,7 +188,7 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.yaw(2.0)))
     bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.yaw(1.0)))
     world.run(0.8)
-    view = anna.physics.view()
+    view = anna.physics.snapshot()
     primitives = Primitives(world.model, grass=0.0)
     primitives.update(view)
     eye = np.array([0.0, 0.0, 1.3])
@@ -200,8 +200,8 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     measured = Camera(d435, d435.info("optical", 0.5)).render(primitives, clear)
     seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
     for organ, name, at in (
-        (Organ.HUMAN, "eva", eva.physics.rigid.stands("eva")),
-        (Organ.ROBOT, "bert", bert.physics.rigid.stands("bert")),
+        (Organ.HUMAN, "eva", eva.physics.rigid.actor_position("eva")),
+        (Organ.ROBOT, "bert", bert.physics.rigid.actor_position("bert")),
     ):
         mine = label(organ, label_index(name))
         points = eye + scan.xyz[scan.labels == mine].astype(float)
@@ -236,7 +236,7 @@ class Shove:
         self.human = self.world.join("eva", None, SIDE, self.pose)
         self.arm = [i for i, joint in enumerate(vinebot.joints) if joint.startswith("arm_left")]
         self.world.run(0.6 + 6 * delay)
-        self.rest = self.robot.physics.rigid.read("anna")[2].copy()
+        self.rest = self.robot.physics.rigid.joint_measurements("anna")[2].copy()
 
     def pose(self, time: float) -> HumanPose:
         right = np.concatenate([self.at, self.stand.right[3:]])
@@ -277,10 +277,10 @@ def test_a_push_on_the_copy_is_felt_by_the_robot(vinebot, delay):
 
     # the efforts of the real robot hold against the wrench; nothing of it is counted twice
     rigid = shove.robot.physics.rigid
-    _, _, effort, contact = rigid.read("anna")
+    _, _, effort, contact = rigid.joint_measurements("anna")
     expected = np.zeros(len(contact))
     for link, wrench in rigid._robots["anna"].afar.items():
-        at = rigid.data.xipos[rigid.world.body(f"anna/{link}").id]
+        at = rigid.mj_data.xipos[rigid.mj_model.body(f"anna/{link}").id]
         expected += rigid.jacobian("anna", link, at).T @ wrench
     np.testing.assert_allclose(contact, expected, atol=1e-3)
     assert np.abs(expected).max() > 3.0
@@ -294,7 +294,7 @@ def test_a_push_on_the_copy_is_felt_by_the_robot(vinebot, delay):
     said = shove.forces_said()
     shove.world.run(0.5)
     assert shove.forces_said() == said
-    np.testing.assert_allclose(rigid.read("anna")[2], shove.rest, atol=0.1)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[2], shove.rest, atol=0.1)
 
 
 def test_a_hand_that_pulls_at_an_arm_is_seen_there_and_felt(vinebot):
@@ -337,7 +337,7 @@ def test_an_arm_that_comes_to_a_hand_feels_it(vinebot):
         robot.command_position([home + swing], joint)
         shove.world.run(DT)
     shove.world.run(1.0)
-    efforts = shove.robot.physics.rigid.read("anna")[3][shove.arm]
+    efforts = shove.robot.physics.rigid.joint_measurements("anna")[3][shove.arm]
     assert shove.felt()[1] < -3.0, "the hand pushes back"
     np.testing.assert_allclose(shove.felt(), shove.given(), atol=0.05 * np.abs(shove.given()).max())
     assert np.abs(efforts).max() > 1.0
@@ -372,7 +372,7 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     assert eva.physics.hand("eva", "right").holds == ("plants", f"body/{body}")
     world.run(1.6)
     for client in world.clients:
-        client.physics.refresh()
+        client.physics.update_kinematics()
     poses_now = [client.physics.state.body_q[body].astype(float) for client in world.clients]
     here, there = (pose[:3] + frames.rotate(pose[3:], middle) for pose in poses_now)
     assert np.linalg.norm(here - centre) > 0.05

@@ -13,7 +13,7 @@ from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper,
 from vinesim import frames
 from vinesim.kernels.contact import solver
 from vinesim.physics.contact.contact_solver import Touching, shapes_of
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import Tree, Wood, assemble
 from vinesim.scene.ids import Organ
@@ -230,7 +230,7 @@ def test_only_what_is_reached_wakes_and_it_moves_in_the_same_tick():
     assert len(physics.plants.awake) == 0
     physics.add_robot(bar((0.7, -0.06, 0.95)))
     drive = physics.rigid._robots["bar"].v
-    physics.rigid.data.qvel[drive] = 3.0
+    physics.rigid.mj_data.qvel[drive] = 3.0
     before = physics.state.joint_q.copy()
     reached = None
     for _ in range(3):
@@ -246,14 +246,14 @@ def test_only_what_is_reached_wakes_and_it_moves_in_the_same_tick():
     assert not moved[model.tree_size[0] :].any()
     deepest = min(c.distance for c in physics.contacts)
     assert deepest > 0.0  # seen before it was there: nothing was late
-    _, _, _, contact_effort = physics.rigid.read("bar")
+    _, _, _, contact_effort = physics.rigid.joint_measurements("bar")
     assert contact_effort[0] == pytest.approx(sum(c.force[1] for c in physics.contacts), rel=1e-6)
 
 
 def test_fast_bar_wakes_every_cane_before_it_overlaps_one():
     physics = Physics(assemble([cane((0.0, 0.3 * i, 1.0), radius=0.005) for i in range(6)]))
     physics.add_robot(bar((0.7, -0.2, 0.95), damping=2000.0))
-    physics.rigid.data.qvel[physics.rigid._robots["bar"].v] = 5.0
+    physics.rigid.mj_data.qvel[physics.rigid._robots["bar"].v] = 5.0
     physics.rigid.command("bar", np.zeros(1), np.array([5.0]))
     first = {}
     for _ in range(40):
@@ -278,7 +278,7 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
     for _ in range(20):
         physics.step()
     assert len(physics.plants.awake) == 0
-    physics.rigid.data.joint("box/0").qvel[1] = 1.0
+    physics.rigid.mj_data.joint("box/0").qvel[1] = 1.0
     touched = set()
     for _ in range(30):
         physics.step()
@@ -289,19 +289,19 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
 def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     model, _, middle = bunch_scene()
     physics = Physics(model)
-    physics.touching = Touching(model, physics.plants, physics.rigid, capacity=2)
+    physics.contact_solver = Touching(model, physics.plants, physics.rigid, capacity=2)
     physics.add_robot(gripper(middle))
-    stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+    stages = (physics.rigid.predict, physics.contact_solver.find, physics.plants.free, physics.contact_solver.solve)
     for tick in range(250):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         for stage in stages:
             stage()
         physics._commit()
         physics._finish()
-        assert physics.touching.count <= 2
-    assert physics.touching.dropped > 0
-    assert "left out" in physics.touching.complaint
-    assert "capacity" in physics.touching.complaint
+        assert physics.contact_solver.count <= 2
+    assert physics.contact_solver.dropped > 0
+    assert "left out" in physics.contact_solver.complaint
+    assert "capacity" in physics.contact_solver.complaint
     assert len(physics.contacts) == 2
 
 
@@ -313,7 +313,7 @@ def test_nothing_touches_a_bunch_that_was_picked():
     for tick in range(120):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         physics.step()
-    assert physics.touching.count == 0
+    assert physics.contact_solver.count == 0
 
 
 def test_a_robot_that_joins_does_not_shake_a_grasp():
@@ -329,7 +329,7 @@ def test_a_robot_that_joins_does_not_shake_a_grasp():
             if join and tick == 250:
                 physics.remove_robot("bar")
             physics.step()
-        runs.append(physics.view().body_q[body])
+        runs.append(physics.snapshot().body_q[body])
     np.testing.assert_allclose(runs[0], runs[1], atol=1e-6)
 
 
@@ -346,7 +346,7 @@ def test_islands_do_not_feel_each_other():
             for i in which:
                 physics.rigid.command(f"bar{i}", np.zeros(1), np.array([0.5]))
             physics.step()
-            islands = max(islands, physics.touching.islands)
+            islands = max(islands, physics.contact_solver.islands)
         assert islands == len(which)
         ends.append(physics.state.joint_q.copy())
     np.testing.assert_allclose(ends[0], np.concatenate(ends[1:]), atol=1e-5)
@@ -373,33 +373,33 @@ def test_views_own_what_they_show_and_share_it_while_all_sleep():
     model, _, middle = bunch_scene()
     physics = Physics(model)
     physics.step()
-    first = physics.view()
+    first = physics.snapshot()
     physics.step()
-    assert physics.view().body_q is first.body_q
+    assert physics.snapshot().body_q is first.body_q
     physics.plants.wake(0)
     physics.state.joint_qd[5, 1] = 1.0
     physics.step()
-    second = physics.view()
+    second = physics.snapshot()
     kept = second.body_q.copy()
-    assert second.moved.tolist() == [0]
+    assert second.moved_trees.tolist() == [0]
     assert (second.body_q != first.body_q).any()
     np.testing.assert_allclose(second.body_q, model.forward(physics.state.joint_q), atol=1e-5)
     physics.step()
-    physics.view()
+    physics.snapshot()
     assert (second.body_q == kept).all()
     physics.add_robot(gripper(middle))
-    assert len(physics.view().links) == len(physics.view().link_q) == 2
-    assert physics.view().links is physics.view().links
+    assert len(physics.snapshot().visuals) == len(physics.snapshot().visual_q) == 2
+    assert physics.snapshot().visuals is physics.snapshot().visuals
 
 
 def test_rigid_groups_join_what_a_constraint_couples():
-    rigid = Rigid(rows_of_canes(1))
+    rigid = RigidWorld(rows_of_canes(1))
     rigid.add_robot(bar((0.0, 0.0, 0.5), "a"))
     rigid.add_robot(bar((0.0, 0.055, 0.5), "b"))
-    rigid.prep()
-    world = rigid.world
-    a, b = (int(rigid.group[world.body_treeid[world.geom_bodyid[g]]]) for g in rigid.geoms.id)
-    assert rigid.data.ncon > 0
+    rigid.predict()
+    world = rigid.mj_model
+    a, b = (int(rigid.islands[world.body_treeid[world.geom_bodyid[g]]]) for g in rigid.geoms.id)
+    assert rigid.mj_data.ncon > 0
     assert a == b
 
 
@@ -424,7 +424,7 @@ def test_a_tree_that_a_robot_reaches_into_stays_awake():
     physics.add_robot(bar((0.7, -0.034, 0.95), stiffness=1000.0, damping=100.0))
     for _ in range(400):
         physics.step()
-    assert physics.touching.near.tolist() == [0]
+    assert physics.contact_solver.near.tolist() == [0]
     assert physics.plants.awake.tolist() == [0]
 
 
@@ -433,7 +433,7 @@ def test_a_copy_touches_only_trees_of_which_its_owner_tells():
     reached = int(physics.model.tree_first[20])
     at = physics.state.body_q[reached + 5, :3].copy()
     physics.add_robot(bar(at, "ghost"))
-    physics.touching.copies.add("ghost")
+    physics.contact_solver.copies.add("ghost")
     asleep = physics.state.joint_q.copy()
     for _ in range(5):
         physics.step()
@@ -441,7 +441,7 @@ def test_a_copy_touches_only_trees_of_which_its_owner_tells():
     assert len(physics.plants.awake) == 0
     assert np.array_equal(physics.state.joint_q, asleep)
 
-    physics.touching.told[20] = True
+    physics.contact_solver.told[20] = True
     physics.step()
     assert {tree for tree, _ in physics.touched} == {20}
 
@@ -462,7 +462,7 @@ def test_what_stands_neither_wakes_a_tree_nor_keeps_it_awake():
     for _ in range(60):
         physics.step()
     assert len(physics.plants.awake) == 0
-    assert physics.touching.near.tolist() == []
+    assert physics.contact_solver.near.tolist() == []
 
 
 def test_a_swinging_cane_stops_at_a_pole():
@@ -477,7 +477,7 @@ def test_a_swinging_cane_stops_at_a_pole():
         for _ in range(40):
             physics.step()
             met |= {(c.actor, c.link) for c in physics.contacts}
-            furthest[standing] = max(furthest[standing], float(physics.view().body_q[12, 1]))
+            furthest[standing] = max(furthest[standing], float(physics.snapshot().body_q[12, 1]))
         assert met == ({("world", "fixed/0")} if standing else set())
     assert furthest[False] > 0.12
     assert furthest[True] < 0.08
@@ -526,7 +526,7 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         physics.add_robot(bar(at, damping=200.0))
         physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
         seen = set()
-        stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+        stages = (physics.rigid.predict, physics.contact_solver.find, physics.plants.free, physics.contact_solver.solve)
         for _ in range(40):
             for stage in stages:
                 stage()
@@ -554,15 +554,15 @@ def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
         )
         for i in range(4)
     ]  # fmt: skip
-    physics = Physics(assemble(trees), picking=False)
+    physics = Physics(assemble(trees), detachment=False)
     if options:
-        Touching.__init__(physics.touching, physics.model, physics.plants, physics.rigid, **options)
+        Touching.__init__(physics.contact_solver, physics.model, physics.plants, physics.rigid, **options)
     physics.add_robot(bar((rng.uniform(0.3, 0.9), -0.2, 1.0), damping=float(rng.choice([0.0, 300.0]))))
     physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
     speed = rng.uniform(0.3, 3.0)
     physics.rigid.command("bar", np.zeros(1), np.array([speed]))
-    physics.rigid.data.qvel[physics.rigid._robots["bar"].v] = speed
-    physics.rigid.push("probe", "rod", np.array([0.0, 0.0, -rng.uniform(2.0, 30.0)]))
+    physics.rigid.mj_data.qvel[physics.rigid._robots["bar"].v] = speed
+    physics.rigid.apply_wrench("probe", "rod", np.array([0.0, 0.0, -rng.uniform(2.0, 30.0)]))
     return physics, ["bar", "probe"]
 
 
@@ -570,7 +570,7 @@ def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
 @given(seed=st.integers(0, 2**31))
 def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed):
     physics, robots = scene_by_chance(seed)
-    touching, rigid = physics.touching, physics.rigid
+    touching, rigid = physics.contact_solver, physics.rigid
     pressed = 0
     for _ in range(60):
         physics.step()
@@ -597,7 +597,7 @@ def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed)
 
 def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axis: np.ndarray) -> np.ndarray:
     """Least distance [tree] of the shapes of each tree and a capsule on a robot's link, from many points of both."""
-    touching, model = physics.touching, physics.model
+    touching, model = physics.contact_solver, physics.model
     body_q = model.forward(physics.state.joint_q)[touching.shapes.body]
     t = np.linspace(0.0, 1.0, 9)[:, None, None]
     along = touching.shapes.start + t * (touching.shapes.end - touching.shapes.start)
@@ -624,7 +624,7 @@ def test_waking_is_never_late(seed):
     for tick in range(120):
         if tick % 20 == 0:
             speed = float(rng.uniform(-5.0, 5.0))
-            physics.rigid.drive_base("bar", (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), rng.uniform(-2.0, 2.0)))
+            physics.rigid.command_base("bar", (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), rng.uniform(-2.0, 2.0)))
         physics.rigid.command("bar", np.zeros(1), np.array([speed]))
         asleep = ~physics.state.tree_awake.copy()
         physics.step()
@@ -643,13 +643,13 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
 
     def run() -> tuple:
         physics = Physics(model)
-        Touching.__init__(physics.touching, model, physics.plants, physics.rigid, capacity=100, branches=False)
+        Touching.__init__(physics.contact_solver, model, physics.plants, physics.rigid, capacity=100, branches=False)
         for i in range(15):
             physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
         physics.plants.wake(np.arange(460))
-        for stage in (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve):
+        for stage in (physics.rigid.predict, physics.contact_solver.find, physics.plants.free, physics.contact_solver.solve):
             stage()
-        t = physics.touching
+        t = physics.contact_solver
         return t.count, t.dropped, t.complaint, t._gap[:100].copy(), t.bodies.tobytes() + t.wrenches.tobytes(), t
 
     count, dropped, complaint, gap, result, touching = run()

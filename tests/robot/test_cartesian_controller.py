@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.cartesian_controller import Hand, axes_of, prioritized
 from vinesim.robot.description.description import load
 from vinesim.robot.drives import Robot
@@ -21,8 +21,8 @@ def led(hand: Hand, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, 
     for tick in range(round(seconds / 0.01)):
         hand.lead(goal, ahead, up, speed=0.3, height=float(goal[2]))
         robot.control(0.01 * tick)
-        robot.rigid.prep()
-        robot.rigid.finish()
+        robot.rigid.predict()
+        robot.rigid.integrate()
         points.append(hand.point)
     return np.array(points)
 
@@ -34,7 +34,7 @@ def led(hand: Hand, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, 
     ids=["level, to a bunch", "down, to a box"],
 )
 def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple, ahead: tuple, up: np.ndarray):
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    robot = Robot(RigidWorld(assemble([])), load("vinebot"), "anna")
     hand = Hand(robot, side)
     there = np.array(goal) * [1.0, 1.0 if side == "left" else -1.0, 1.0]
     led(hand, there, np.array(ahead), np.array(up))
@@ -45,7 +45,7 @@ def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple,
 
 
 def test_a_hand_goes_straight_and_not_too_fast():
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    robot = Robot(RigidWorld(assemble([])), load("vinebot"), "anna")
     hand = Hand(robot, "left", tip=0.03)
     led(hand, np.array([0.6, 0.25, 1.3]), np.array([1.0, 0.0, 0.0]), UP)
     hand.start()

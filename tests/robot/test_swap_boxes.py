@@ -26,7 +26,7 @@ def yard() -> tuple[Model, Swap]:
 
 def begun(count: int = 6) -> Exchange:
     model, swap = yard()
-    physics = Physics(model, picking=False)
+    physics = Physics(model, detachment=False)
     robot = Robot(physics.rigid, load("logistic"), "carrier", pose=swap.start)
     swap_planning.fill(physics, swap.full, count)
     return Exchange(physics, robot, swap)
@@ -42,13 +42,13 @@ def test_a_full_box_goes_and_an_empty_one_comes():
     exchange = begun()
     model, swap = yard()
     place = exchange.box_pose(swap.full).copy()
-    load_kg = sum(float(model.body_mass[model.bunch_body[bunch]]) for bunch in exchange.physics.rigid.loose)
+    load_kg = sum(float(model.body_mass[model.bunch_body[bunch]]) for bunch in exchange.physics.rigid.free_bunches)
     lift = exchange.robot.description.indices("lift_front")[0]
     carried = []
     while not exchange.done:
         tick(exchange)
         if exchange.phase == "turn":
-            carried.append(exchange.robot.rigid.read("carrier")[2][lift])
+            carried.append(exchange.robot.rigid.joint_measurements("carrier")[2][lift])
     assert exchange.succeeded, exchange.reason
     report = exchange.report()
     assert report["exchanged"]
@@ -64,7 +64,7 @@ def test_a_full_box_goes_and_an_empty_one_comes():
 
 def test_a_box_that_is_not_there_is_told_in_words():
     exchange = begun(count=0)
-    joint = exchange.physics.rigid.data.joint("box/1")
+    joint = exchange.physics.rigid.mj_data.joint("box/1")
     while exchange.phase != "take the empty box":
         tick(exchange)
     joint.qpos[2] = 5.0  # somebody takes it away

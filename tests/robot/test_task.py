@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import load
 from vinesim.robot.drives import Robot
 from vinesim.robot.tasks.task import Failed, Script
@@ -29,7 +29,7 @@ class Story(Script):
 
 @pytest.fixture(scope="module")
 def robot() -> Robot:
-    return Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    return Robot(RigidWorld(assemble([])), load("vinebot"), "anna")
 
 
 def tell(story: Story) -> Story:

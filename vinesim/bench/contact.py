@@ -17,7 +17,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.bench import scenes as scenes
 from vinesim.bench.mujoco_reference import Whole
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
@@ -63,10 +63,10 @@ def _block(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> It
         pose = frames.pose([*PLACE, 0.0], frames.yaw(0.5 * np.pi)) if i == 0 else frames.pose([4.0 * i, -6.0, 0.0])
         home = robot.home if i else raised
         physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
-        physics.rigid.drive_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))
+        physics.rigid.command_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))
     _swing(physics, robot, raised, 0)
     physics.step()
-    reached = physics.touching.near
+    reached = physics.contact_solver.near
     away = np.linalg.norm(model.tree_pose[:, :2] - PLACE, axis=1)
     away[reached] = -1.0
     scenes.sleepless(physics, np.sort(np.argsort(away, kind="stable")[:AWAKE]))
@@ -152,7 +152,7 @@ def _beside(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -
         )
 
 
-def _command(rigid: Rigid, robots: list[RobotSpec], tick: int) -> None:
+def _command(rigid: RigidWorld, robots: list[RobotSpec], tick: int) -> None:
     """The bar, 4 cm above its start, and the hands, closed and lifted by 2 cm, go up and down by a centimetre."""
     wave = 0.01 * np.sin(0.06 * tick)
     for robot in robots:

@@ -20,7 +20,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load
-from vinesim.scene.values import Link, Measurement, Shape, View
+from vinesim.scene.values import RigidVisual, Measurement, Shape, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec, Visibility, pinhole
 from vinesim.sensors.camera.renderers import NoRenderer
 from vinesim.sensors.export.images import depth_colours, looking, write_png
@@ -70,7 +70,7 @@ def plane(spec: CameraSpec) -> Depths:
     for number, away in enumerate(RANGES):
         wall = Shape("box", (0.05, 20.0, 20.0), frames.pose(np.array([away + 0.05, 0.0, 1.0])))
         nothing = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=0)
-        view = still_view(nothing, (Link("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None])
+        view = still_view(nothing, (RigidVisual("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None])
         primitives = Primitives(nothing, grass=0.0)
         primitives.update(view)
         camera = Camera(spec, spec.info("optical"), seed=SEED, image=number)
@@ -80,7 +80,7 @@ def plane(spec: CameraSpec) -> Depths:
     return found
 
 
-def plants(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> dict[str, Depths]:
+def plants(spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot) -> dict[str, Depths]:
     """Leaves and bunches, looked at from all ranges around some bunches."""
     rng = np.random.default_rng(SEED)
     camera = Camera(spec, spec.info("optical"), seed=SEED)
@@ -100,7 +100,7 @@ def plants(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -
     return found
 
 
-def _towards_a_bunch(rng: np.random.Generator, model: Model, view: View, away: float) -> np.ndarray:
+def _towards_a_bunch(rng: np.random.Generator, model: Model, view: Snapshot, away: float) -> np.ndarray:
     """Pose [7] of an optical frame that looks at some bunch from a distance, from a robot's height."""
     bunch = int(rng.integers(len(model.bunch_body)))
     pose = view.body_q[model.bunch_body[bunch]].astype(float)
@@ -111,7 +111,7 @@ def _towards_a_bunch(rng: np.random.Generator, model: Model, view: View, away: f
     return looking(middle + np.array([level * np.cos(around), level * np.sin(around), rise]), middle)
 
 
-def berries(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> np.ndarray:
+def berries(spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot) -> np.ndarray:
     """Share of the bunch that is hidden, share of its berries that are seen [bunch in a picture, 2]; whole bunches."""
     rng = np.random.default_rng(SEED)
     info = spec.info("optical")
@@ -170,7 +170,7 @@ class Pixels:
     primitive: np.ndarray
 
 
-def backends(spec: CameraSpec, model: Model, view: View) -> dict[str, Pixels]:
+def backends(spec: CameraSpec, model: Model, view: Snapshot) -> dict[str, Pixels]:
     """One view by every renderer that runs here on the CPU, and by the ray caster, which is the measure of all."""
     info, pose = spec.info("optical"), looking(*GAZE)
     lens, found = pinhole(info, pose), {}

@@ -76,7 +76,7 @@ class Client:
         ``executor`` prepares others who join, so that no tick has to; without one they are there at once.
         """
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, picking=self.picking)
+        self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
@@ -166,12 +166,12 @@ class Client:
             self.arrivals.forget(name)
             if (other := self.others.pop(name, None)) is not None:
                 other.leave()
-                self.physics.touching.copies.discard(name)
+                self.physics.contact_solver.copies.discard(name)
                 log.info("%s left", name)
         for name, update in (*inbox.robots.items(), *inbox.people.items()):
             if name in self.arrivals and (other := self.arrivals.embody(name, update)) is not None:
                 self.others[name] = other
-                self.physics.touching.copies.add(name)
+                self.physics.contact_solver.copies.add(name)
             if name in self.others:
                 self.others[name].follow(update)
         self._pull(inbox)
@@ -188,7 +188,7 @@ class Client:
     def sense(self) -> None:
         """Note the watched bunch, and tell everybody who listens."""
         if self.trace is not None:
-            self.physics.refresh()
+            self.physics.update_kinematics()
             body = self.trace.body
             force = np.zeros(3)
             for contact in self.physics.contacts:
@@ -213,7 +213,7 @@ class Client:
             settled = exchange.send(
                 now, pose, touched=touched, moving=moving, read=things.read,
                 grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, changed=things.changed,
-                lies=self.physics.riding.lies, pushed=actor.pushed(self.others) if isinstance(actor, Person) else None,
+                lies=self.physics.support_tracker.lies, pushed=actor.pushed(self.others) if isinstance(actor, Person) else None,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too
@@ -230,12 +230,12 @@ class Client:
             if riders:
                 self.exchanges[name].send(
                     now, robot.update(now), read=self.things.read, grabbed=riders, parted=riders,
-                    lies=self.physics.riding.lies,
+                    lies=self.physics.support_tracker.lies,
                 )  # fmt: skip
 
     def side_of(self, point: np.ndarray) -> str:
         """The arm that is on the same side as a point [3] in the world."""
-        base, _ = self.physics.rigid.base(self.name)
+        base, _ = self.physics.rigid.base_state(self.name)
         local = frames.rotate(frames.conjugate(base[3:]), point - base[:3])
         return "left" if local[1] >= 0.0 else "right"
 
@@ -249,7 +249,7 @@ class Client:
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
-        here = {name: self.physics.rigid.stands(name)[:2] for name in inboxes}
+        here = {name: self.physics.rigid.actor_position(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
         loose = {update.thing: update for update in inbox.things}
         nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
@@ -277,13 +277,13 @@ class Client:
     def _bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
         """Let a robot feel what other clients' people do to it."""
         try:
-            self.physics.rigid.bear(name, pushes)
+            self.physics.rigid.set_remote_wrenches(name, pushes)
         except RobotError as error:
             log.debug("a push on nothing: %s", error)
 
     def _pull(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
-        things, told = self.things, self.physics.touching.told
+        things, told = self.things, self.physics.contact_solver.told
         for update in inbox.trees:
             if update.tree not in self._copies:
                 self.physics.plants.wake(update.tree)
@@ -318,8 +318,8 @@ class Faraway:
         """Judge one tick by where the others' copies stand."""
         sent = sum(exchange.counters.environment.bytes_out for exchange in client.exchanges.values())
         rigid = client.physics.rigid
-        here = [rigid.stands(name)[:2] for name in client.exchanges]
-        there = [rigid.stands(name)[:2] for name in client.others]
+        here = [rigid.actor_position(name)[:2] for name in client.exchanges]
+        there = [rigid.actor_position(name)[:2] for name in client.others]
         distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
         if distance > client.exchange.near + self.MARGIN:
             self.bytes += sent - self._seen

@@ -10,7 +10,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.rigid.human_body import JUMP, LINGER, SIDES
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.scene.values import POINTS, HumanPose, HumanSpec, HumanUpdate
 
@@ -37,7 +37,7 @@ class Person:
 
     def update(self, now: float) -> HumanUpdate:
         """What other clients are told: where everything is, hands that are held back included, and how fast."""
-        self._given, giving = self.physics.rigid.pushed_by(self.name)
+        self._given, giving = self.physics.rigid.hand_wrenches(self.name)
         points, before = self.pose.points, self._told
         for i, side in enumerate(SIDES):
             hand = self.physics.hand(self.name, side)
@@ -65,7 +65,7 @@ class Person:
 class RemotePerson:
     """The copy of a person whom another client moves: bit for bit where that client says; the hands push what lies."""
 
-    def __init__(self, rigid: Rigid, name: str) -> None:
+    def __init__(self, rigid: RigidWorld, name: str) -> None:
         """``name`` is here already; see :func:`spec_of`."""
         self.rigid, self.name = rigid, name
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.plants.detachment import Blade
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import Description, Mount
 from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
@@ -51,7 +51,7 @@ class Embodied:
 
     def __init__(
         self,
-        rigid: Rigid,
+        rigid: RigidWorld,
         description: Description,
         name: str = "",
         index: int = 0,
@@ -80,8 +80,8 @@ class Embodied:
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """What the robot knows of itself at ``time`` [s]; of ``contacts`` it keeps its own."""
-        position, velocity, effort, contact = self.rigid.read(self.name)
-        base_q, base_qd = self.rigid.base(self.name)
+        position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
         return RobotSample(
             actor=self.name,
             joints=JointSample(time, self.description.joints, position, velocity, effort, contact),
@@ -133,7 +133,7 @@ class Robot(Embodied):
 
     def __init__(
         self,
-        rigid: Rigid,
+        rigid: RigidWorld,
         description: Description,
         name: str = "",
         index: int = 0,
@@ -161,7 +161,7 @@ class Robot(Embodied):
         self._cutters: dict[str, list[Blade]] = {}
         self._physics: Physics | None = None
         for mount in (*description.wrenches, *description.imus):
-            rigid.instrument(self.name, mount.frame)
+            rigid.add_link_sensor(self.name, mount.frame)
         self._beyond = {mount.frame: _links_beyond(description, mount.frame) for mount in description.wrenches}
         self.stop()
 
@@ -169,7 +169,7 @@ class Robot(Embodied):
         """Give the robot the cutters of its description, to cut what grows in ``physics``."""
         self._physics = physics
         for cutter in self.description.cutters:
-            blade = physics.blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
+            blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
             self._cutters.setdefault(cutter.group, []).append(blade)
 
     def leave(self) -> None:
@@ -181,7 +181,7 @@ class Robot(Embodied):
 
     def stop(self) -> None:
         """Forget all commands and hold every joint and the base where they are."""
-        self.setpoint = self.rigid.read(self.name)[0].copy()
+        self.setpoint = self.rigid.joint_measurements(self.name)[0].copy()
         """[joint] what the servos are asked for [rad or m]"""
         self.interface = np.full(len(self.setpoint), Interface.POSITION)
         """[joint] :class:`Interface` by which each was commanded last"""
@@ -311,7 +311,7 @@ class Robot(Embodied):
     def _switch(self, joints: np.ndarray, interface: Interface) -> None:
         before = self.interface[joints] == Interface.ELASTIC
         if before.any() or interface == Interface.ELASTIC:  # from motors to links, or back
-            position, _, effort, _ = self.rigid.read(self.name)
+            position, _, effort, _ = self.rigid.joint_measurements(self.name)
             motor = position + effort / self.spring
             self.setpoint[joints] = np.where(
                 before == (interface == Interface.ELASTIC),
@@ -338,7 +338,7 @@ class Robot(Embodied):
         """Hand set-points for the tick that starts at ``time`` [s] to the servos; call it before physics steps."""
         if self._retuned:
             self._arrange()
-        position, velocity = self.rigid.state(self.name)
+        position, velocity = self.rigid.joint_state(self.name)
         rate = self._advance(position, velocity)
         if self._retuned or self._changing:
             braked, brake = self._brakes(velocity)
@@ -347,7 +347,7 @@ class Robot(Embodied):
         self._velocity = velocity
         self.rigid.command(self.name, self.setpoint, rate)
         self._drive(time)
-        self._odometry(self.rigid.base(self.name)[0])
+        self._odometry(self.rigid.base_state(self.name)[0])
 
     def _arrange(self) -> None:
         """Prepare what changes only with the interfaces, gains and limits."""
@@ -372,7 +372,7 @@ class Robot(Embodied):
         wanted = (self._goal - start) / dt
         wanted[self._by_velocity] = self._goal[self._by_velocity]
         # Nor may it run ahead faster than the drive can follow: at its limit the servo would shoot past the speed.
-        gain = self._gain / np.maximum(self.rigid.inertia(self.name), 1e-9)
+        gain = self._gain / np.maximum(self.rigid.joint_inertia(self.name), 1e-9)
         slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.speed)
         fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.speed)
         rate = np.clip(wanted, slowest, fastest)
@@ -402,8 +402,8 @@ class Robot(Embodied):
         """Give the servos the gains and efforts that the interfaces ask for."""
         by_effort, by_motor = self._by_effort, self._by_motor
         damping = np.where(by_motor, self._spring_damping, self._damping)
-        effort = np.where(by_motor, -self.rigid.weight(self.name), 0.0)
-        self.rigid.tune(
+        effort = np.where(by_motor, -self.rigid.gravity_effort(self.name), 0.0)
+        self.rigid.set_gains(
             self.name,
             np.where(by_effort, 0.0, self._spring_in_use),
             np.where(braked, brake, np.where(by_effort, 0.0, damping)),
@@ -419,7 +419,7 @@ class Robot(Embodied):
         goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
         change = self.rigid.dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
         self._base_velocity += np.clip(goal - self._base_velocity, -change, change)
-        self.rigid.drive_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
+        self.rigid.command_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """What the robot knows of itself at ``time`` [s], sensors and elastic elements included."""
@@ -438,7 +438,7 @@ class Robot(Embodied):
         )
 
     def _wrench(self, mount: Mount, time: float, contacts: Sequence[Contact]) -> Wrench:
-        wrench = self.rigid.wrench(self.name, mount.frame)
+        wrench = self.rigid.link_wrench(self.name, mount.frame)
         mine = [contact for contact in contacts if contact.link in self._beyond[mount.frame]]
         if mine:  # with plants, which the rigid world does not know
             pose = self.frame_pose(mount.frame)
@@ -451,14 +451,14 @@ class Robot(Embodied):
 
     def _imu(self, mount: Mount, time: float) -> Imu:
         turn = self.frame_pose(mount.frame)[3:]
-        spin = self.rigid.angular_velocity(self.name, mount.frame)
-        acceleration = self.rigid.acceleration(self.name, mount.frame)[3:]
+        spin = self.rigid.link_angular_velocity(self.name, mount.frame)
+        acceleration = self.rigid.link_acceleration(self.name, mount.frame)[3:]
         return Imu(time, mount.name, mount.frame, turn, spin, acceleration)
 
     def update(self, time: float) -> RobotUpdate:
         """What other clients are told: actual joints, never commands."""
-        position, velocity, _, _ = self.rigid.read(self.name)
-        base_q, base_qd = self.rigid.base(self.name)
+        position, velocity, _, _ = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)
 
 
@@ -485,13 +485,13 @@ class RemoteRobot(Embodied):
                 f"{self.name}: update has {update.position.size} joints, its description {count}; "
                 "load the same robot on both clients"
             )
-        here, _ = self.rigid.base(self.name)
+        here, _ = self.rigid.base_state(self.name)
         if np.linalg.norm(update.base_q[:3] - here[:3]) > self.SNAP:
             self._set_down(update, here)
-        self.rigid.follow(self.name, update.base_q, update.base_qd, update.position, update.velocity)
+        self.rigid.follow_remote(self.name, update.base_q, update.base_qd, update.position, update.velocity)
 
     def _set_down(self, update: RobotUpdate, here: np.ndarray) -> None:
         if abs(update.base_q[2] - here[2]) > 1e-3:  # a base rolls on its plane; another height is another world
             self.rigid.remove_robot(self.name)
             self.rigid.add_robot(self.description.spec(self.name, self._index, update.base_q))
-        self.rigid.place(self.name, update.base_q, update.position)
+        self.rigid.place_robot(self.name, update.base_q, update.position)

@@ -23,7 +23,7 @@ from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.sensing import lidar_echoes, stereo_depth
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, LidarScan, View
+from vinesim.scene.values import CameraFrame, LidarScan, Snapshot
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import Rolling
@@ -95,7 +95,7 @@ class Eyes:
         self._turning = {m.name: Rolling(m.sensor, m.rate) for m in mounts if isinstance(m.sensor, Lidar)}
         self._stands: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in self._turning}
         self._news = threading.Condition()
-        self._newest: tuple[View, Mapping[str, np.ndarray]] | None = None
+        self._newest: tuple[Snapshot, Mapping[str, np.ndarray]] | None = None
         self._moved: list[np.ndarray] = []
         self._stopping = False
         self._thread: threading.Thread | None = None
@@ -131,7 +131,7 @@ class Eyes:
             if kind is None:  # a failure of the body comes first
                 raise
 
-    def see(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
+    def see(self, view: Snapshot, poses: Mapping[str, np.ndarray]) -> None:
         """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
         self._raise()
         with self._news:
@@ -140,8 +140,8 @@ class Eyes:
                 self._stands[name].append((view.time, poses[name]))
                 if len(self._stands[name]) > _STANDS:
                     del self._stands[name][: _STANDS // 2]
-            if len(view.moved):
-                self._moved.append(view.moved)
+            if len(view.moved_trees):
+                self._moved.append(view.moved_trees)
                 if len(self._moved) > 256:
                     self._moved = [np.unique(np.concatenate(self._moved))]
             self._news.notify()

@@ -14,14 +14,14 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.rigid.human_body import standing
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description import description
 from vinesim.scene import appearance
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.values import HumanSpec, View
+from vinesim.scene.values import HumanSpec, Snapshot
 from vinesim.sensors.scene.primitives import still_view
 
 BULK = 330.0
@@ -86,14 +86,14 @@ class Stage:
     crates: tuple[CrateAt, ...] = ()
     """After those of the scene."""
 
-    def set(self, model: Model) -> View:
+    def set(self, model: Model) -> Snapshot:
         """The vineyard with all of it at rest; :class:`NoRoom` if two would stand in each other."""
         furnished = self.furnished(model)
         if any(crate.fill > 0.0 for crate in self.crates):
             return self.enter(Physics(furnished))
-        rigid = Rigid(furnished)  # plants that nobody picks from need not be ready to move
+        rigid = RigidWorld(furnished)  # plants that nobody picks from need not be ready to move
         self._admit(rigid)
-        return still_view(model, rigid.links(), rigid.link_q())
+        return still_view(model, rigid.visuals(), rigid.visual_q())
 
     def furnished(self, model: Model) -> Model:
         """The same vineyard with the crates after its own boxes."""
@@ -106,14 +106,14 @@ class Stage:
             box_mass=np.append(model.box_mass, [MASS] * count).astype(model.box_mass.dtype),
         )
 
-    def enter(self, physics: Physics) -> View:
+    def enter(self, physics: Physics) -> Snapshot:
         """In a world that is furnished: fill the crates, then let everybody in."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             heap(physics, number, crate)
         self._admit(physics.rigid)
-        return physics.view()
+        return physics.snapshot()
 
-    def _admit(self, rigid: Rigid) -> None:
+    def _admit(self, rigid: RigidWorld) -> None:
         """Let robots and people in."""
         for index, one in enumerate(self.robots):
             pose = _at(one.x, one.y, one.yaw)
@@ -197,17 +197,17 @@ def _top(physics: Physics, bunch: int) -> float:
     return float(_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 
-def _fall(rigid: Rigid, ticks: int) -> None:
+def _fall(rigid: RigidWorld, ticks: int) -> None:
     """Let loose things fall, without the plants."""
     for _ in range(ticks):
-        rigid.prep()
-        rigid.finish()
+        rigid.predict()
+        rigid.integrate()
 
 
-def _apart(rigid: Rigid) -> None:
+def _apart(rigid: RigidWorld) -> None:
     """:class:`NoRoom` if whoever has come stands in somebody or something."""
-    rigid.prep()
-    for names in rigid.overlaps():
+    rigid.predict()
+    for names in rigid.penetrations():
         one, other = sorted(names[:2], key=rigid.actors.__contains__, reverse=True)
         if names[2] > CLEAR and one in rigid.actors:
             kind, _, number = other.partition("/")

@@ -16,7 +16,7 @@ from vinesim.physics.step import Physics
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import View
+from vinesim.scene.values import Snapshot
 
 ROBOTS = ("vinebot", "logistic")
 ROOM = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
@@ -45,7 +45,7 @@ class Life:
         """All that decides what happens, as JSON."""
         return {"share": self.share, "robots": list(ROBOTS)}
 
-    def view(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
+    def view(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
         """See :meth:`vinesim.sensors.export.dataset.Life.view`."""
         if rng.uniform() >= self.share:
             return None
@@ -61,7 +61,7 @@ class Life:
             happens: dict[str, Any] = {"actors": stage.told(model)}
             if rng.uniform() < WINDY:
                 happens["wind"] = _blow(physics, rng)
-            return physics.view(), middle, happens
+            return physics.snapshot(), middle, happens
         return None
 
 

@@ -42,8 +42,8 @@ class Things:
 
     def receive(self, inbox: Inbox) -> None:
         """Do what others say is so, every tick before the step."""
-        riding = self.physics.riding
-        self.physics.stirred = self.physics.stirred[:0]
+        riding = self.physics.support_tracker
+        self.physics.remotely_posed = self.physics.remotely_posed[:0]
         self._believe(inbox.facts)
         told = {update.thing: update for update in inbox.things}
         for update in inbox.things:
@@ -67,25 +67,25 @@ class Things:
             elif self._lies_as(fact, holds):
                 lie.append(fact)
         if trees:
-            self.physics.told_rest([update.tree for update in trees], [update.joint_q for update in trees])
+            self.physics.apply_remote_rest([update.tree for update in trees], [update.joint_q for update in trees])
         if lie:
             bunches = [unthing(fact.thing)[1] for fact in lie]
             self._changed.update(self._tree_of(bunch) for bunch in bunches)
-            self.physics.lying.lay(bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie]))
+            self.physics.dormant_bunches.lay(bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie]))
 
     def _lies_as(self, fact: Fact, holds: bool) -> bool:
         """Let a box or a bunch be where a fact says; True if it is a bunch that has no body here and needs none yet."""
         number = fact.thing
         kind, bunch = unthing(number)
-        bodiless = kind == Kind.BUNCH and number not in self.physics.riding
-        if not (holds or (bodiless and bunch not in self.physics.lying)):
+        bodiless = kind == Kind.BUNCH and number not in self.physics.support_tracker
+        if not (holds or (bodiless and bunch not in self.physics.dormant_bunches)):
             return False
         self._told.pop(number, None)
         if fact.moving:
             self._rise(number)
             pose = np.array(fact.pose)
-            self._loosen(number, *(self.physics.riding.where(fact.parent, pose) or (pose, np.zeros(6))))
-            self.physics.riding.unsettle([number])
+            self._loosen(number, *(self.physics.support_tracker.where(fact.parent, pose) or (pose, np.zeros(6))))
+            self.physics.support_tracker.unsettle([number])
             return False
         self._lie(number, fact)
         if not bodiless:
@@ -106,11 +106,11 @@ class Things:
 
     def _embody(self) -> None:
         """Give bunches that lie near an actor their bodies, a few now and then."""
-        lying = self.physics.lying
+        lying = self.physics.dormant_bunches
         if len(lying) and self.physics.tick % EMBODY_TICKS == 0:
             rigid = self.physics.rigid
-            actors = [rigid.base(name)[0][:3] for name in rigid.robots]
-            actors += [rigid.person(name).parts[0, :3] for name in rigid.people]
+            actors = [rigid.base_state(name)[0][:3] for name in rigid.robots]
+            actors += [rigid.human(name).parts[0, :3] for name in rigid.humans]
             bunches = lying.nearest(np.array(actors), EMBODIED)
             lying.embody(bunches)
             for bunch in bunches:
@@ -118,24 +118,24 @@ class Things:
 
     def cut(self, body: int) -> None:
         """Cut a body off because others have."""
-        self.physics.told_cut(body)
+        self.physics.apply_remote_cut(body)
         self._note_cut(body)
 
     def _loosen(self, number: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Of a bunch that hangs here still, or has no body: take it off, give it one."""
         kind, bunch = unthing(number)
-        if kind == Kind.BUNCH and bunch in self.physics.lying:
-            self.physics.lying.embody([bunch])
+        if kind == Kind.BUNCH and bunch in self.physics.dormant_bunches:
+            self.physics.dormant_bunches.embody([bunch])
         elif kind == Kind.BUNCH and self.physics.state.bunch_attached[bunch]:
-            self.physics.told_pick(bunch, pose, velocity)
+            self.physics.apply_remote_pick(bunch, pose, velocity)
             self._changed.add(self._tree_of(bunch))
 
     def _hold(self) -> None:
         """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
-        moving = set(self.physics.riding.moving)
+        moving = set(self.physics.support_tracker.moving)
         pushed = {number for number in moving & self._lies.keys() if self._bearer(number) not in self._ours}
         for name in self._ours if pushed else ():
-            pushed -= self.physics.riding.reached(name)
+            pushed -= self.physics.support_tracker.reached(name)
         for number in sorted(pushed):
             self._put([number])
         for parent, riders in self._riders.items():
@@ -166,7 +166,7 @@ class Things:
 
     def _put(self, numbers: list[int]) -> None:
         """Put things of one parent where they lie, as far as they have bodies."""
-        riding = self.physics.riding
+        riding = self.physics.support_tracker
         numbers = [number for number in numbers if number in riding]
         if not numbers:
             return
@@ -194,8 +194,8 @@ class Things:
 
     def look(self) -> None:
         """After the step: note what parted and what moves."""
-        self.physics.riding.update()
-        self._partings = self.physics.partings
+        self.physics.support_tracker.update()
+        self._partings = self.physics.detachments
         for parting in self._partings:
             self._changed.add(parting.tree)
             if parting.bunch < 0:
@@ -213,7 +213,7 @@ class Things:
 
     def touched(self, name: str, mine: Container[int]) -> list[int]:
         """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
-        riding = self.physics.riding
+        riding = self.physics.support_tracker
         found = {number for number in riding.moving if self._bearer(number) == name} | riding.reached(name)
         for number, actor in (*riding.touched, *self.physics.touched):
             other = thing_named(actor)
@@ -236,12 +236,12 @@ class Things:
     @property
     def moving(self) -> list[int]:
         """All that moves: trees that are not asleep, and what does not rest in its parent's frame."""
-        return [*self.physics.sleep.moving.tolist(), *self.physics.riding.moving]
+        return [*self.physics.sleep_monitor.moving.tolist(), *self.physics.support_tracker.moving]
 
     def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """State of a thing, as :meth:`Exchange.send` wants it."""
         if not is_tree(number):
-            return self.physics.riding.read(number)
+            return self.physics.support_tracker.read(number)
         here, state = self.physics.model.bodies_of(number), self.physics.state
         return state.joint_q[here], state.joint_qd[here]
 
@@ -267,7 +267,7 @@ class Things:
         """We have said that a thing of ours lies still: from now on it does, as for everybody else."""
         if fact is not None and not fact.moving and not is_tree(fact.thing):
             self._lie(fact.thing, fact)
-            self.physics.riding.settle(fact.thing, fact.parent, np.array(fact.pose))
+            self.physics.support_tracker.settle(fact.thing, fact.parent, np.array(fact.pose))
 
     # ------------------------------------------------------------------ inside
 

@@ -15,7 +15,7 @@ from vinesim import frames
 from vinesim.physics.contact.contact_solver import Touching
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.rigid.free_bunch import Loose
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Contact, Parting
 
@@ -45,7 +45,7 @@ class Blade:
 class Partings:
     """Watches the peduncles of awake trees and the blades that close, and takes off what parts."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching) -> None:
+    def __init__(self, plants: Plants, rigid: RigidWorld, touching: Touching) -> None:
         self.plants, self.rigid, self.touching = plants, rigid, touching
         self.blades: list[Blade] = []
         self.held: tuple[Contact, ...] = ()

@@ -13,10 +13,10 @@ from vinesim.physics.contact.contact_solver import Touching
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.plants.detachment import STUB
 from vinesim.physics.rigid.free_bunch import Loose
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.support_tracking import Riding
 from vinesim.scene.ids import Organ
-from vinesim.scene.values import Link
+from vinesim.scene.values import RigidVisual
 
 NEAR = 2.5
 """[m] A bunch gets its body when an actor is so near on the ground plan: seconds before an arm reaches it."""
@@ -25,12 +25,12 @@ NEAR = 2.5
 class Lying:
     """Picked bunches without bodies, each at a pose in the frame of its parent."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching, riding: Riding) -> None:
+    def __init__(self, plants: Plants, rigid: RigidWorld, touching: Touching, riding: Riding) -> None:
         self.plants, self.rigid, self.touching, self.riding = plants, rigid, touching, riding
         self._loose: dict[int, Loose] = {}
         self._parent: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
-        self._links: tuple[Link, ...] | None = ()
+        self._links: tuple[RigidVisual, ...] | None = ()
         self._groups: list[tuple[str, np.ndarray, np.ndarray]] = []
         shapes = touching.shapes
         fruit = np.flatnonzero((plants.model.body_organ[shapes.body] == int(Organ.BUNCH)) & (shapes.when != 2))
@@ -88,11 +88,11 @@ class Lying:
         links = self.links()
         return [links[i].index for i in np.argsort(away, kind="stable")[:most].tolist() if away[i] < NEAR]
 
-    def links(self) -> tuple[Link, ...]:
+    def links(self) -> tuple[RigidVisual, ...]:
         """As :meth:`Rigid.links`."""
         if self._links is None:
             order = sorted(self._loose)
-            self._links = tuple(Link(f"bunch/{i}", Organ.BUNCH, i, self._loose[i].shapes) for i in order)
+            self._links = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._loose[i].shapes) for i in order)
             parents = np.array([self._parent[i] for i in order])
             poses = np.array([self._relative[i] for i in order]).reshape(-1, 7)
             here = [(str(parent), np.flatnonzero(parents == parent)) for parent in np.unique(parents)]

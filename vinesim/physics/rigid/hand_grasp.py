@@ -15,7 +15,7 @@ from vinesim import frames
 from vinesim.physics.contact.contact_solver import Touching
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.rigid.human_body import FINGERS, THICK, Hand, Person
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import Contact, Haptic, Parting
 
 GRASP = 0.03
@@ -47,7 +47,7 @@ class _Grip:
 class Holding:
     """What the hands of all people hold, and what their controllers feel of it."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching) -> None:
+    def __init__(self, plants: Plants, rigid: RigidWorld, touching: Touching) -> None:
         self.plants, self.rigid, self.touching = plants, rigid, touching
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the last tick, by person and hand."""
@@ -95,8 +95,8 @@ class Holding:
             if (grip := self._grips.get(key)) is not None:
                 if grip.body in gone:
                     self._drop(key)
-                    self.rigid.let_go(*key)
-                    self.rigid.hold(*key, f"bunch/{gone[grip.body]}", "bunch")
+                    self.rigid.release(*key)
+                    self.rigid.grasp(*key, f"bunch/{gone[grip.body]}", "bunch")
                 elif not self._torn(grip):
                     contacts.append(self._ride(person, hand, grip))
                 else:
@@ -107,7 +107,7 @@ class Holding:
     def let_go(self, name: str, side: str) -> None:
         """Open a hand, whatever it holds."""
         self._drop((name, side))
-        self.rigid.let_go(name, side)
+        self.rigid.release(name, side)
 
     def forget(self, name: str) -> None:
         """Take all ties off that a person who leaves holds."""
@@ -117,14 +117,14 @@ class Holding:
     # ------------------------------------------------------------------ inside
 
     def _hands(self) -> list[tuple[Person, Hand]]:
-        people = (self.rigid.person(name) for name in self.rigid.people)
+        people = (self.rigid.human(name) for name in self.rigid.humans)
         return [(person, hand) for person in people if not person.copy for hand in person.hands]
 
     def _close(self, person: Person, hand: Hand) -> None:
         """Take what is nearest to the hand, if anything is near enough."""
         key = person.spec.name, hand.side
-        palm = self.rigid.hand(*key).pose
-        rigid = self.rigid.near_hand(*key, GRASP)
+        palm = self.rigid.hand_sample(*key).pose
+        rigid = self.rigid.nearest_to_hand(*key, GRASP)
         plant = self.touching.nearest(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
         if plant is not None and (rigid is None or plant[0] - THICK < rigid[0]):
             body = plant[1]
@@ -134,9 +134,9 @@ class Holding:
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
             tie = self.plants.hold(body, hand.grip[:3], person.spec.stiffness, person.damping)
             self._grips[key] = _Grip(body, tie, hand.grip[:3].copy(), next(iter(bunch.tolist()), -1))
-            self.rigid.ride(*key, body)
+            self.rigid.grasp_plant(*key, body)
         elif rigid is not None:
-            self.rigid.hold(*key, *rigid[1:])
+            self.rigid.grasp(*key, *rigid[1:])
 
     def _pull(self, person: Person, hand: Hand, grip: _Grip) -> None:
         """Set the far end of the spring: no further from the plant than the hand is strong."""
@@ -153,7 +153,7 @@ class Holding:
         """Put a hand where the plant is that it holds, and say with what force it holds it."""
         plants = self.plants
         pose, motion = plants.state.body_q[grip.body].astype(float), plants.state.body_qd[grip.body].astype(float)
-        self.rigid.put_hand(person.spec.name, hand.side, frames.compose(pose, hand.grip))
+        self.rigid.place_hand(person.spec.name, hand.side, frames.compose(pose, hand.grip))
         at = self._point(grip)
         speed = motion[:3] + frames.cross(motion[3:], at - pose[:3])
         hand.force = plants.tie_stiffness[grip.tie] * (plants.tie_anchor[grip.tie] - at) - person.damping * speed

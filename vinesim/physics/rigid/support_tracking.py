@@ -14,7 +14,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.rigid.human_body import rouse
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Kind, thing, thing_named
 
 STILL = 0.005, float(np.radians(1.0))
@@ -40,7 +40,7 @@ _NONE = -1
 class Riding:
     """Boxes and loose bunches as the network sees them: poses, velocities, parents and rest."""
 
-    def __init__(self, rigid: Rigid) -> None:
+    def __init__(self, rigid: RigidWorld) -> None:
         self.rigid = rigid
         self.things = np.zeros(0, np.int64)
         """[n] :func:`vinesim.scene.ids.thing`: boxes, then loose bunches."""
@@ -59,7 +59,7 @@ class Riding:
     def update(self) -> None:
         """After a tick: who is still, who is not, and on what."""
         self._keep_up()
-        d = self.rigid.data
+        d = self.rigid.mj_data
         self._still += 1
         speed = d.qvel[self._v[:, None] + np.arange(3)]
         self._calm = np.where((speed * speed).sum(1) > JERK * JERK, 0, self._calm + 1)
@@ -71,7 +71,7 @@ class Riding:
         if len(awake) == 0:
             return
         if (self._kind[self._parent[awake]] == _LINK).any():
-            self.rigid.refresh()
+            self.rigid.update_kinematics()
         pose = self._poses(awake)
         relative = self._relative(pose, self._parent[awake])
         out = _apart(relative, self._anchor[awake], bands[awake])
@@ -85,7 +85,7 @@ class Riding:
         changed = loose[self._parent[loose] != parent]
         anew = np.union1d(awake[out], changed)
         if len(anew):
-            self.rigid.refresh()
+            self.rigid.update_kinematics()
             self._anchor[anew] = self._relative(self._poses(anew), self._parent[anew])
             self._still[anew] = 0
 
@@ -113,7 +113,7 @@ class Riding:
         row, other = self._pairs.T
         touched = np.zeros(len(self.things), bool)
         touched[row[np.isin(other, bodies)]] = True
-        for hand in self.rigid.person(actor).hands if actor in self.rigid.people else ():
+        for hand in self.rigid.human(actor).hands if actor in self.rigid.humans else ():
             held = None if hand.holds is None else thing_named(hand.holds[0])
             if held in self._at:
                 touched[self._at[held]] = True
@@ -130,8 +130,8 @@ class Riding:
             owner = self.rigid.owners.get(body)
             if owner is not None:
                 found.add((int(self.things[row]), owner[0]))
-        for name in self.rigid.people:
-            for hand in self.rigid.person(name).hands:
+        for name in self.rigid.humans:
+            for hand in self.rigid.human(name).hands:
                 held = None if hand.holds is None else thing_named(hand.holds[0])
                 if held in self._at and self._still[self._at[held]] < PATIENCE:
                     found.add((held, name))
@@ -145,7 +145,7 @@ class Riding:
 
     def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (of its origin, angular; world axes)."""
-        row, d = self._row_of(thing), self.rigid.data
+        row, d = self._row_of(thing), self.rigid.mj_data
         pose = self._poses(np.array([row]))[0]
         v = d.qvel[self._v[row] : self._v[row] + 6]
         return pose, np.concatenate([v[:3], frames.rotate(pose[3:], v[3:])])
@@ -153,7 +153,7 @@ class Riding:
     def lies(self, thing: int) -> tuple[str, np.ndarray]:
         """Its parent, and its pose [7] in that frame."""
         row = self._row_of(thing)
-        self.rigid.refresh()
+        self.rigid.update_kinematics()
         at = np.array([row])
         return self._name(int(self._parent[row])), self._relative(self._poses(at), self._parent[at])[0]
 
@@ -168,8 +168,8 @@ class Riding:
         body = self._body_named.get(parent)
         if body is None:
             return None
-        m, d = self.rigid.world, self.rigid.data
-        self.rigid.refresh()
+        m, d = self.rigid.mj_model, self.rigid.mj_data
+        self.rigid.update_kinematics()
         twist = np.zeros(6)
         mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
         pose = np.concatenate([d.xpos[body], frames.from_wxyz(d.xquat[body])])
@@ -191,14 +191,14 @@ class Riding:
 
     def place_all(self, things: list[int], pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put things [k] somewhere: poses [k, 7], velocities [k, 6] in world axes."""
-        rows, d = np.array([self._row_of(thing) for thing in things]), self.rigid.data
+        rows, d = np.array([self._row_of(thing) for thing in things]), self.rigid.mj_data
         turn = frames.normalize(pose[:, 3:])
         d.qpos[self._q[rows][:, None] + np.arange(7)] = np.concatenate([pose[:, :3], frames.to_wxyz(turn)], -1)
         spin = frames.rotate(frames.conjugate(turn), velocity[:, 3:])
         d.qvel[self._v[rows][:, None] + np.arange(6)] = np.concatenate([velocity[:, :3], spin], -1)
         for body in self._body[rows].tolist():
-            rouse(self.rigid.world, d, body)
-        self.rigid.stale()
+            rouse(self.rigid.mj_model, d, body)
+        self.rigid.invalidate_kinematics()
 
     def pull_all(self, things: list[int], pose: np.ndarray, velocity: np.ndarray, blend: np.ndarray) -> None:
         """Move things [k] by ``blend`` [k] of the way towards poses [k, 7]; as fast as ``velocity`` [k, 6] at once."""
@@ -231,7 +231,7 @@ class Riding:
         return self._at[thing]
 
     def _poses(self, rows: np.ndarray) -> np.ndarray:
-        pose = self.rigid.data.qpos[self._q[rows][:, None] + np.arange(7)]
+        pose = self.rigid.mj_data.qpos[self._q[rows][:, None] + np.arange(7)]
         pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
         return pose
 
@@ -240,7 +240,7 @@ class Riding:
         moves = np.flatnonzero(parent)
         if len(moves) == 0:
             return pose
-        d, relative = self.rigid.data, pose.copy()
+        d, relative = self.rigid.mj_data, pose.copy()
         frame = np.concatenate([d.xpos[parent[moves]], frames.from_wxyz(d.xquat[parent[moves]])], -1)
         row = self._row[parent[moves]]
         free = np.flatnonzero(row >= 0)  # boxes know where they are without being asked anew
@@ -257,7 +257,7 @@ class Riding:
 
     def _touching(self) -> np.ndarray:
         """(row, MuJoCo body) of all contacts of the last tick [k, 2], each seen from both sides."""
-        m, d = self.rigid.world, self.rigid.data
+        m, d = self.rigid.mj_model, self.rigid.mj_data
         if d.ncon == 0:
             return np.zeros((0, 2), np.int64)
         pairs = m.geom_bodyid[d.contact.geom[d.contact.efc_address >= 0]].astype(np.int64)
@@ -290,15 +290,15 @@ class Riding:
             found[leaning[helped]] = found[on[helped]]
         touches = np.zeros(count, bool)
         touches[row[np.where(self._kind[other] == _STANDS, 0, other) == self._parent[row]]] = True
-        asleep = self.rigid.data.tree_asleep[self._tree] >= 0  # of these MuJoCo tells no contacts
+        asleep = self.rigid.mj_data.tree_asleep[self._tree] >= 0  # of these MuJoCo tells no contacts
         keep = (inside & (touches | (found == _NONE))) | asleep
         return np.where(keep, self._parent, np.where(found == _NONE, 0, found))[rows]
 
     def _renew(self) -> None:
         """Find everything in the world as it is now; parents keep their names, not their numbers."""
         rigid = self.rigid
-        m = rigid.world
-        rigid.refresh()
+        m = rigid.mj_model
+        rigid.update_kinematics()
         names = self._parent_names() if self._at else []
         known = {
             number: (names[row], self._anchor[row], self._still[row], self._calm[row])
@@ -306,7 +306,7 @@ class Riding:
         }
         self._generation = rigid.generation
         boxes = [thing(Kind.BOX, i) for i in range(len(rigid.model.box_mass))]
-        bunches = [thing(Kind.BUNCH, i) for i in rigid.loose]
+        bunches = [thing(Kind.BUNCH, i) for i in rigid.free_bunches]
         self.things = np.array(sorted(boxes + bunches), np.int64)
         self._at = {number: row for row, number in enumerate(self.things.tolist())}
         self._kind = np.full(m.nbody, _STANDS)

@@ -161,7 +161,7 @@ class TrajectoryController:
         self._knots, self._points, self._slopes = trajectory.times, trajectory.positions, trajectory.velocities
         if trajectory.times[0] > 0.0:  # from where they are, or should be
             by_servo = np.isin(self.robot.interface[active], (Interface.POSITION, Interface.VELOCITY))
-            here = np.where(by_servo, self.robot.setpoint[active], self.robot.rigid.read(self.robot.name)[0][active])
+            here = np.where(by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active])
             self._knots = np.concatenate([[0.0], self._knots])
             self._points = np.concatenate([here[None], self._points])
             if self._slopes is not None:
@@ -221,7 +221,7 @@ class TrajectoryController:
         run, elapsed = self.run, time - self.run.began
         if elapsed < 0.0:
             return
-        position, velocity, _, _ = self.robot.rigid.read(self.robot.name)
+        position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         wanted, rate = self._at(elapsed)
         self._wanted[self._order], self._wanted_velocity[self._order] = wanted, rate
         error, slip = wanted - position[self._active], rate - velocity[self._active]
@@ -244,7 +244,7 @@ class TrajectoryController:
 
     def following(self, time: float) -> Following:
         """Where the joints should be and are."""
-        position, velocity, _, _ = self.robot.rigid.read(self.robot.name)
+        position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         return Following(
             time, self.joints, self._wanted.copy(), self._wanted_velocity.copy(), position[self.indices],
             velocity[self.indices],
@@ -271,7 +271,7 @@ class TrajectoryController:
         self._hold()
 
     def _hold(self) -> None:
-        position = self.robot.rigid.read(self.robot.name)[0][self._active]
+        position = self.robot.rigid.joint_measurements(self.robot.name)[0][self._active]
         self.robot.command_position(position, self._active)
         self._wanted[self._order], self._wanted_velocity[self._order] = position, 0.0
         self.run = None

@@ -126,7 +126,7 @@ class Pick(Script):
     def box_pose(self) -> np.ndarray:
         """Where the box is [7]: the middle of its underside."""
         rigid = self.physics.rigid
-        return rigid.link_q()[[link.name for link in rigid.links()].index(f"box/{self.task.box}")]
+        return rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{self.task.box}")]
 
     @property
     def in_box(self) -> bool:
@@ -162,7 +162,7 @@ class Pick(Script):
         stiffness = np.array([self.robot.description.drives[i].stiffness for i in self._fingers])
         end, firm = self.time + 4.0, 0
         while firm < 30:
-            position, _, _, contact = rigid.read(name)
+            position, _, _, contact = rigid.joint_measurements(name)
             here, felt = position[self._fingers], np.abs(contact[self._fingers])
             firm = firm + 1 if (felt > HELD).all() else 0
             if self.time > end:
@@ -205,7 +205,7 @@ class Pick(Script):
         self._up = along
         yield from self._lead("turn", lambda: over, down, patience=6.0)
         yield from self._lead("lower", lambda: low, down, speed=0.15, patience=8.0, near=0.03)
-        opening = self.robot.rigid.read(self.robot.name)[0][self._fingers].sum()
+        opening = self.robot.rigid.joint_measurements(self.robot.name)[0][self._fingers].sum()
         self._open(float(opening) + RELEASE)
         yield from self.wait(0.8, "let go")
         yield from self._lead("rise", lambda: over, down, speed=0.2, patience=8.0, near=0.05)
@@ -250,7 +250,7 @@ class Pick(Script):
         self.robot.command_gripper(self.hand.gripper, min(opening, widest))
 
     def _base(self) -> np.ndarray:
-        return self.robot.rigid.base(self.robot.name)[0]
+        return self.robot.rigid.base_state(self.robot.name)[0]
 
     def _of_base(self, point: np.ndarray) -> np.ndarray:
         """A point [3] given for the left arm in the base's axes, in the world."""

@@ -12,7 +12,7 @@ from vinesim.kernels.shading import materials
 from vinesim.scene.appearance import smooth
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.values import Link, Mesh, Shape
+from vinesim.scene.values import RigidVisual, Mesh, Shape
 from vinesim.sensors.scene.plant_primitives import Ripeness, bunches
 from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, batch
 
@@ -39,7 +39,7 @@ _SMOOTH_STEPS = 2047
 
 def rigid(
     model: Model,
-    links: tuple[Link, ...],
+    links: tuple[RigidVisual, ...],
     first: int,
     groups: int,
     shape: dict[int, np.ndarray],
