@@ -166,7 +166,7 @@ def hurl(physics: Physics, kind: str, index: int, x: float, speed: float) -> Non
         rigid.place_bunch(index, frames.pose(at - [0.085, 0, 0]), np.array([speed, 0, 0, 0, 0, 0]))
     else:
         rigid.place_robot(f"ram{index}", frames.pose([*at[:2], HIGH]), np.zeros(1))
-        rigid.mj_data.qvel[rigid._robots[f"ram{index}"].v] = speed
+        rigid.mj_data.qvel[rigid.robot(f"ram{index}").v] = speed
 
 
 PAIRS = [
@@ -215,7 +215,7 @@ def test_a_cut_cane_takes_what_the_other_loses(other):
     middle = np.array([0.5, 60.0, HIGH])
     if other == "ram":
         rigid.place_robot("ram0", frames.pose([middle[0], 59.8, HIGH], frames.yaw(0.5 * np.pi)), np.zeros(1))
-        rigid.mj_data.qvel[rigid._robots["ram0"].v] = 1.0
+        rigid.mj_data.qvel[rigid.robot("ram0").v] = 1.0
     elif other == "box":
         joint = rigid.mj_data.joint("box/0")
         joint.qpos[:] = [middle[0], 59.7, HIGH - 0.15, 1, 0, 0, 0]

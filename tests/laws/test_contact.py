@@ -164,7 +164,7 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
                 sum((c.force for c in touching.contacts), np.zeros(3)),
             )
             np.testing.assert_allclose(on_plants, -on_robot, atol=1e-9)
-            base = rigid._robots["grip"].base_v[:2]
+            base = rigid.robot("grip").base_v[:2]
             np.testing.assert_allclose(touching.force[base], on_robot[:2], atol=1e-9)
         physics._commit()
         rigid.integrate(touching.force)
@@ -188,9 +188,9 @@ def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, g
     ours.add_robot(spec)
     for rigid in (ours.rigid, oracle.rigid):
         rigid.command("bar", np.zeros(1), np.array([speed]))
-        rigid.mj_data.qvel[rigid._robots["bar"].v] = speed
+        rigid.mj_data.qvel[rigid.robot("bar").v] = speed
     force, met = [], set()
-    base = ours.rigid._robots["bar"].base_v[:2]
+    base = ours.rigid.robot("bar").base_v[:2]
     for _ in range(round(seconds / ours.dt)):
         ours.step()
         on_bar, theirs = force_on(ours, "bar"), np.zeros(3)
@@ -363,7 +363,7 @@ def test_contact_without_damping_gives_no_energy(stiffness, speed):
     physics.contact_solver.damping = 0.0
     physics.contact_solver._record()
     physics.add_robot(bar((0.7, -0.08, 0.95)))
-    drive = physics.rigid._robots["bar"].v
+    drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = speed
     start = energy(physics) + 1.5 * speed**2
     most, met = -np.inf, set()
@@ -379,7 +379,7 @@ def test_branches_that_push_each_other_give_no_energy():
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005, beta=0.0) for i in range(5)])
     physics = Physics(model)
     physics.add_robot(bar((0.7, -0.08, 0.95)))
-    drive = physics.rigid._robots["bar"].v
+    drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = 0.5
     start = energy(physics) + 1.5 * 0.5**2
     most, pushed = -np.inf, 0
@@ -436,7 +436,7 @@ def test_a_floating_cane_takes_the_momentum_that_the_bar_loses():
     physics = Physics(model)
     physics.plants.cut(0)
     physics.add_robot(bar((0.4, -0.06, 3.0)))
-    drive = physics.rigid._robots["bar"].v
+    drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = 1.0
     total = []
     for _ in range(40):

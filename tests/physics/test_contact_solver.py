@@ -229,7 +229,7 @@ def test_only_what_is_reached_wakes_and_it_moves_in_the_same_tick():
     physics.step()
     assert len(physics.plants.awake) == 0
     physics.add_robot(bar((0.7, -0.06, 0.95)))
-    drive = physics.rigid._robots["bar"].v
+    drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = 3.0
     before = physics.state.joint_q.copy()
     reached = None
@@ -253,7 +253,7 @@ def test_only_what_is_reached_wakes_and_it_moves_in_the_same_tick():
 def test_fast_bar_wakes_every_cane_before_it_overlaps_one():
     physics = Physics(assemble([cane((0.0, 0.3 * i, 1.0), radius=0.005) for i in range(6)]))
     physics.add_robot(bar((0.7, -0.2, 0.95), damping=2000.0))
-    physics.rigid.mj_data.qvel[physics.rigid._robots["bar"].v] = 5.0
+    physics.rigid.mj_data.qvel[physics.rigid.robot("bar").v] = 5.0
     physics.rigid.command("bar", np.zeros(1), np.array([5.0]))
     first = {}
     for _ in range(40):
@@ -406,8 +406,8 @@ def test_rigid_groups_join_what_a_constraint_couples():
 def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "wind", "holding", "rigid", "touching", "detail", "plants", "touching", "plants", "rigid", "guard", "parting",
-        "holding", "sleep",
+        "wind", "grasps", "rigid", "contacts", "detail", "plants", "contacts", "plants", "rigid", "faults", "detachment",
+        "grasps", "sleep",
     ]  # fmt: skip
     physics.plants.wake(1)
     physics.state.joint_qd[physics.model.bodies_of(1).start, 1] = 0.5
@@ -561,7 +561,7 @@ def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
     physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
     speed = rng.uniform(0.3, 3.0)
     physics.rigid.command("bar", np.zeros(1), np.array([speed]))
-    physics.rigid.mj_data.qvel[physics.rigid._robots["bar"].v] = speed
+    physics.rigid.mj_data.qvel[physics.rigid.robot("bar").v] = speed
     physics.rigid.apply_wrench("probe", "rod", np.array([0.0, 0.0, -rng.uniform(2.0, 30.0)]))
     return physics, ["bar", "probe"]
 
@@ -588,7 +588,7 @@ def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed)
             touching.wrenches[:, :3].sum(0), -sum((c.force for c in outside), np.zeros(3)), atol=1e-9
         )
         for name in robots:
-            base = rigid._robots[name].base_v[:2]
+            base = rigid.robot(name).base_v[:2]
             on_robot = sum((c.force for c in outside if c.actor == name), np.zeros(3))
             np.testing.assert_allclose(touching.force[base], on_robot[:2], atol=1e-9)
     assume(pressed > 0)

@@ -15,7 +15,7 @@ def test_many_are_laid_down_at_once_and_have_no_body():
     trees = physics.model.body_tree[physics.model.bunch_body]
     poses = np.array([frames.pose([3.0, 0.2 * i, 0.05]) for i in range(40)])
     generation = physics.rigid.generation
-    physics.dormant_bunches.lay(list(range(40)), [""] * 39 + ["box/1"], poses)
+    physics.dormant_bunches.add(list(range(40)), [""] * 39 + ["box/1"], poses)
     physics.step()
     assert physics.rigid.generation == generation
     assert physics.rigid.free_bunches == ()
@@ -24,7 +24,7 @@ def test_many_are_laid_down_at_once_and_have_no_body():
     view = physics.snapshot()
     assert [link.name for link in view.visuals][-40:] == [f"bunch/{i}" for i in range(40)]
     np.testing.assert_allclose(view.visual_q[-40:-1], poses[:-1])
-    box = physics.support_tracker.read(BOX(1))[0]
+    box = physics.support_tracker.object_state(BOX(1))[0]
     np.testing.assert_allclose(view.visual_q[-1], frames.compose(box, poses[-1]), atol=1e-9)
     assert physics.snapshot().visuals is view.visuals
     # drawn with the shapes it had on its vine
@@ -33,12 +33,12 @@ def test_many_are_laid_down_at_once_and_have_no_body():
 
 def test_who_is_near_gets_a_body_with_the_weight_it_had():
     physics, fallen = Physics(vineyard(3)), Physics(vineyard(3))
-    physics.dormant_bunches.lay([0, 1, 2], [""] * 3, np.array([frames.pose([x, 0.0, 0.05]) for x in (0.0, 1.0, 9.0)]))
+    physics.dormant_bunches.add([0, 1, 2], [""] * 3, np.array([frames.pose([x, 0.0, 0.05]) for x in (0.0, 1.0, 9.0)]))
     assert physics.dormant_bunches.nearest(np.array([[0.2, 0.0, 0.0]]), 5) == [0, 1]
     assert physics.dormant_bunches.nearest(np.array([[0.2, 0.0, 0.0]]), 1) == [0]
     assert physics.dormant_bunches.nearest(np.array([[40.0, 0.0, 0.0]]), 5) == []
     before = physics.visuals()
-    physics.dormant_bunches.embody([0, 1])
+    physics.dormant_bunches.activate([0, 1])
     assert physics.visuals() is not before
     assert physics.rigid.free_bunches == (0, 1)
     assert len(physics.dormant_bunches) == 1
@@ -46,14 +46,14 @@ def test_who_is_near_gets_a_body_with_the_weight_it_had():
     world, other = physics.rigid.mj_model, fallen.rigid.mj_model
     assert world.body("loose/0").mass == pytest.approx(other.body("loose/0").mass)
     np.testing.assert_allclose(world.body("loose/0").inertia, other.body("loose/0").inertia, rtol=1e-4)
-    np.testing.assert_allclose(physics.support_tracker.read(BUNCH(1))[0], frames.pose([1.0, 0.0, 0.05]), atol=1e-9)
+    np.testing.assert_allclose(physics.support_tracker.object_state(BUNCH(1))[0], frames.pose([1.0, 0.0, 0.05]), atol=1e-9)
     with pytest.raises(ValueError, match="bunch 1 is loose already"):
         physics.dormant_bunches.rigid.add_bunch(1, physics.rigid._free_bunches[1], frames.pose([0.0, 0, 0]), np.zeros(6))
 
 
 def test_a_tree_whose_bunch_was_laid_down_moves_without_it_when_it_wakes():
     physics, other = Physics(vineyard(1)), Physics(vineyard(1))
-    physics.dormant_bunches.lay([0], [""], frames.pose([3.0, 0.0, 0.05])[None])
+    physics.dormant_bunches.add([0], [""], frames.pose([3.0, 0.0, 0.05])[None])
     other.pick(0)
     physics.plants.wake(0)
     for _ in range(30):

@@ -98,7 +98,7 @@ def test_a_hand_that_holds_a_link_gives_its_pull():
 def test_hands_of_a_copy_touch_no_robot_and_hold_nothing():
     rigid, spec = RigidWorld(yard()), eva(-1.0)
     rigid.add_robot(arm())
-    rigid.add_human(spec, copy=True)
+    rigid.add_human(spec, is_remote=True)
     for x in np.linspace(-0.6, 0.0, 100):
         pose = put(spec.pose, (x, 0.0, 0.3))
         rigid.move_human("eva", dataclasses.replace(pose, right_closed=True))
@@ -106,7 +106,7 @@ def test_hands_of_a_copy_touch_no_robot_and_hold_nothing():
     step(rigid, 50)
     hand = rigid.hand_sample("eva", "right")
     np.testing.assert_allclose(hand.pose, hand.controller, atol=1e-6)  # inside the chassis
-    assert (hand.touching, hand.holds) == (False, None)
+    assert (hand.touching, hand.held) == (False, None)
     np.testing.assert_array_equal(rigid.joint_measurements("anna")[3], 0.0)
     np.testing.assert_allclose(rigid.joint_measurements("anna")[0], HOME, atol=1e-3)
 
@@ -115,7 +115,7 @@ def test_legs_of_a_copy_stop_a_base():
     """F27 on the robot's own client: what does not give way is computed there, against the copy."""
     rigid, spec = RigidWorld(yard()), eva(1.0, heading=np.pi)
     rigid.add_robot(arm(heading=np.pi))
-    rigid.add_human(spec, copy=True)
+    rigid.add_human(spec, is_remote=True)
     rigid.command_base("anna", (-0.5, 0.0, 0.0))
     step(rigid, 500)
     assert rigid.base_state("anna")[0][0] == pytest.approx(1.0 - 0.05 - 0.3, abs=2e-3)
@@ -124,7 +124,7 @@ def test_legs_of_a_copy_stop_a_base():
 @pytest.mark.parametrize("busy", [False, True])
 def test_a_copys_hand_pushes_what_lies_but_not_while_it_is_busy_at_home(busy):
     rigid, spec = RigidWorld(yard(boxes=1)), eva(0.0, 4.0, heading=np.pi / 2)
-    rigid.add_human(spec, copy=True)
+    rigid.add_human(spec, is_remote=True)
     generation = rigid.generation
     for y in np.linspace(4.3, 5.0, 100):
         pose = put(spec.pose, (0.0, y, 0.2))
@@ -145,7 +145,7 @@ def test_my_hand_and_the_copy_of_anothers_push_each_other():
     """F14 between clients: each side has its own hand and a copy of the other's controller."""
     rigid, mine, yours = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
     rigid.add_human(mine)
-    rigid.add_human(yours, copy=True)
+    rigid.add_human(yours, is_remote=True)
     for x in np.linspace(-0.4, 0.0, 150):
         rigid.move_human("eva", put(mine.pose, (x, 0.0, 1.1)))
         rigid.move_human("ida", put(yours.pose, (-x, 0.0, 1.1)))

@@ -11,7 +11,7 @@ import pytest
 from tests.physics.test_rigid_world import arm, step, yard
 from tests.support.contact_scenes import probe
 from vinesim import frames
-from vinesim.physics.rigid.human_body import LIMBS, PARTS, THICK, HumanError, posture, standing
+from vinesim.physics.rigid.human_body import VISUAL_PARTS, BODY_PARTS, THICK, HumanError, posture, standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene import appearance
@@ -29,7 +29,7 @@ PALM = frames.exp(np.array([0.0, -0.5 * np.pi, 0.0]))
 
 
 def eva(x: float = 0.0, y: float = 0.0, heading: float = 0.0, name: str = "eva", **settings) -> HumanSpec:
-    pose = standing(frames.pose(np.array([x, y, 0.0]), frames.yaw(heading)))
+    pose = standing_pose(frames.pose(np.array([x, y, 0.0]), frames.yaw(heading)))
     return HumanSpec(name, 3, pose, **settings)
 
 
@@ -244,10 +244,10 @@ def test_a_pair_in_contact_keeps_its_momentum():
 
 
 def test_knees_bend_forward_and_limbs_keep_their_lengths():
-    pose = standing(frames.pose(np.zeros(3), frames.yaw(0.7)), 1.8)
+    pose = standing_pose(frames.pose(np.zeros(3), frames.yaw(0.7)), 1.8)
     for drop in (0.0, 0.2, 0.5):
         crouched = dataclasses.replace(pose, hips=pose.hips - np.array([0, 0, drop, 0, 0, 0, 0]))
-        parts = dict(zip(PARTS, posture(1.8, crouched), strict=True))
+        parts = dict(zip(BODY_PARTS, posture(1.8, crouched), strict=True))
         for side in ("left", "right"):
             thigh, shank, foot = (parts[f"{side}_{name}"] for name in ("thigh", "shank", "foot"))
             assert np.linalg.norm(shank[:3] - thigh[:3]) == pytest.approx(0.245 * 1.8, rel=1e-6)
@@ -260,7 +260,7 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
             assert forward @ (shank[:3] - 0.5 * (thigh[:3] + foot[:3])) >= -1e-6
     assert forward @ (shank[:3] - 0.5 * (thigh[:3] + foot[:3])) > 0.2
     np.testing.assert_allclose(np.linalg.norm(posture(1.8, crouched)[:, 3:], axis=1), 1.0, atol=1e-12)
-    chest = posture(1.8, pose)[PARTS.index("chest")]
+    chest = posture(1.8, pose)[BODY_PARTS.index("chest")]
     np.testing.assert_allclose(frames.rotate(chest[3:], np.eye(3))[[0, 2]], [[*forward[:2], 0.0], [0, 0, 1]], atol=0.1)
 
 
@@ -279,7 +279,7 @@ def test_nothing_moves_head_trunk_or_legs():
         step(rigid)
         poses = rigid.visual_q()
         expected = posture(spec.height, pose)
-        for part, told in zip(PARTS, expected, strict=True):
+        for part, told in zip(BODY_PARTS, expected, strict=True):
             assert poses[links.index(f"eva/{part}")].tobytes() == told.tobytes()
         assert poses[links.index("eva/head")].tobytes() == head.tobytes()
         pressed = pressed or rigid.joint_measurements("probe")[3][0] < -100.0
@@ -296,13 +296,13 @@ def test_a_base_stops_at_legs():
     deep = 0.0
     for _ in range(500):
         step(rigid)
-        deep = max(deep, *(deepest(rigid, f"eva/{part}") for part in PARTS))
+        deep = max(deep, *(deepest(rigid, f"eva/{part}") for part in BODY_PARTS))
     base, velocity = rigid.base_state("anna")
     assert np.abs(velocity).max() < 1e-3
     assert base[0] == pytest.approx(1.0 - 0.05 - 0.3, abs=2e-3)  # at the shins, the toes below it
     assert deep < 0.01 * 0.5 + 2e-3
-    assert max(deepest(rigid, f"eva/{part}") for part in PARTS) < 2e-3
-    assert rigid._contact_force[rigid._robots["anna"].base_v[0]] == pytest.approx(-800.0, rel=0.05)
+    assert max(deepest(rigid, f"eva/{part}") for part in BODY_PARTS) < 2e-3
+    assert rigid.contact_force[rigid.robot("anna").base_v[0]] == pytest.approx(-800.0, rel=0.05)
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.4])
@@ -327,7 +327,7 @@ def test_who_is_put_elsewhere_kicks_nobody_on_the_way():
     rigid, spec = RigidWorld(yard(boxes=1)), eva(-1.0, 5.0)
     rigid.add_human(spec)
     step(rigid, 100)
-    elsewhere = standing(frames.pose(np.array([3.5, 0.0, 0.0])))  # behind the pole, and the box between
+    elsewhere = standing_pose(frames.pose(np.array([3.5, 0.0, 0.0])))  # behind the pole, and the box between
     rigid.move_human("eva", elsewhere)
     before = rigid.mj_data.body("box/0").xpos.copy()
     step(rigid, 50)
@@ -340,12 +340,12 @@ def test_people_are_seen_as_people():
     rigid = RigidWorld(yard())
     rigid.add_human(eva())
     links = [link for link in rigid.visuals() if link.organ == Organ.HUMAN]
-    names = (*PARTS, "left_hand", "right_hand", *LIMBS)
+    names = (*BODY_PARTS, "left_hand", "right_hand", *VISUAL_PARTS)
     assert [link.name for link in links] == [f"eva/{name}" for name in names]
     assert {link.index for link in links} == {3}
     assert all(link.shapes for link in links)
     assert set(rigid.geoms.actor) == {"eva"}
-    assert not {link.partition("/")[2] for link in rigid.geoms.link} & set(LIMBS)  # only seen
+    assert not {link.partition("/")[2] for link in rigid.geoms.link} & set(VISUAL_PARTS)  # only seen
 
 
 def limbs_of(pose: HumanPose) -> tuple[RigidWorld, dict[str, np.ndarray]]:
@@ -360,7 +360,7 @@ def limbs_of(pose: HumanPose) -> tuple[RigidWorld, dict[str, np.ndarray]]:
 def test_arms_reach_from_shoulders_to_wrists(posture: str):
     """Bones keep their lengths, elbows join, and both arms of a mirrored pose mirror each other."""
     look = appearance.person(1.75)
-    pose = appearance.posed(standing(frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(0.7))), posture, 1.75)
+    pose = appearance.posed(standing_pose(frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(0.7))), posture, 1.75)
     _, at = limbs_of(pose)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         upper, fore, hand = at[f"{side}_upper_arm"], at[f"{side}_forearm"], at[f"{side}_hand"]
@@ -375,7 +375,7 @@ def test_arms_reach_from_shoulders_to_wrists(posture: str):
 
 
 def test_an_arm_that_is_too_short_points_at_its_hand():
-    pose = standing(frames.pose(np.zeros(3)))
+    pose = standing_pose(frames.pose(np.zeros(3)))
     far = dataclasses.replace(pose, left=frames.pose(np.array([3.0, 0.2, 1.2])))
     _, at = limbs_of(far)
     upper, fore = at["left_upper_arm"], at["left_forearm"]
@@ -390,7 +390,7 @@ def test_fingers_bend_as_they_are_told():
     look = appearance.person(1.75)
     for bent in range(5):
         told = tuple(float(k == bent) for k in range(5))
-        pose = dataclasses.replace(standing(frames.pose(np.zeros(3))), left_fingers=told, right_fingers=told)
+        pose = dataclasses.replace(standing_pose(frames.pose(np.zeros(3))), left_fingers=told, right_fingers=told)
         _, at = limbs_of(pose)
         for s, side in enumerate(("left", "right")):
             down = frames.rotate(at[f"{side}_hand"][3:], np.array([0.0, 0.0, -1.0]))
@@ -441,7 +441,7 @@ def test_what_is_heavier_needs_a_larger_movement(mass):
     needed = mass * 9.81 / 100.0
     rigid, _ = lifted(mass, needed + 0.3)
     hand = rigid.hand_sample("eva", "right")
-    assert hand.holds == ("box/0", "box")
+    assert hand.held == ("box/0", "box")
     assert hand.controller[2] - hand.pose[2] == pytest.approx(needed, rel=5e-3)
     assert hand.force[2] == pytest.approx(mass * 9.81, rel=5e-3)
     assert rigid.mj_data.body("box/0").xpos[2] == pytest.approx(0.3, abs=0.01)
@@ -492,7 +492,7 @@ def test_a_robot_is_taken_by_the_link_and_let_go():
     assert effort[0] == pytest.approx(-hand.force[0], rel=1e-2)
     rigid.release("eva", "right")
     step(rigid, 300)
-    assert rigid.hand_sample("eva", "right").holds is None
+    assert rigid.hand_sample("eva", "right").held is None
     assert np.abs(rigid.hand_sample("eva", "right").pose[:3] - rigid.hand_sample("eva", "right").controller[:3]).max() < 1e-3
     assert abs(rigid.joint_measurements("probe")[0][0]) < 1e-4
 
@@ -505,7 +505,7 @@ def test_a_hand_holds_a_hand():
     rigid.move_human("ida", put(other.pose, (0.0, 0.0, 1.1 + 3 * THICK)))
     step(rigid, 200)
     rigid.grasp("eva", "right", *rigid.nearest_to_hand("eva", "right", 0.05)[1:])
-    assert rigid.hand_sample("eva", "right").holds == ("ida", "right_hand")
+    assert rigid.hand_sample("eva", "right").held == ("ida", "right_hand")
     for x in np.linspace(0.0, 0.4, 200):
         rigid.move_human("ida", put(other.pose, (x, 0.0, 1.1 + 3 * THICK)))
         step(rigid)
@@ -532,7 +532,7 @@ def test_others_join_and_leave_while_a_hand_holds():
     step(rigid, 30)
     step(alone, 30)
     np.testing.assert_allclose(rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose, atol=1e-9)
-    assert rigid.hand_sample("eva", "right").holds == ("box/0", "box")
+    assert rigid.hand_sample("eva", "right").held == ("box/0", "box")
     rigid.remove_human("eva")
     assert rigid.humans == ()
     step(rigid, 100)
@@ -545,7 +545,7 @@ def test_who_is_held_may_leave():
     rigid.grasp("eva", "right", "probe", "rod")
     rigid.remove_robot("probe")
     step(rigid, 5)
-    assert rigid.hand_sample("eva", "right").holds is None
+    assert rigid.hand_sample("eva", "right").held is None
 
 
 def test_twice_the_same_bits():

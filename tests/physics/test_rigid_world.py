@@ -115,7 +115,7 @@ def test_prediction_and_response_are_what_the_second_half_does(exact):
     step(rigid, 5)
     rng = np.random.default_rng(1)
     force = np.zeros(rigid.mj_model.nv)
-    force[rigid._robots["anna"].v] = rng.normal(size=3) * 3.0
+    force[rigid.robot("anna").v] = rng.normal(size=3) * 3.0
     rigid.predict()
     predicted = rigid.velocity_free + rigid.impulse_response(force[None])[:, 0] * rigid.dt
     rigid.integrate(force)
@@ -130,7 +130,7 @@ def test_response_holds_the_stiffness_of_a_limit_that_is_active():
     rigid.predict()
     assert rigid.mj_data.nefc == 1
     force = np.zeros(rigid.mj_model.nv)
-    force[rigid._robots["anna"].v[2]] = -1.0
+    force[rigid.robot("anna").v[2]] = -1.0
     predicted = rigid.velocity_free + rigid.impulse_response(force[None])[:, 0] * rigid.dt
     rigid.integrate(force)
     np.testing.assert_allclose(rigid.mj_data.qvel, predicted, atol=1e-7)
@@ -172,7 +172,7 @@ def test_a_weak_drive_gives_no_more_than_its_effort():
     step(rigid, 3)
     _, _, effort, _ = rigid.joint_measurements("anna")
     assert abs(effort[0]) <= 90.0 + 1e-9
-    assert np.abs(rigid.mj_data.qfrc_actuator[rigid._robots["anna"].v]).max() <= 90.0 + 1e-9
+    assert np.abs(rigid.mj_data.qfrc_actuator[rigid.robot("anna").v]).max() <= 90.0 + 1e-9
 
 
 def test_known_contact_is_read_as_contact_and_balanced_by_the_drives():
@@ -202,7 +202,7 @@ def test_contact_with_a_pole_is_read_too_and_the_tracks_slip_at_their_effort():
     step(rigid, 300)
     pose, _ = rigid.base_state("anna")
     assert pose[0] == pytest.approx(3.0 - 0.05 - 0.3, abs=0.02)
-    assert rigid._contact_force[rigid._robots["anna"].base_v[0]] == pytest.approx(-800.0, rel=3e-2)
+    assert rigid.contact_force[rigid.robot("anna").base_v[0]] == pytest.approx(-800.0, rel=3e-2)
 
 
 def test_tracks_drive_and_hold():
@@ -413,7 +413,7 @@ def test_gains_can_be_tuned_and_survive_a_newcomer():
     rigid.add_robot(arm("bert", 1, y=3.0))
     step(rigid, 20)
     _, velocity, effort, _ = rigid.joint_measurements("anna")
-    gravity = rigid.mj_data.qfrc_gravcomp[rigid._robots["anna"].v[1]]
+    gravity = rigid.mj_data.qfrc_gravcomp[rigid.robot("anna").v[1]]
     assert effort[1] - gravity == pytest.approx(2.0 - 5.0 * velocity[1], abs=1e-9)
     assert velocity[1] > 0.1
 
@@ -449,7 +449,7 @@ def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
     step(alone, 20)
     where = rigid.base_state("anna")[0]
     rigid.predict()
-    rigid.mj_data.qvel[rigid._robots["anna"].v[1]] = np.nan
+    rigid.mj_data.qvel[rigid.robot("anna").v[1]] = np.nan
     rigid.integrate()
     step(rigid, 30)
     step(alone, 31)
@@ -462,25 +462,25 @@ def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
     assert rigid.mj_data.time == pytest.approx(alone.mj_data.time)
 
 
-def loose(shapes: int, mass: float = 0.6) -> loose_module.Loose:
+def loose(shapes: int, mass: float = 0.6) -> loose_module.FreeBunch:
     """A bunch of some spheres and, last, a capsule."""
     start = np.stack([0.02 * np.arange(shapes), 0.003 * np.arange(shapes), np.zeros(shapes)], 1)
     end = start.copy()
     end[-1, 0] += 0.03
     inertia = np.array([6e-4, 1.5e-3, 1.4e-3])
     radius, product = 0.04 - 0.001 * np.arange(shapes), np.array([1e-5, -3e-5, 4e-5])
-    return loose_module.Loose(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
+    return loose_module.FreeBunch(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
 
 
-@pytest.mark.parametrize("shapes", [1, 5, loose_module.LUMPS])
+@pytest.mark.parametrize("shapes", [1, 5, loose_module.MAX_GEOMS])
 def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
     """All constants that MuJoCo derives from weight and shapes, against a world compiled with the bunch in it."""
     model = assemble([], box_pose=[[1.0, 0, 0, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.3]], box_mass=[[2.0]])
     rigid = RigidWorld(model)
     bunch = loose(shapes)
     rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
-    spec = yard_module.furnished(model, rigid.parameters)
-    loose_module.drop(spec, bunch)
+    spec = yard_module.build_static_world(model, rigid.parameters)
+    loose_module.add_free_bunch(spec, bunch)
     ours, theirs = rigid.mj_model, spec.compile()
     a, b = ours.body("loose/0").id, theirs.nbody - 1
     for name in loose_module.OF_BODY:
@@ -515,12 +515,12 @@ def test_more_bunches_than_bodies_wait_for_them():
     """The pool grows by a compilation when it is used up; those that fall go on falling."""
     rigid = RigidWorld(assemble([]))
     generations = []
-    for bunch in range(loose_module.WAITING + 2):
+    for bunch in range(loose_module.POOL_SIZE + 2):
         rigid.add_bunch(bunch, loose(3), frames.pose(np.array([float(bunch), 0.0, 5.0])), np.zeros(6))
         generations.append(rigid.mj_model)
         rigid.predict()
         rigid.integrate()
-    assert all(world is generations[0] for world in generations[: loose_module.WAITING])
+    assert all(world is generations[0] for world in generations[: loose_module.POOL_SIZE])
     assert generations[-1] is not generations[0]
     ticks = np.arange(len(generations), 0, -1)
     fallen = 5.0 - 9.81 * rigid.dt**2 * ticks * (ticks + 1) / 2.0
@@ -530,5 +530,5 @@ def test_more_bunches_than_bodies_wait_for_them():
     assert 4 not in rigid.free_bunches
     assert [link.name for link in rigid.visuals()] == [f"bunch/{bunch}" for bunch in rigid.free_bunches]
     with pytest.raises(ValueError, match="shapes; a loose one has"):
-        rigid.add_bunch(4, loose(loose_module.LUMPS + 1), frames.pose(np.zeros(3)), np.zeros(6))
+        rigid.add_bunch(4, loose(loose_module.MAX_GEOMS + 1), frames.pose(np.zeros(3)), np.zeros(6))
     assert 4 not in rigid.free_bunches

@@ -11,7 +11,7 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.kernels.shading import materials
-from vinesim.physics.rigid.human_body import PARTS, figure, hand_shapes, standing
+from vinesim.physics.rigid.human_body import BODY_PARTS, body_shapes, hand_shapes, standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import CRATE_WALL
 from vinesim.robot.description import description
@@ -30,7 +30,7 @@ SIZES = [(0.6, 0.4, 0.15), (0.6, 0.4, 0.24), (0.6, 0.4, 0.3), (0.4, 0.3, 0.24)]
 
 def person(name: str, height: float = 1.75) -> RigidWorld:
     rigid = RigidWorld(sensor_scenes.empty())
-    pose = appearance.posed(standing(frames.pose(np.zeros(3)), height), name, height)
+    pose = appearance.posed(standing_pose(frames.pose(np.zeros(3)), height), name, height)
     rigid.add_human(HumanSpec("eva", 4, pose, height))
     rigid.predict()
     rigid.integrate()
@@ -52,7 +52,7 @@ def test_a_person_looks_as_large_as_what_touches(side: float, height: float) -> 
     rigid = person("stand", height)
     eye = 4.0 * np.array([np.cos(side), np.sin(side), 0.0]) + [0.0, 0.0, 1.3]
     seen = silhouette(rigid.visuals(), rigid.visual_q(), eye)
-    touching = dict(zip(PARTS, ((shape,) for shape in figure(height)), strict=True))
+    touching = dict(zip(BODY_PARTS, ((shape,) for shape in body_shapes(height)), strict=True))
     touching |= {f"{hand}_hand": hand_shapes(hand) for hand in ("left", "right")}
     rows = [i for i, link in enumerate(rigid.visuals()) if link.name.partition("/")[2] in touching]
     named = [rigid.visuals()[i].name for i in rows]
@@ -178,7 +178,7 @@ def test_what_is_wrong_with_a_figure_is_said_in_one_line(tmp_path, line: str, wo
 
 def test_an_unknown_posture_is_said() -> None:
     with pytest.raises(FigureError, match="posture 'dance' is unknown; give one of: stand, pick"):
-        appearance.posed(standing(frames.pose(np.zeros(3))), "dance", 1.75)
+        appearance.posed(standing_pose(frames.pose(np.zeros(3))), "dance", 1.75)
 
 
 def test_a_cone_tapers_the_way_it_says() -> None:
@@ -197,7 +197,7 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
     """F48: an open hand before a camera shows gaps between fingers and reaches further than a fist."""
     views = {}
     for name, bent in (("open", 0.0), ("fist", 1.0)):
-        pose = standing(frames.pose(np.zeros(3)))
+        pose = standing_pose(frames.pose(np.zeros(3)))
         up = frames.aligned(np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0]))
         hand = {"right": frames.pose(np.array([0.5, -0.4, 1.4]), up), "right_fingers": (bent,) * 5}
         rigid = RigidWorld(sensor_scenes.empty())

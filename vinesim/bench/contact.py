@@ -92,9 +92,9 @@ def _block(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> It
 
 
 def _whose(stage: str) -> str:
-    """Rigid stages call MuJoCo and do little else; plants, wind and touching are ours; the rest hands over."""
+    """Rigid stages call MuJoCo and do little else; plants, wind and contacts are ours; the rest hands over."""
     room = stage.split(":")[0]
-    return {"rigid": "MuJoCo", "plants": "ours", "touching": "ours", "wind": "ours"}.get(room, "rest")
+    return {"rigid": "MuJoCo", "plants": "ours", "contacts": "ours", "wind": "ours"}.get(room, "rest")
 
 
 def _swing(physics: Physics, robot: RobotSpec, raised: np.ndarray, tick: int) -> None:

@@ -14,7 +14,7 @@ from vinesim.physics.contact.contact_solver import shapes_of
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, furnished
+from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, build_static_world
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -70,7 +70,7 @@ class Whole:
         self.rigid = mine = RigidWorld(model, parameters=PhysicsParameters(dt=dt))
         for robot in robots:
             mine.add_robot(robot)
-        spec = furnished(model, mine.parameters)
+        spec = build_static_world(model, mine.parameters)
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         for bit, robot in enumerate(robots, FIRST_ACTOR):

@@ -21,7 +21,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.humans import Person, RemotePerson
+from vinesim.client.humans import LocalHuman, RemoteHuman
 from vinesim.client.recording.trace import Trace
 from vinesim.client.remote.objects import PULL, Things
 from vinesim.client.remote.spawner import Arrivals
@@ -30,7 +30,7 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.exchange import Exchange, Inbox
 from vinesim.net.transport.bus import Bus
 from vinesim.physics.plants.wind import Wind
-from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.human_body import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import Description
@@ -82,7 +82,7 @@ class Client:
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robots: dict[str, Robot] = {}
         """All robots that this client moves, by name; the first is :attr:`robot`."""
-        self.people: dict[str, Person] = {}
+        self.people: dict[str, LocalHuman] = {}
         """All people that this client moves, by name."""
         self.exchanges: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
@@ -90,7 +90,7 @@ class Client:
         self._near, self._jitter_buffer = near, jitter_buffer
         self._enter(description, pose, source, height, bus)
         self.exchange = self.exchanges[name]
-        self.others: dict[str, RemoteRobot | RemotePerson] = {}
+        self.others: dict[str, RemoteRobot | RemoteHuman] = {}
         self.jobs: list[Callable[[float], None]] = []
         """Called every tick with the simulation time, before the drives: what the robot is to do."""
         self.senses: list[Callable[[Client], None]] = []
@@ -110,7 +110,7 @@ class Client:
     ) -> None:  # fmt: skip
         """Come into the world as what this client is to be."""
         if description is None:
-            spec = HumanSpec(self.name, label_index(self.name), standing(pose, height), height)
+            spec = HumanSpec(self.name, label_index(self.name), standing_pose(pose, height), height)
             self.add_human(spec, source, bus)
         else:
             self.robot = self.add_robot(description, self.name, pose, bus)
@@ -128,14 +128,14 @@ class Client:
         self._share(name, exchange)
         return robot
 
-    def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> Person:
+    def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> LocalHuman:
         """Move one more person as ``source`` says (see :class:`Person`; None: still); ``bus`` is opened in its name."""
         hello = Hello(
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
         exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
-        self.people[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
+        self.people[spec.name] = person = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
         self._share(spec.name, exchange)
         return person
 
@@ -213,7 +213,7 @@ class Client:
             settled = exchange.send(
                 now, pose, touched=touched, moving=moving, read=things.read,
                 grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, changed=things.changed,
-                lies=self.physics.support_tracker.lies, pushed=actor.pushed(self.others) if isinstance(actor, Person) else None,
+                lies=self.physics.support_tracker.pose_on_support, pushed=actor.pushed(self.others) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too
@@ -230,7 +230,7 @@ class Client:
             if riders:
                 self.exchanges[name].send(
                     now, robot.update(now), read=self.things.read, grabbed=riders, parted=riders,
-                    lies=self.physics.support_tracker.lies,
+                    lies=self.physics.support_tracker.pose_on_support,
                 )  # fmt: skip
 
     def side_of(self, point: np.ndarray) -> str:

@@ -17,7 +17,7 @@ from vinesim.scene.values import POINTS, HumanPose, HumanSpec, HumanUpdate
 _HEAD, _HANDS = POINTS.index("head"), [POINTS.index(side) for side in SIDES]
 
 
-class Person:
+class LocalHuman:
     """A person whom this client moves: somebody tells every tick where the tracked points are."""
 
     def __init__(self, physics: Physics, spec: HumanSpec, source: Callable[[float], HumanPose]) -> None:
@@ -42,7 +42,7 @@ class Person:
         for i, side in enumerate(SIDES):
             hand = self.physics.hand(self.name, side)
             was = self._free[i] < LINGER
-            self._free[i] = 0 if giving[i] or hand.holds is not None else self._free[i] + 1
+            self._free[i] = 0 if giving[i] or hand.held is not None else self._free[i] + 1
             if self._free[i] < LINGER:
                 points[_HANDS[i]] = hand.pose
             if was != (self._free[i] < LINGER):
@@ -62,7 +62,7 @@ class Person:
         return {robot: links for robot, links in self._given.items() if robot in robots}
 
 
-class RemotePerson:
+class RemoteHuman:
     """The copy of a person whom another client moves: bit for bit where that client says; the hands push what lies."""
 
     def __init__(self, rigid: RigidWorld, name: str) -> None:

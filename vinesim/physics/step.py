@@ -15,10 +15,10 @@ from vinesim.physics.plants.fault_guard import Guard
 from vinesim.physics.plants.level_of_detail import Detail
 from vinesim.physics.plants.sleep import Sleep
 from vinesim.physics.plants.wind import Wind
-from vinesim.physics.rigid.dormant_bunches import Lying
-from vinesim.physics.rigid.hand_grasp import Holding
+from vinesim.physics.rigid.dormant_bunches import DormantBunches
+from vinesim.physics.rigid.hand_grasp import GraspManager
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.rigid.support_tracking import Riding
+from vinesim.physics.rigid.support_tracking import SupportTracker
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, RigidVisual, Parting, RobotSpec, Snapshot
@@ -27,7 +27,7 @@ from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSp
 class Physics:
     """A vineyard that moves: plants, rigid bodies, and what passes between them.
 
-    One thread owns it. What others may read leaves it as :class:`View` and other frozen values.
+    One thread owns it. What others may read leaves it as :class:`Snapshot` and other frozen values.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Physics:
         threads: int = 1,
         detachment: bool = True,
     ) -> None:
-        """``device``, ``threads``: see :class:`Plants`; ``picking``: whether bunches detach when pulled too hard."""
+        """``device``, ``threads``: see :class:`Plants`; ``detachment``: whether bunches detach when pulled too hard."""
         p = parameters
         self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
@@ -52,10 +52,10 @@ class Physics:
             model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
         )
         self.detachment_monitor = Partings(self.plants, self.rigid, self.contact_solver)
-        self.grasp_manager = Holding(self.plants, self.rigid, self.contact_solver)
-        self.support_tracker = Riding(self.rigid)
-        self.dormant_bunches = Lying(self.plants, self.rigid, self.contact_solver, self.support_tracker)
-        self._links: tuple[tuple[RigidVisual, ...], tuple[RigidVisual, ...], tuple[RigidVisual, ...]] = ((), (), ())
+        self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
+        self.support_tracker = SupportTracker(self.rigid)
+        self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
+        self._visuals: tuple[tuple[RigidVisual, ...], tuple[RigidVisual, ...], tuple[RigidVisual, ...]] = ((), (), ())
         self._detachment = detachment
         self.level_of_detail = Detail(
             self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
@@ -73,19 +73,19 @@ class Physics:
         self._body_q: np.ndarray | None = None
         self._fresh = True
         self.stages: tuple[tuple[str, Callable[[], None]], ...] = (
-            ("wind: blow on what somebody may see", self._blow),
-            ("holding: close and open hands, pull at plants", self.grasp_manager.begin),
-            ("rigid: predict without plants", self.rigid.predict),
-            ("touching: wake what is near", self.contact_solver.find),
-            ("detail: berries move where somebody is near", self._refine),
-            ("plants: predict without contacts", self.plants.free),
-            ("touching: solve the contacts of both", self.contact_solver.solve),
-            ("plants: move, pushed by them", self._commit),
-            ("rigid: move, pushed by them", self._finish),
-            ("guard: stop what went wrong", self._guard),
-            ("parting: let go what was pulled, bent or cut off", self._part),
-            ("holding: hands go with what they hold, and feel it", self._hold),
-            ("sleep: rest what nobody touches or reaches", self._sleep),
+            ("wind: set the air velocity at trees near actors", self._blow),
+            ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
+            ("rigid: predict velocities without plant contacts", self.rigid.predict),
+            ("contacts: wake trees near moving geoms", self.contact_solver.find),
+            ("detail: refine bunches near actors", self._refine),
+            ("plants: predict velocities without contacts", self.plants.free),
+            ("contacts: solve for plants and rigid bodies together", self.contact_solver.solve),
+            ("plants: integrate with contact wrenches", self._commit),
+            ("rigid: integrate with contact forces", self._finish),
+            ("faults: stop trees with invalid rates", self._guard),
+            ("detachment: detach what broke or was cut", self._part),
+            ("grasps: move hands with what they hold, measure forces", self._hold),
+            ("sleep: put quiet trees to sleep", self._sleep),
         )
 
     def step(self) -> None:
@@ -142,37 +142,37 @@ class Physics:
 
     def visuals(self) -> tuple[RigidVisual, ...]:
         """All rigid bodies that can be seen, with a body or without; the same object until one comes or goes."""
-        rigid, lying = self.rigid.visuals(), self.dormant_bunches.links()
-        if self._links[0] is not rigid or self._links[1] is not lying:
-            self._links = rigid, lying, rigid + lying
-        return self._links[2]
+        rigid, lying = self.rigid.visuals(), self.dormant_bunches.visuals()
+        if self._visuals[0] is not rigid or self._visuals[1] is not lying:
+            self._visuals = rigid, lying, rigid + lying
+        return self._visuals[2]
 
     def visual_q(self) -> np.ndarray:
-        """Poses [link, 7] of :meth:`links`."""
+        """Poses [visual, 7] of :meth:`visuals`."""
         rigid = self.rigid.visual_q()
-        return np.concatenate([rigid, self.dormant_bunches.link_q()]) if len(self.dormant_bunches) else rigid
+        return np.concatenate([rigid, self.dormant_bunches.visual_q()]) if len(self.dormant_bunches) else rigid
 
     # ------------------------------------------------------------------ who is here
 
     def add_robot(self, spec: RobotSpec) -> None:
-        """See :meth:`Rigid.add_robot`."""
+        """See :meth:`RigidWorld.add_robot`."""
         self.rigid.add_robot(spec)
 
     def remove_robot(self, name: str) -> None:
-        """See :meth:`Rigid.remove_robot`; its blades go with it."""
+        """See :meth:`RigidWorld.remove_robot`; its blades go with it."""
         self.rigid.remove_robot(name)
         self.detachment_monitor.blades = [blade for blade in self.detachment_monitor.blades if blade.actor != name]
 
-    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
-        """See :meth:`Rigid.add_human`; a copy touches only trees of which its own client tells."""
-        self.rigid.add_human(spec, copy=copy)
-        if copy:
+    def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
+        """See :meth:`RigidWorld.add_human`; a remote one touches only trees whose state its own client sends."""
+        self.rigid.add_human(spec, is_remote=is_remote)
+        if is_remote:
             self.contact_solver.copies.add(spec.name)
 
     def remove_human(self, name: str) -> None:
-        """See :meth:`Rigid.remove_human`; what the hands held is let go."""
+        """See :meth:`RigidWorld.remove_human`; what the hands held is let go."""
         self.rigid.remove_human(name)
-        self.grasp_manager.forget(name)
+        self.grasp_manager.remove_ties_of(name)
         self.contact_solver.copies.discard(name)
 
     def move_human(self, name: str, pose: HumanPose) -> None:
@@ -255,11 +255,11 @@ class Physics:
             self._body_q = None
 
     def _hold(self) -> None:
-        self.grasp_manager.end(self.detachments)
+        self.grasp_manager.end_step(self.detachments)
         self.detachment_monitor.held = self.grasp_manager.contacts
 
     def _sleep(self) -> None:
         if not self.parameters.sleep:
             return
-        held = self.grasp_manager.trees
+        held = self.grasp_manager.held_trees
         self.sleep_monitor.update(np.union1d(self.contact_solver.near, held) if len(held) else self.contact_solver.near)

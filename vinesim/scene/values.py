@@ -178,7 +178,7 @@ class HandSample:
     force: np.ndarray
     """[3] N with which the hand pushes or pulls the world in this tick, world axes."""
     touching: bool
-    holds: tuple[str, str] | None
+    held: tuple[str, str] | None
     """Actor and link of what it holds, named as in :class:`Contact`."""
 
 

@@ -13,7 +13,7 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.human_body import standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description import description
@@ -119,7 +119,7 @@ class Stage:
             pose = _at(one.x, one.y, one.yaw)
             rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
-            pose = appearance.posed(standing(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
+            pose = appearance.posed(standing_pose(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
         _apart(rigid)
 

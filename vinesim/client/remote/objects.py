@@ -52,8 +52,8 @@ class Things:
         if told:
             blend = np.array([PULL if number in self._told else 1.0 for number in told])
             poses = np.array([update.pose for update in inbox.things])
-            riding.pull_all(list(told), poses, np.array([update.velocity for update in inbox.things]), blend)
-            riding.unsettle(list(told))
+            riding.blend_towards(list(told), poses, np.array([update.velocity for update in inbox.things]), blend)
+            riding.set_moving(list(told))
         self._told = told
         self._hold()
         self._embody()
@@ -71,7 +71,7 @@ class Things:
         if lie:
             bunches = [unthing(fact.thing)[1] for fact in lie]
             self._changed.update(self._tree_of(bunch) for bunch in bunches)
-            self.physics.dormant_bunches.lay(bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie]))
+            self.physics.dormant_bunches.add(bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie]))
 
     def _lies_as(self, fact: Fact, holds: bool) -> bool:
         """Let a box or a bunch be where a fact says; True if it is a bunch that has no body here and needs none yet."""
@@ -84,8 +84,8 @@ class Things:
         if fact.moving:
             self._rise(number)
             pose = np.array(fact.pose)
-            self._loosen(number, *(self.physics.support_tracker.where(fact.parent, pose) or (pose, np.zeros(6))))
-            self.physics.support_tracker.unsettle([number])
+            self._loosen(number, *(self.physics.support_tracker.to_world(fact.parent, pose) or (pose, np.zeros(6))))
+            self.physics.support_tracker.set_moving([number])
             return False
         self._lie(number, fact)
         if not bodiless:
@@ -110,9 +110,9 @@ class Things:
         if len(lying) and self.physics.tick % EMBODY_TICKS == 0:
             rigid = self.physics.rigid
             actors = [rigid.base_state(name)[0][:3] for name in rigid.robots]
-            actors += [rigid.human(name).parts[0, :3] for name in rigid.humans]
+            actors += [rigid.human(name).part_poses[0, :3] for name in rigid.humans]
             bunches = lying.nearest(np.array(actors), EMBODIED)
-            lying.embody(bunches)
+            lying.activate(bunches)
             for bunch in bunches:
                 self._put([thing(Kind.BUNCH, bunch)])
 
@@ -125,7 +125,7 @@ class Things:
         """Of a bunch that hangs here still, or has no body: take it off, give it one."""
         kind, bunch = unthing(number)
         if kind == Kind.BUNCH and bunch in self.physics.dormant_bunches:
-            self.physics.dormant_bunches.embody([bunch])
+            self.physics.dormant_bunches.activate([bunch])
         elif kind == Kind.BUNCH and self.physics.state.bunch_attached[bunch]:
             self.physics.apply_remote_pick(bunch, pose, velocity)
             self._changed.add(self._tree_of(bunch))
@@ -135,7 +135,7 @@ class Things:
         moving = set(self.physics.support_tracker.moving)
         pushed = {number for number in moving & self._lies.keys() if self._bearer(number) not in self._ours}
         for name in self._ours if pushed else ():
-            pushed -= self.physics.support_tracker.reached(name)
+            pushed -= self.physics.support_tracker.objects_moved_by(name)
         for number in sorted(pushed):
             self._put([number])
         for parent, riders in self._riders.items():
@@ -172,11 +172,11 @@ class Things:
             return
         parent = self._lies[numbers[0]].parent
         relative = np.array([self._lies[number].pose for number in numbers])
-        there = riding.where(parent, relative)
+        there = riding.to_world(parent, relative)
         if there is not None:
-            riding.place_all(numbers, *there)
+            riding.set_states(numbers, *there)
             for number, pose in zip(numbers, relative, strict=True):
-                riding.settle(number, parent, pose)
+                riding.set_at_rest(number, parent, pose)
 
     def pull_tree(self, update: TreeUpdate, blend: float) -> None:
         """Move a tree towards what its owner says, and what was cut off it."""
@@ -214,7 +214,7 @@ class Things:
     def touched(self, name: str, mine: Container[int]) -> list[int]:
         """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
         riding = self.physics.support_tracker
-        found = {number for number in riding.moving if self._bearer(number) == name} | riding.reached(name)
+        found = {number for number in riding.moving if self._bearer(number) == name} | riding.objects_moved_by(name)
         for number, actor in (*riding.touched, *self.physics.touched):
             other = thing_named(actor)
             if other in mine or (actor == name and is_tree(number)):
@@ -241,7 +241,7 @@ class Things:
     def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """State of a thing, as :meth:`Exchange.send` wants it."""
         if not is_tree(number):
-            return self.physics.support_tracker.read(number)
+            return self.physics.support_tracker.object_state(number)
         here, state = self.physics.model.bodies_of(number), self.physics.state
         return state.joint_q[here], state.joint_qd[here]
 
@@ -267,7 +267,7 @@ class Things:
         """We have said that a thing of ours lies still: from now on it does, as for everybody else."""
         if fact is not None and not fact.moving and not is_tree(fact.thing):
             self._lie(fact.thing, fact)
-            self.physics.support_tracker.settle(fact.thing, fact.parent, np.array(fact.pose))
+            self.physics.support_tracker.set_at_rest(fact.thing, fact.parent, np.array(fact.pose))
 
     # ------------------------------------------------------------------ inside
 

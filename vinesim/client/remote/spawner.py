@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from vinesim.client.humans import RemotePerson, spec_of
+from vinesim.client.humans import RemoteHuman, spec_of
 from vinesim.net.codec.messages import Hello, valid_name
 from vinesim.physics.rigid.rigid_world import CompiledWorld, RigidWorld
 from vinesim.robot.description import description as descriptions
@@ -46,7 +46,7 @@ class Arrivals:
         self._expected.pop(name, None)
         self._coming.pop(name, None)
 
-    def embody(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemotePerson | None:
+    def embody(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemoteHuman | None:
         """The copy of whoever is expected, standing where ``update`` says; None as long as it is not ready.
 
         Who cannot be shown is named in the log and no more expected.
@@ -66,7 +66,7 @@ class Arrivals:
             return None  # somebody else came or went meanwhile: once more, from the next tick on
         self.forget(name)
         if description is None or not isinstance(update, RobotUpdate):
-            return RemotePerson(self.rigid, name)
+            return RemoteHuman(self.rigid, name)
         other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, here=True)
         self.rigid.place_robot(name, update.base_q, update.position)
         return other
@@ -83,7 +83,7 @@ class Arrivals:
 
     def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
         if isinstance(update, HumanUpdate):
-            return None, self.rigid.compile_with(spec_of(hello, update), copy=True)
+            return None, self.rigid.compile_with(spec_of(hello, update), is_remote=True)
         description = described(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")

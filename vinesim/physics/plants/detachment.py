@@ -14,7 +14,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import Touching
 from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.rigid.free_bunch import Loose
+from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Contact, Parting
@@ -175,7 +175,7 @@ class Partings:
         start, end = (
             local[:, :3] + frames.rotate(local[:, 3:], at[of].astype(float)) for at in (shapes.start, shapes.end)
         )
-        loose = Loose(
+        loose = FreeBunch(
             mass=float(plants.body_mass[body]), com=plants.body_com[body].astype(float),
             inertia=plants.body_inertia[body].astype(float), product=plants.body_product[body].astype(float),
             start=start, end=end, radius=shapes.radius[of].astype(float),

@@ -22,9 +22,9 @@ from vinesim.physics.contact import collision_geoms
 from vinesim.physics.contact.effective_mass import Metric
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, hand_wrenches, recompile, static_world
-from vinesim.physics.rigid.free_bunch import Loose
-from vinesim.physics.rigid.human_body import HAND, LIMBS, PARTS, Hand, HumanError, Person, rouse
-from vinesim.physics.rigid.robot_body import GIVE, Felt, RobotBody, unfit
+from vinesim.physics.rigid.free_bunch import FreeBunch
+from vinesim.physics.rigid.human_body import HAND, VISUAL_PARTS, BODY_PARTS, HandBody, HumanError, HumanBody, wake_body
+from vinesim.physics.rigid.robot_body import GIVE, LinkSensor, RobotBody, build_error
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
@@ -39,7 +39,7 @@ class CompiledWorld:
     """A world that is compiled and in which nothing has happened yet."""
 
     robots: tuple[RobotBody, ...]
-    humans: tuple[Person, ...]
+    humans: tuple[HumanBody, ...]
     bunch_slots: int
     """How many loose bunches have room in it."""
     mj_model: mujoco.MjModel
@@ -52,11 +52,11 @@ class RigidWorld:
         self.model, self.parameters = model, parameters
         self.dt = parameters.dt
         self._robots: dict[str, RobotBody] = {}
-        self._humans: dict[str, Person] = {}
-        self._free_bunches: dict[int, Loose] = {}
+        self._humans: dict[str, HumanBody] = {}
+        self._free_bunches: dict[int, FreeBunch] = {}
         self._pool_size = 0
         self._bunch_slot: dict[int, int] = {}
-        self._static_spec = static_world.furnished(model, parameters)
+        self._static_spec = static_world.build_static_world(model, parameters)
         self._compile_lock = threading.Lock()
         self.mj_model: mujoco.MjModel
         self.mj_data: mujoco.MjData
@@ -84,19 +84,19 @@ class RigidWorld:
         while not self.adopt(self.compile_with(spec)):
             pass
 
-    def compile_with(self, spec: RobotSpec | HumanSpec, *, copy: bool = False) -> CompiledWorld:
+    def compile_with(self, spec: RobotSpec | HumanSpec, *, is_remote: bool = False) -> CompiledWorld:
         """The world with one more actor in it, for :meth:`admit`. Any thread may call this while the ticks go on.
 
-        Raises :class:`RobotError` if the URDF does not compile. ``copy``: see :meth:`add_human`.
+        Raises :class:`RobotError` if the URDF does not compile. ``is_remote``: see :meth:`add_human`.
         """
         robots, people = tuple(self._robots.values()), tuple(self._humans.values())
         if isinstance(spec, HumanSpec):
-            return self._compile_world(robots, (*people, Person(spec, self._free_collision_bit("human", spec.name, HumanError), copy=copy)))
+            return self._compile_world(robots, (*people, HumanBody(spec, self._free_collision_bit("human", spec.name, HumanError), is_remote=is_remote)))
         robot = RobotBody(spec, self._free_collision_bit("robot", spec.name, RobotError))
         try:
             return self._compile_world((*robots, robot), people)
         except ValueError as error:
-            raise unfit(spec, error) from error
+            raise build_error(spec, error) from error
 
     def adopt(self, draft: CompiledWorld) -> bool:
         """Between ticks, let the actor in for whom ``draft`` was made, where its ``spec`` says.
@@ -109,12 +109,12 @@ class RigidWorld:
         others = tuple(actor for actor in those if actor is not newcomer)
         if newcomer is None or more or others != here or draft.bunch_slots <= max(self._bunch_slot.values(), default=-1):
             return False
-        if isinstance(newcomer, Person):
+        if isinstance(newcomer, HumanBody):
             self._humans[newcomer.spec.name] = newcomer
             self._replace_world(draft)
             return True
         spec = newcomer.spec
-        self._robots[spec.name] = newcomer
+        self.robot(spec.name) = newcomer
         self._replace_world(draft)
         self.place_robot(spec.name, spec.pose, spec.home)
         return True
@@ -122,7 +122,7 @@ class RigidWorld:
     def remove_robot(self, name: str) -> None:
         """Let a robot leave; all others go on exactly where they are."""
         self.robot(name)
-        del self._robots[name]
+        del self.robot(name)
         self._recompile()
 
     def place_robot(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
@@ -142,21 +142,21 @@ class RigidWorld:
 
     def actor_position(self, name: str) -> np.ndarray:
         """[3] m where a robot's base or a person's hips are."""
-        return self.human(name).parts[PARTS.index("hips"), :3] if name in self._humans else self.base_state(name)[0][:3]
+        return self.human(name).part_poses[BODY_PARTS.index("hips"), :3] if name in self._humans else self.base_state(name)[0][:3]
 
-    def human(self, name: str) -> Person:
+    def human(self, name: str) -> HumanBody:
         """The body of a person who is here."""
         try:
             return self._humans[name]
         except KeyError:
             raise HumanError(f"no human {name!r} here; there are: {', '.join(self._humans) or 'none'}") from None
 
-    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
+    def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
         """Let a person join, at ``spec.pose``; all others go on exactly where they are. Raises :class:`HumanError`.
 
-        ``copy``: another client moves the person; here the hands neither hold anything nor touch robots.
+        ``is_remote``: another client moves the person; here the hands neither hold anything nor touch robots.
         """
-        while not self.adopt(self.compile_with(spec, copy=copy)):
+        while not self.adopt(self.compile_with(spec, is_remote=is_remote)):
             pass
 
     def remove_human(self, name: str) -> None:
@@ -186,7 +186,7 @@ class RigidWorld:
         self.update_kinematics()
         pose = np.concatenate([self.mj_data.xpos[[body, hand.body]], self.mj_data.xquat[[body, hand.body]]], -1)
         pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
-        hand.grip, hand.holds = frames.compose(frames.inverse(pose[0]), pose[1]), (actor, link)
+        hand.grasp_pose, hand.held = frames.compose(frames.inverse(pose[0]), pose[1]), (actor, link)
         person.grasp(self.mj_model, self.mj_data, hand, body)
         self._update_tables()
 
@@ -194,7 +194,7 @@ class RigidWorld:
         """Let a hand hold a plant's ``body``: it meets nothing, and goes where :meth:`put_hand` says."""
         person = self.human(name)
         hand = person.hand(side)
-        hand.holds = ("plants", f"body/{body}")
+        hand.held = ("plants", f"body/{body}")
         person.grasp(self.mj_model, self.mj_data, hand, None)
         self._update_tables()
 
@@ -233,15 +233,15 @@ class RigidWorld:
         """Bunches that lie, fall or are held, in the order in which they left their vines."""
         return tuple(self._free_bunches)
 
-    def add_bunch(self, bunch: int, body: Loose, pose: np.ndarray, velocity: np.ndarray) -> None:
+    def add_bunch(self, bunch: int, body: FreeBunch, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Take a bunch over from its vine: ``pose`` [7] and ``velocity`` [6] (of its origin, angular; world axes)."""
         self.add_bunches({bunch: (body, pose, velocity)})
 
-    def add_bunches(self, bunches: dict[int, tuple[Loose, np.ndarray, np.ndarray]]) -> None:
+    def add_bunches(self, bunches: dict[int, tuple[FreeBunch, np.ndarray, np.ndarray]]) -> None:
         """Several at once, each with its pose [7] and velocity [6]: they are listed but once."""
         if known := sorted(bunches.keys() & self._free_bunches.keys()):
             raise ValueError(f"bunch {known[0]} is loose already")
-        derived = {bunch: free_bunch.alone(body) for bunch, (body, _, _) in bunches.items()}
+        derived = {bunch: free_bunch.compile_alone(body) for bunch, (body, _, _) in bunches.items()}
         free = iter(sorted(set(range(self._pool_size + len(bunches))) - set(self._bunch_slot.values())))
         for bunch, (body, _, _) in bunches.items():
             self._free_bunches[bunch], self._bunch_slot[bunch] = body, next(free)
@@ -249,7 +249,7 @@ class RigidWorld:
             self._recompile()
         else:
             for bunch, (body, _, _) in bunches.items():
-                free_bunch.embody(self.mj_model, self._bunch_slot[bunch], body, derived[bunch])
+                free_bunch.activate(self.mj_model, self._bunch_slot[bunch], body, derived[bunch])
             self._update_tables()
         for bunch, (_, pose, velocity) in bunches.items():
             self.place_bunch(bunch, pose, velocity)
@@ -261,7 +261,7 @@ class RigidWorld:
         joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(turn)])
         joint.qvel[:3] = velocity[:3]
         joint.qvel[3:] = frames.rotate(frames.conjugate(turn), np.asarray(velocity[3:], float))
-        rouse(self.mj_model, self.mj_data, self._body_of_object(f"bunch/{bunch}", "bunch"))
+        wake_body(self.mj_model, self.mj_data, self._body_of_object(f"bunch/{bunch}", "bunch"))
         self._kinematics_current = False
 
     def remove_bunch(self, bunch: int) -> None:
@@ -296,7 +296,7 @@ class RigidWorld:
         are ``exact`` [joint] swing with just this damping; the others are damped as if it were larger by dt times
         stiffness, as stiff servos should be. All stay until they are given anew.
         """
-        self.robot(name).tune(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
+        self.robot(name).set_gains(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
 
     def command_base(self, name: str, velocity: tuple[float, float, float]) -> None:
         """Ask the tracks for (vx, vy, wz) [m/s, m/s, rad/s] in the base's axes; zero holds the place."""
@@ -324,13 +324,13 @@ class RigidWorld:
 
         Force [N] and moment about the link's centre of mass [N m], world axes. They count as contacts in :meth:`read`.
         """
-        self.robot(name).bear(self.mj_data, pushes)
+        self.robot(name).set_remote_wrenches(self.mj_data, pushes)
 
     def hand_wrenches(self, name: str) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
         """What a person's hands did to robots in the last tick; see :func:`wrenches.of_hands`."""
         robots = self._robots.items()
         links = {body: (robot, link) for robot, found in robots for link, body in found.bodies.items()}
-        return hand_wrenches.of_hands(self.mj_model, self.mj_data, self.human(name), links)
+        return hand_wrenches.hand_wrenches(self.mj_model, self.mj_data, self.human(name), links)
 
     # ------------------------------------------------------------------ what they feel and where they are
 
@@ -341,7 +341,7 @@ class RigidWorld:
         ``contact`` is J^T f of the contacts with plants and with rigid things; at rest the two cancel.
         """
         robot, d = self.robot(name), self.mj_data
-        return d.qpos[robot.q], d.qvel[robot.v], robot.effort_given(d), self._contact_force[robot.v]
+        return d.qpos[robot.q], d.qvel[robot.v], robot.effort_given(d), self.contact_force[robot.v]
 
     def joint_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity of the drives alone, as :meth:`read` gives them."""
@@ -382,7 +382,7 @@ class RigidWorld:
     def add_link_sensor(self, name: str, link: str) -> None:
         """From the next tick on, measure at a link what :meth:`wrench` and :meth:`acceleration` tell."""
         self._link_body(name, link)
-        self.robot(name).felt[link] = Felt()
+        self.robot(name).link_sensors[link] = LinkSensor()
 
     def link_wrench(self, name: str, link: str) -> np.ndarray:
         """Force [N] and moment about the link's origin [N m] of the link, and all beyond it, on its parent [6].
@@ -434,10 +434,10 @@ class RigidWorld:
         pose[:, :3] = d.xpos[body]
         pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
         for person in self._humans.values():  # bit by bit: MuJoCo makes quaternions unit anew
-            pose[self._visual_row[person.part_bodies]] = person.parts
+            pose[self._visual_row[person.part_bodies]] = person.part_poses
             hands = self._visual_row[[hand.body for hand in person.hands]]
             first = hands[-1] + 1
-            pose[first : first + len(LIMBS)] = person.limbs(pose[hands])
+            pose[first : first + len(VISUAL_PARTS)] = person.limbs(pose[hands])
         return pose
 
     # ------------------------------------------------------------------ the tick, in two halves
@@ -473,7 +473,7 @@ class RigidWorld:
     def dof_names(self) -> list[tuple[str, int]]:
         """[dof] joint (or loose bunch) and number in it: they outlive a compilation, their places do not."""
         m = self.mj_model
-        bunch_in = {free_bunch.name_of(slot): f"bunch/{bunch}" for bunch, slot in self._bunch_slot.items()}
+        bunch_in = {free_bunch.slot_name(slot): f"bunch/{bunch}" for bunch, slot in self._bunch_slot.items()}
         names = [m.joint(i).name for i in range(m.njnt)]
         of = [bunch_in.get(name, name) for name in names]
         return [(of[i], int(v - m.jnt_dofadr[i])) for v, i in enumerate(m.dof_jntid.tolist())]
@@ -501,22 +501,22 @@ class RigidWorld:
         if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
             self._roll_back()
             force = None
-        self._contact_force[:] = 0.0 if force is None else force
+        self.contact_force[:] = 0.0 if force is None else force
         if d.ncon:
             native = np.where(d.efc_type >= _CONTACT, d.efc_force, 0.0)
             out = np.zeros(m.nv)
             mujoco.mj_mulJacTVec(m, d, out, native)
-            self._contact_force += out
+            self.contact_force += out
         for robot in self._robots.values():
-            if robot.afar:
-                self._contact_force += robot.effort_from_afar(m, d)
+            if robot.remote_wrenches:
+                self.contact_force += robot.effort_from_afar(m, d)
         for person in self._humans.values():
             person.feel(d)
         self._kinematics_current = False
 
     def rebind(self, world: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Let the robots live in another world, in which their joints and bodies have the same names."""
-        self.mj_model, self.mj_data, self._contact_force, self._kinematics_current = world, data, np.zeros(world.nv), False
+        self.mj_model, self.mj_data, self.contact_force, self._kinematics_current = world, data, np.zeros(world.nv), False
         for robot in self._robots.values():
             robot.locate(world)
 
@@ -547,14 +547,14 @@ class RigidWorld:
         kind, _, number = actor.partition("/")
         if actor == "world":
             return 0
-        return self.mj_model.body(free_bunch.name_of(self._bunch_slot[int(number)]) if kind == "bunch" else actor).id
+        return self.mj_model.body(free_bunch.slot_name(self._bunch_slot[int(number)]) if kind == "bunch" else actor).id
 
     def _bunch_joint(self, bunch: int) -> Any:  # MuJoCo does not name its views
-        return self.mj_data.joint(free_bunch.name_of(self._bunch_slot[bunch]))
+        return self.mj_data.joint(free_bunch.slot_name(self._bunch_slot[bunch]))
 
     def robot(self, name: str) -> RobotBody:
         try:
-            return self._robots[name]
+            return self.robot(name)
         except KeyError:
             raise ValueError(f"no robot {name!r} here; there are: {', '.join(self._robots) or 'none'}") from None
 
@@ -565,20 +565,20 @@ class RigidWorld:
         except KeyError:
             raise ValueError(f"robot {name!r} has no link {link!r}; it has: {', '.join(robot.bodies)}") from None
 
-    def _link_sensor(self, name: str, link: str) -> Felt:
+    def _link_sensor(self, name: str, link: str) -> LinkSensor:
         try:
-            return self.robot(name).felt[link]
+            return self.robot(name).link_sensors[link]
         except KeyError:
             raise ValueError(f"nothing is measured at {link!r} of robot {name!r}; instrument() it first") from None
 
     def _measure(self) -> None:
         """Keep what links felt in the tick that ends, while MuJoCo's places are still those of its start."""
         m, d = self.mj_model, self.mj_data
-        if not any(robot.felt for robot in self._robots.values()):
+        if not any(robot.link_sensors for robot in self._robots.values()):
             return
         mujoco.mj_rnePostConstraint(m, d)
         for robot in self._robots.values():
-            for link, felt in robot.felt.items():
+            for link, felt in robot.link_sensors.items():
                 felt.feel(m, d, robot.bodies[link])
 
     def _roll_back(self) -> None:
@@ -593,7 +593,7 @@ class RigidWorld:
         sound = np.where(np.isfinite(self._valid_qpos), self._valid_qpos, m.qpos0)
         d.qpos[bad[tree]] = sound[bad[tree]]
         dofs = bad[m.dof_treeid]
-        for name in recompile.OF_DOFS:
+        for name in recompile.DOF_ARRAYS:
             getattr(d, name)[dofs] = 0.0
         for name, robot in self._robots.items():
             if bad[m.dof_treeid[robot.base_v[0]]]:
@@ -605,9 +605,9 @@ class RigidWorld:
 
     # ------------------------------------------------------------------ building the world
 
-    def _compile_world(self, robots: tuple[RobotBody, ...], people: tuple[Person, ...]) -> CompiledWorld:
+    def _compile_world(self, robots: tuple[RobotBody, ...], people: tuple[HumanBody, ...]) -> CompiledWorld:
         """A world with these in it and room for loose bunches, compiled; nothing here changes."""
-        slots = max(self._bunch_slot.values(), default=-1) + 1 + free_bunch.WAITING
+        slots = max(self._bunch_slot.values(), default=-1) + 1 + free_bunch.POOL_SIZE
         with self._compile_lock:
             spec = self._static_spec.copy()
             for robot in robots:
@@ -615,12 +615,12 @@ class RigidWorld:
             for person in people:
                 person.attach(spec, sum(1 << robot.bit for robot in robots))
             for slot in range(slots):
-                free_bunch.wait(spec, slot)
-            world = recompile.compiled(spec)
+                free_bunch.add_slot(spec, slot)
+            world = recompile.compile_without_contacts(spec)
         # the solver's tolerance is relative to it: whoever joins would change when it stops for everybody else
         world.stat.meaninertia = 1.0
         for slot in range(slots):
-            free_bunch.untouch(world, slot)
+            free_bunch.disable_collision(world, slot)
         return CompiledWorld(robots, people, slots, world)
 
     def _recompile(self) -> None:
@@ -629,16 +629,16 @@ class RigidWorld:
 
     def _replace_world(self, draft: CompiledWorld) -> None:
         """Go on in another world, every joint's and body's state carried over by its name."""
-        before = (self.mj_model, self.mj_data, self._contact_force) if self.generation else None
+        before = (self.mj_model, self.mj_data, self.contact_force) if self.generation else None
         self.mj_model, self._pool_size = draft.mj_model, draft.bunch_slots
         world = self.mj_model
         for bunch, body in self._free_bunches.items():
-            free_bunch.embody(world, self._bunch_slot[bunch], body, free_bunch.alone(body))
+            free_bunch.activate(world, self._bunch_slot[bunch], body, free_bunch.compile_alone(body))
         if before is None:
-            self.mj_data, self._contact_force = mujoco.MjData(world), np.zeros(world.nv)
+            self.mj_data, self.contact_force = mujoco.MjData(world), np.zeros(world.nv)
         else:
-            parked = {free_bunch.name_of(slot) for slot in set(range(self._pool_size)) - set(self._bunch_slot.values())}
-            self.mj_data, self._contact_force = recompile.carried(*before, world, parked)
+            parked = {free_bunch.slot_name(slot) for slot in set(range(self._pool_size)) - set(self._bunch_slot.values())}
+            self.mj_data, self.contact_force = recompile.transfer_state(*before, world, parked)
         self._effective_mass = Metric(world)
         self._valid_qpos = self.mj_data.qpos.copy()
         self._kinematics_current = False
@@ -653,12 +653,12 @@ class RigidWorld:
             self.static_geoms = collision_geoms.standing(world)
         self._update_tables()
 
-    def _regrasp(self, person: Person, hand: Hand) -> None:
+    def _regrasp(self, person: HumanBody, hand: HandBody) -> None:
         """In a world compiled anew: hold on to what was held, if it is still there."""
-        if hand.holds is None:
+        if hand.held is None:
             return
         try:
-            body = None if hand.rides else self._body_of_object(*hand.holds)
+            body = None if hand.on_plant else self._body_of_object(*hand.held)
         except (KeyError, ValueError):
             person.release(self.mj_model, self.mj_data, hand)
         else:
@@ -686,8 +686,8 @@ class RigidWorld:
                     bodies.append(robot.bodies[link])
         for name, person in self._humans.items():
             drawn = appearance.person(person.spec.height).parts
-            mine = [(part, person.bodies[part]) for part in (*PARTS, *(hand.link for hand in person.hands))]
-            for part, body in (*mine, *((limb, 0) for limb in LIMBS)):  # limbs have no body: link_q() places them
+            mine = [(part, person.bodies[part]) for part in (*BODY_PARTS, *(hand.link for hand in person.hands))]
+            for part, body in (*mine, *((limb, 0) for limb in VISUAL_PARTS)):  # limbs have no body: link_q() places them
                 links.append(RigidVisual(f"{name}/{part}", Organ.HUMAN, person.spec.index, drawn[part]))
                 bodies.append(body)
         for bunch, body in self._free_bunches.items():
@@ -703,5 +703,5 @@ class RigidWorld:
             owner.update({body: (name, link) for link, body in robot.bodies.items()})
         for name, person in self._humans.items():
             owner.update({body: (name, link) for link, body in person.bodies.items()})
-        owner.update({m.body(free_bunch.name_of(slot)).id: (f"bunch/{i}", "bunch") for i, slot in self._bunch_slot.items()})
+        owner.update({m.body(free_bunch.slot_name(slot)).id: (f"bunch/{i}", "bunch") for i, slot in self._bunch_slot.items()})
         return owner
