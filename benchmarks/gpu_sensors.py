@@ -25,7 +25,7 @@ from vinesim.kernels.raster import ray_cast
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import REACH, Camera, CameraSpec, pinhole
 from vinesim.sensors.export.images import looking
@@ -52,7 +52,7 @@ def things() -> RigidVisual:
 def world(model: Model, device: str) -> tuple[Primitives, Snapshot]:
     """The vineyard with some solids in it."""
     primitives = Primitives(model, device=device)
-    view = still_view(model, (things(),), np.array([[1.6, 0.6, 1.2, *frames.yaw(0.5)]]))
+    view = still_view(model, (things(),), np.array([[1.6, 0.6, 1.2, *frames.from_yaw(0.5)]]))
     primitives.update(view)
     return primitives, view
 
@@ -205,7 +205,7 @@ def main() -> None:
     ask.add_argument("--device", default="cuda")
     ask.add_argument("--scene", default="vsp")
     given = ask.parse_args()
-    say, model = Report(given.device), generate(load(given.scene))
+    say, model = Report(given.device), generate(load_scene(given.scene))
     compare(say, model, given.device)
     measure(say, model, given.device)
 

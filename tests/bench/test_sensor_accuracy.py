@@ -8,7 +8,7 @@ import pytest
 from vinesim.bench import sensor_accuracy
 from vinesim.bench.sensor_accuracy import Depths, formula, plane, ranges
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.sensors.camera.camera import CameraSpec
 from vinesim.sensors.scene.primitives import Primitives, still_view
 
@@ -33,14 +33,14 @@ def test_depths_are_told_only_of_enough_pixels() -> None:
 
 
 def test_a_real_lidar_loses_some_returns_and_mixes_some() -> None:
-    scan = ranges("vlp16", Primitives(generate(load("demo"))))
+    scan = ranges("vlp16", Primitives(generate(load_scene("demo"))))
     assert 0.7 < scan.returned < 1.2
     assert 0.02 < scan.mixed < 0.5
     assert len(scan.real) == pytest.approx(scan.returned * len(scan.exact))
 
 
 def test_renderers_see_what_rays_meet(tmp_path) -> None:
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     pictures = sensor_accuracy.backends(CameraSpec.load("d435"), model, still_view(model))
     assert {"warp", "rays"} <= pictures.keys()
     cast = pictures["rays"]

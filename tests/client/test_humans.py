@@ -11,7 +11,7 @@ from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.avatar.scripted_human import Legs, ScriptedHuman
-from vinesim.cli.human_client import before
+from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
 from vinesim.client.tasks.start_poses import bunch_centres, bunch_in_reach, start_pose
 from vinesim.net.codec import human as poses
@@ -21,7 +21,7 @@ from vinesim.robot.description.description import Description, load
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.values import HumanPose
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import looking
@@ -31,7 +31,7 @@ from vinesim.sensors.scene.primitives import Primitives
 DT = 0.01
 FOREARM = np.array([0.2, 0.36, 0.885])
 """A point of the vinebot's left forearm, when it stands at the origin with its arms at home."""
-SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.yaw(-0.5 * np.pi))
+SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.from_yaw(-0.5 * np.pi))
 """Beside that arm, facing it."""
 
 
@@ -81,19 +81,19 @@ def test_people_and_robots_meet_and_part(vinebot):
     eva = world.join("eva", None, frames.pose(np.array([3.0, 0.0, 0.0])), height=1.6)
     ida = world.join("ida", None, frames.pose(np.array([0.0, 3.0, 0.0])), height=1.9)
     world.run(0.8)
-    assert set(anna.others) == {"eva", "ida"}
-    assert set(eva.others) == {"anna", "ida"}
-    assert set(ida.others) == {"anna", "eva"}
+    assert set(anna.remote_actors) == {"eva", "ida"}
+    assert set(eva.remote_actors) == {"anna", "ida"}
+    assert set(ida.remote_actors) == {"anna", "eva"}
     for client in world.clients:
         assert len(client.physics.rigid.humans) == 2
         assert client.physics.rigid.human("eva").spec.height == pytest.approx(1.6)
         assert client.physics.rigid.human("ida").spec.height == pytest.approx(1.9)
     for name in ("eva", "ida"):
         np.testing.assert_allclose(parts_of(anna, name), parts_of(world.clients[1 + (name == "ida")], name), atol=2e-3)
-    ida.exchange.bus.close()
+    ida.replicator.bus.close()
     world.clients.remove(ida)
     world.run(0.2)
-    assert set(anna.others) == {"eva"}
+    assert set(anna.remote_actors) == {"eva"}
     assert anna.physics.rigid.humans == ("eva",)
 
 
@@ -162,7 +162,7 @@ def test_fingers_are_seen():
     world.join("eva", None, SIDE, lambda _: pose)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(0.5)
-    heard = ida.exchange.receive(world.now).people["eva"].pose
+    heard = ida.replicator.receive(world.now).people["eva"].pose
     assert heard.right_fingers == pytest.approx((0.2, 0.0, 1.0, 1.0, 1.0), abs=1 / 255)
 
 
@@ -185,8 +185,8 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     """F59, F62: points with the label of each lie where it is on its own client."""
     world = World()
     anna = world.join("anna", vinebot, frames.pose(np.zeros(3)))
-    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.yaw(2.0)))
-    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.yaw(1.0)))
+    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.from_yaw(2.0)))
+    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.from_yaw(1.0)))
     world.run(0.8)
     view = anna.physics.snapshot()
     primitives = Primitives(world.model, grass=0.0)
@@ -259,7 +259,7 @@ class Shove:
         return sum((wrench[:3] for wrench in borne), np.zeros(3))
 
     def forces_said(self) -> int:
-        return self.human.exchange.counters.force.bytes_out
+        return self.human.replicator.counters.force.bytes_out
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.02, 0.05, 0.1])
@@ -355,7 +355,7 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     bunch = bunch_in_reach(world.model, stand)
     body = int(world.model.bunch_body[bunch])
     centre = bunch_centres(world.model)[bunch]
-    walker = ScriptedHuman(frames.pose(np.array([*before(centre, stand), 0.0]), stand[3:]))
+    walker = ScriptedHuman(frames.pose(np.array([*standing_place(centre, stand), 0.0]), stand[3:]))
     eva = world.join("eva", None, walker.root, walker)
     aside = frames.compose(stand, frames.pose(np.array([-1.5, 1.0, 0.0])))
     anna = world.join("anna", vinebot, aside)
@@ -377,7 +377,7 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     here, there = (pose[:3] + frames.rotate(pose[3:], middle) for pose in poses_now)
     assert np.linalg.norm(here - centre) > 0.05
     assert np.linalg.norm(there - here) < 0.02
-    assert anna.exchange.owner(int(world.model.body_tree[body])) == "eva"
+    assert anna.replicator.owner(int(world.model.body_tree[body])) == "eva"
     assert anna.physics.hand("eva", "right").held is None
     np.testing.assert_allclose(
         anna.physics.hand("eva", "right").pose[:3], eva.physics.hand("eva", "right").pose[:3], atol=0.01

@@ -11,11 +11,11 @@ import pytest
 from vinesim import frames
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import Box, Scene, load, reseeded
+from vinesim.scene.spec import Box, Scene, load_scene, with_seed
 
 
 def harvest(seed: int, **changes) -> Scene:
-    return msgspec.structs.replace(reseeded(load("harvest"), seed), **changes)
+    return msgspec.structs.replace(with_seed(load_scene("harvest"), seed), **changes)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -34,7 +34,7 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
         for a, b in itertools.pairwise(points[:-1]):
             line = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
             assert start_poses.free_room(model, line).min() > pick_planning.ROOM - pick_planning.GRID
-        end = frames.pose(np.append(points[-1], 0.0), frames.yaw(task.heading))
+        end = frames.pose(np.append(points[-1], 0.0), frames.from_yaw(task.heading))
         box = frames.compose(frames.inverse(end), model.box_pose[task.box].astype(float))[:3]
         gap = abs(box[1]) - 0.5 * float(model.box_size[task.box, 1]) - pick_planning.WIDTH
         assert gap == pytest.approx(pick_planning.GAP, abs=1e-6)
@@ -65,7 +65,7 @@ def test_boxes_without_room_are_told():
 
 def test_a_box_is_an_obstacle_as_large_as_it_is():
     model = generate(harvest(7, boxes=(Box(x=3.75, y=1.2, yaw=0.5),)))
-    corner = np.array([3.75, 1.2]) + frames.rotate(frames.yaw(0.5), np.array([0.3, 0.2, 0.0]))[:2]
-    away = frames.rotate(frames.yaw(0.5), np.array([0.3, 0.4, 0.0]))[:2]
+    corner = np.array([3.75, 1.2]) + frames.rotate(frames.from_yaw(0.5), np.array([0.3, 0.2, 0.0]))[:2]
+    away = frames.rotate(frames.from_yaw(0.5), np.array([0.3, 0.4, 0.0]))[:2]
     assert start_poses.free_room(model, (corner + away)[None])[0] == pytest.approx(0.5, abs=1e-6)
     assert start_poses.free_room(model, corner[None], without=0)[0] > 1.0

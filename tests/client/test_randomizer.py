@@ -43,7 +43,7 @@ def test_wind_sways_the_plants() -> None:
         assert happens is not None
         view, _, told = happens
         hanging = np.ones(len(rest), bool)
-        hanging[model.bunch_of() >= 0] = False
+        hanging[model.bunch_of_body() >= 0] = False
         moved["wind" in told].append(np.linalg.norm(view.body_q[:, :3] - rest, axis=1)[hanging].max())
     assert max(moved[False]) < 0.02
     assert max(moved[True]) > 0.02

@@ -6,12 +6,12 @@ import pytest
 from vinesim import frames
 from vinesim.client.tasks import start_poses
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load, reseeded
+from vinesim.scene.spec import load_scene, with_seed
 
 
 @pytest.mark.parametrize("seed", [0, 6, 11, 14, 29])
 def test_before_some_bunch_a_robot_finds_room(seed):
-    scene = reseeded(load("demo"), seed)
+    scene = with_seed(load_scene("demo"), seed)
     model = generate(scene)
     bunch, pose = start_poses.stand_before_a_bunch(model, start_poses.spawn_pose(scene, 0)[:2])
     local = frames.rotate(frames.conjugate(pose[3:]), start_poses.bunch_centres(model)[bunch] - pose[:3])
@@ -27,13 +27,13 @@ def test_before_some_bunch_a_robot_finds_room(seed):
 
 
 def test_vsp_bunches_hang_too_low_and_that_is_said():
-    scene = load("vsp")
+    scene = load_scene("vsp")
     with pytest.raises(start_poses.NoPlace, match="no bunch of this vineyard can be pushed"):
         start_poses.stand_before_a_bunch(generate(scene), np.zeros(2))
 
 
 def test_a_start_place_moves_back_along_its_heading():
-    scene = load("demo")
+    scene = load_scene("demo")
     pose, behind = start_poses.spawn_pose(scene, 0), start_poses.spawn_pose(scene, 0, 3.0)
     local = frames.rotate(frames.conjugate(pose[3:]), behind[:3] - pose[:3])
     assert local == pytest.approx([-3.0, 0.0, 0.0], abs=1e-9)
@@ -41,4 +41,4 @@ def test_a_start_place_moves_back_along_its_heading():
 
 def test_a_place_the_scene_does_not_have_is_named_with_those_it_has():
     with pytest.raises(start_poses.NoPlace, match=r"no start place 9; it has: 0 left, 1 right"):
-        start_poses.spawn_pose(load("demo"), 9)
+        start_poses.spawn_pose(load_scene("demo"), 9)

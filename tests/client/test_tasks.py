@@ -18,11 +18,11 @@ from vinesim.robot.tasks.task import Script
 from vinesim.ros.commands.types import Command, JointPositions, JointTrajectory
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 
 def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Script]:
-    scene = load("harvest")
+    scene = load_scene("harvest")
     model = generate(scene)
     begin, start = plan_job(job, model, start_poses.spawn_pose(scene, spawn))
     now = iter(range(1_000_000))
@@ -31,7 +31,7 @@ def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Script]:
         clock=lambda: 0.01 * next(now),
     )  # fmt: skip
     script = begin(client.physics, client.robot)
-    client.jobs += [script.control, LookAt(client.robot, script.focus)]
+    client.pre_step += [script.control, LookAt(client.robot, script.focus)]
     return client, script
 
 
@@ -57,7 +57,7 @@ def test_a_client_exchanges():
 
 
 def test_an_unknown_job_is_told():
-    scene = load("harvest")
+    scene = load_scene("harvest")
     with pytest.raises(UnknownJob, match="no job 'dance'; give pick or exchange"):
         plan_job("dance", generate(scene), start_poses.spawn_pose(scene, 0))
 

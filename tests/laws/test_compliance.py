@@ -95,7 +95,7 @@ class Stand:
                 there.append(pose[:3] + frames.rotate(pose[3:], centre))
             columns.append((there[1] - there[0]) / (2.0 * step))
         base = self.rigid.base_state("anna")[0]
-        return frames.matrix(base[3:])[:3, :3] @ np.array(columns).T
+        return frames.to_matrix(base[3:])[:3, :3] @ np.array(columns).T
 
 
 def weight_beyond(stand: Stand, joint: str) -> float:

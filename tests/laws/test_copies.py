@@ -29,7 +29,7 @@ BEYOND = 0.08
 def ram(name: str, effort: float) -> RobotSpec:
     """A head of 20 cm that is pushed along x with at most ``effort`` [N]; *right* comes from the other side."""
     left = name == "left"
-    pose = frames.pose([-0.6, 0.0, 1.0]) if left else frames.pose([0.6, 0.0, 1.0], frames.yaw(np.pi))
+    pose = frames.pose([-0.6, 0.0, 1.0]) if left else frames.pose([0.6, 0.0, 1.0], frames.from_yaw(np.pi))
     drives = (Drive("push", STIFFNESS, DAMPING, effort, 1.0, -1.0, 1.0),)
     return RobotSpec(name, 0 if left else 1, RAM, "base_footprint", pose, drives, np.array([-0.05]), (1e5, 1e5))
 

@@ -21,7 +21,7 @@ from vinesim.net.transport.bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.robot.description.description import load as load_robot
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 
 def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
@@ -80,7 +80,7 @@ def _fields(value: object) -> dict:
 
 def test_a_client_with_its_physics_lives_through_a_storm():
     """What passes every check may still be nonsense: trees turned inside out, boxes in the sky. Nothing infinite."""
-    scene = load("demo")
+    scene = load_scene("demo")
     model = generate(scene)
     hub = MemoryHub()
     now = [10.0]
@@ -98,7 +98,7 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     for _ in range(60):
         tick()
         evil.tick(now[0])
-    assert EVIL in client.exchange.actors
+    assert EVIL in client.replicator.actors
     wild = storm(model, evil, 3, now[0])
     publishers: dict = {}
     for _ in range(60):
@@ -113,8 +113,8 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     assert np.isfinite(state.joint_qd).all()
     base, _ = client.physics.rigid.base_state("ada")
     assert np.linalg.norm(base[:3] - pose[:3]) < 0.5
-    assert client.exchange.counters.malformed > 100
-    assert client.exchange.actors == {}
+    assert client.replicator.counters.malformed > 100
+    assert client.replicator.actors == {}
 
 
 def test_real_sessions_and_the_server_live_through_a_storm():

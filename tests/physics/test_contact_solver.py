@@ -1,4 +1,4 @@
-"""Touching: closest points, waking, the same tick, books that balance, room that runs out in words."""
+"""Contact solver: closest points, waking, the same tick, books that balance, room that runs out in words."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from vinesim import frames
 from vinesim.kernels.contact import solver
-from vinesim.physics.contact.contact_solver import Touching, shapes_of
+from vinesim.physics.contact.contact_solver import ContactSolver, plant_capsules
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
@@ -205,7 +205,7 @@ def test_segment_along_a_face_touches_in_its_middle():
 
 def test_spheres_of_a_bunch_fill_its_spheroid_and_no_more():
     model, body, _ = bunch_scene()
-    shapes = shapes_of(model)
+    shapes = plant_capsules(model)
     of = (shapes.bunch == 0) & (model.body_organ[shapes.body] == Organ.BUNCH)
     assert (shapes.body[of] == body).all()
     assert (np.diff(shapes.body) >= 0).all()
@@ -274,7 +274,7 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
     physics = Physics(assemble([tree], **box))
     for _ in range(50):
         physics.step()
-    physics.plants.rest(physics.plants.awake)
+    physics.plants.put_to_sleep(physics.plants.awake)
     for _ in range(20):
         physics.step()
     assert len(physics.plants.awake) == 0
@@ -289,9 +289,14 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
 def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     model, _, middle = bunch_scene()
     physics = Physics(model)
-    physics.contact_solver = Touching(model, physics.plants, physics.rigid, capacity=2)
+    physics.contact_solver = ContactSolver(model, physics.plants, physics.rigid, capacity=2)
     physics.add_robot(gripper(middle))
-    stages = (physics.rigid.predict, physics.contact_solver.find, physics.plants.free, physics.contact_solver.solve)
+    stages = (
+        physics.rigid.predict,
+        physics.contact_solver.wake_near_trees,
+        physics.plants.predict,
+        physics.contact_solver.solve,
+    )
     for tick in range(250):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         for stage in stages:
@@ -299,9 +304,9 @@ def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
         physics._commit()
         physics._finish()
         assert physics.contact_solver.count <= 2
-    assert physics.contact_solver.dropped > 0
-    assert "left out" in physics.contact_solver.complaint
-    assert "capacity" in physics.contact_solver.complaint
+    assert physics.contact_solver.dropped_contacts > 0
+    assert "left out" in physics.contact_solver.overflow_message
+    assert "capacity" in physics.contact_solver.overflow_message
     assert len(physics.contacts) == 2
 
 
@@ -383,7 +388,7 @@ def test_views_own_what_they_show_and_share_it_while_all_sleep():
     kept = second.body_q.copy()
     assert second.moved_trees.tolist() == [0]
     assert (second.body_q != first.body_q).any()
-    np.testing.assert_allclose(second.body_q, model.forward(physics.state.joint_q), atol=1e-5)
+    np.testing.assert_allclose(second.body_q, model.forward_kinematics(physics.state.joint_q), atol=1e-5)
     physics.step()
     physics.snapshot()
     assert (second.body_q == kept).all()
@@ -424,7 +429,7 @@ def test_a_tree_that_a_robot_reaches_into_stays_awake():
     physics.add_robot(bar((0.7, -0.034, 0.95), stiffness=1000.0, damping=100.0))
     for _ in range(400):
         physics.step()
-    assert physics.contact_solver.near.tolist() == [0]
+    assert physics.contact_solver.near_trees.tolist() == [0]
     assert physics.plants.awake.tolist() == [0]
 
 
@@ -433,7 +438,7 @@ def test_a_copy_touches_only_trees_of_which_its_owner_tells():
     reached = int(physics.model.tree_first[20])
     at = physics.state.body_q[reached + 5, :3].copy()
     physics.add_robot(bar(at, "ghost"))
-    physics.contact_solver.copies.add("ghost")
+    physics.contact_solver.remote_actors.add("ghost")
     asleep = physics.state.joint_q.copy()
     for _ in range(5):
         physics.step()
@@ -441,7 +446,7 @@ def test_a_copy_touches_only_trees_of_which_its_owner_tells():
     assert len(physics.plants.awake) == 0
     assert np.array_equal(physics.state.joint_q, asleep)
 
-    physics.contact_solver.told[20] = True
+    physics.contact_solver.remote_trees[20] = True
     physics.step()
     assert {tree for tree, _ in physics.touched} == {20}
 
@@ -462,7 +467,7 @@ def test_what_stands_neither_wakes_a_tree_nor_keeps_it_awake():
     for _ in range(60):
         physics.step()
     assert len(physics.plants.awake) == 0
-    assert physics.contact_solver.near.tolist() == []
+    assert physics.contact_solver.near_trees.tolist() == []
 
 
 def test_a_swinging_cane_stops_at_a_pole():
@@ -485,15 +490,15 @@ def test_a_swinging_cane_stops_at_a_pole():
 
 def clustered() -> Model:
     """A cane with a bunch of two clusters at its tip."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, 1.0])))
-    last = tree.rod(-1, 0.4, (0.006, 0.006), Wood(5e9, 800.0, 0.02), 4)[-1]
-    down = frames.aligned(np.array([0.0, 0.0, -1.0]))
-    bunch = tree.add(
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 1.0])))
+    last = tree.add_rod(-1, 0.4, (0.006, 0.006), RodMaterial(5e9, 800.0, 0.02), 4)[-1]
+    down = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
+    bunch = tree.add_body(
         last, offset=(0.1, 0, 0), rest=down, organ=int(Organ.BUNCH), mass=0.3, com=(0.08, 0, 0), length=0.16,
         radius=(0.04, 0.04), inertia=(3e-4, 8e-4, 8e-4), stiffness=np.full(3, 0.3), damping=np.full(3, 0.02),
     )  # fmt: skip
     parts = [
-        tree.add(
+        tree.add_body(
             bunch, offset=(0.02 + 0.07 * i, 0, 0), organ=int(Organ.BUNCH), mass=0.14, com=(0.035, 0, 0), length=0.07,
             radius=(0.03, 0.03), inertia=(1e-4, 1e-4, 1e-4), stiffness=np.full(3, 0.1), damping=np.full(3, 0.01),
         )
@@ -512,10 +517,10 @@ def clustered() -> Model:
 
 def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fine():
     model = clustered()
-    shapes, bunch = shapes_of(model), int(model.bunch_body[0])
-    assert (shapes.bunch == 0).sum() == (shapes.when > 0).sum()
-    assert set(shapes.body[shapes.when == 1]) == {bunch}
-    assert set(shapes.body[shapes.when == 2]) == {bunch + 1, bunch + 2}
+    shapes, bunch = plant_capsules(model), int(model.bunch_body[0])
+    assert (shapes.bunch == 0).sum() == (shapes.level > 0).sum()
+    assert set(shapes.body[shapes.level == 1]) == {bunch}
+    assert set(shapes.body[shapes.level == 2]) == {bunch + 1, bunch + 2}
     assert (np.diff(shapes.body) >= 0).all()
     met = {}
     for fine in (False, True):
@@ -526,7 +531,12 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         physics.add_robot(bar(at, damping=200.0))
         physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
         seen = set()
-        stages = (physics.rigid.predict, physics.contact_solver.find, physics.plants.free, physics.contact_solver.solve)
+        stages = (
+            physics.rigid.predict,
+            physics.contact_solver.wake_near_trees,
+            physics.plants.predict,
+            physics.contact_solver.solve,
+        )
         for _ in range(40):
             for stage in stages:
                 stage()
@@ -556,7 +566,7 @@ def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
     ]  # fmt: skip
     physics = Physics(assemble(trees), detachment=False)
     if options:
-        Touching.__init__(physics.contact_solver, physics.model, physics.plants, physics.rigid, **options)
+        ContactSolver.__init__(physics.contact_solver, physics.model, physics.plants, physics.rigid, **options)
     physics.add_robot(bar((rng.uniform(0.3, 0.9), -0.2, 1.0), damping=float(rng.choice([0.0, 300.0]))))
     physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
     speed = rng.uniform(0.3, 3.0)
@@ -590,7 +600,7 @@ def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed)
         for name in robots:
             base = rigid.robot(name).base_v[:2]
             on_robot = sum((c.force for c in outside if c.actor == name), np.zeros(3))
-            np.testing.assert_allclose(touching.force[base], on_robot[:2], atol=1e-9)
+            np.testing.assert_allclose(touching.rigid_force[base], on_robot[:2], atol=1e-9)
     assume(pressed > 0)
     assert np.isfinite(physics.state.joint_qd).all()
 
@@ -598,17 +608,17 @@ def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed)
 def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axis: np.ndarray) -> np.ndarray:
     """Least distance [tree] of the shapes of each tree and a capsule on a robot's link, from many points of both."""
     touching, model = physics.contact_solver, physics.model
-    body_q = model.forward(physics.state.joint_q)[touching.shapes.body]
+    body_q = model.forward_kinematics(physics.state.joint_q)[touching.capsules.body]
     t = np.linspace(0.0, 1.0, 9)[:, None, None]
-    along = touching.shapes.start + t * (touching.shapes.end - touching.shapes.start)
+    along = touching.capsules.start + t * (touching.capsules.end - touching.capsules.start)
     points = body_q[:, :3] + frames.rotate(body_q[:, 3:], along.astype(float))
     pose = physics.rigid.link_pose(name, link)
     turn = frames.rotate(pose[3:], axis)
     apart = points - pose[:3]
     apart -= np.clip(apart @ turn, -half, half)[..., None] * turn
-    gap = (np.linalg.norm(apart, axis=-1) - touching.shapes.radius - radius).min(0)
+    gap = (np.linalg.norm(apart, axis=-1) - touching.capsules.radius - radius).min(0)
     least = np.full(len(model.tree_first), np.inf)
-    np.minimum.at(least, model.body_tree[touching.shapes.body], gap)
+    np.minimum.at(least, model.body_tree[touching.capsules.body], gap)
     return least
 
 
@@ -643,14 +653,28 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
 
     def run() -> tuple:
         physics = Physics(model)
-        Touching.__init__(physics.contact_solver, model, physics.plants, physics.rigid, capacity=100, branches=False)
+        ContactSolver.__init__(
+            physics.contact_solver, model, physics.plants, physics.rigid, capacity=100, plant_plant_contacts=False
+        )
         for i in range(15):
             physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
         physics.plants.wake(np.arange(460))
-        for stage in (physics.rigid.predict, physics.contact_solver.find, physics.plants.free, physics.contact_solver.solve):
+        for stage in (
+            physics.rigid.predict,
+            physics.contact_solver.wake_near_trees,
+            physics.plants.predict,
+            physics.contact_solver.solve,
+        ):
             stage()
         t = physics.contact_solver
-        return t.count, t.dropped, t.complaint, t._gap[:100].copy(), t.bodies.tobytes() + t.wrenches.tobytes(), t
+        return (
+            t.count,
+            t.dropped_contacts,
+            t.overflow_message,
+            t._gap[:100].copy(),
+            t.bodies.tobytes() + t.wrenches.tobytes(),
+            t,
+        )
 
     count, dropped, complaint, gap, result, touching = run()
     assert count == 100

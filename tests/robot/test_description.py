@@ -137,7 +137,7 @@ def test_moving_joints_agree_with_yourdfpy(vinebot: Description, parsed: yourdfp
     for link in ("gripper_left_left_finger_link", "head_front_camera_depth_optical_frame", "arm_right_5_link"):
         expected = oracle.get_transform(link, "base_footprint")
         np.testing.assert_allclose(poses[link][:3], expected[:3, 3], atol=1e-9)
-        np.testing.assert_allclose(frames.matrix(poses[link][3:]), expected[:3, :3], atol=1e-9)
+        np.testing.assert_allclose(frames.to_matrix(poses[link][3:]), expected[:3, :3], atol=1e-9)
 
 
 def test_camera_looks_ahead(vinebot: Description) -> None:

@@ -209,7 +209,7 @@ def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard)
 
 def test_samples_agree_with_the_rigid_world(vinebot: Description) -> None:
     """Oracle: MuJoCo's kinematics of every moving link; odometry: the way since the start."""
-    start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
+    start = frames.pose([3.0, -2.0, 0.0], frames.from_yaw(2.0))
     yard = Yard(vinebot, start)
     first = yard.robot.sample(0.0)
     np.testing.assert_allclose(first.odom_q, frames.pose([0.0, 0.0, 0.0]), atol=1e-12)
@@ -469,7 +469,7 @@ def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
 def test_odometry_believes_in_what_the_tracks_travelled(vinebot: Description, ahead: float, turning: float) -> None:
     """Straight on, then a turn on the spot: travel = way / (1 - slip)."""
     limits = msgspec.structs.replace(vinebot.base_limits, slip=(ahead, turning))
-    start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
+    start = frames.pose([3.0, -2.0, 0.0], frames.from_yaw(2.0))
     yard = Yard(dataclasses.replace(vinebot, base_limits=limits), start)
     for drive in ((0.5, 0.0), (0.0, 0.8)):
         for _ in range(250):
@@ -580,8 +580,8 @@ def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
     physics = Physics(model)
     tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
     ahead = np.array([0.15, 0.0, 0.0])  # it comes from beyond the cane's tip
-    place = middle + ahead - frames.rotate(frames.yaw(np.pi), tip)
-    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
+    place = middle + ahead - frames.rotate(frames.from_yaw(np.pi), tip)
+    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.from_yaw(np.pi)))
     met = 0
     for _ in range(900):
         met += any(c.link.startswith("gripper_left") for c in physics.contacts)
@@ -606,8 +606,8 @@ def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
     model, _, middle = bunch_scene()
     physics = Physics(model)
     tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
-    place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.yaw(np.pi), tip)
-    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
+    place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.from_yaw(np.pi), tip)
+    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.from_yaw(np.pi)))
     joints = description.indices("arm_left")
     stiffness = np.array([60.0, 60.0, 40.0, 40.0, 15.0, 15.0, 15.0])
     robot.command_impedance(stiffness, 0.2 * stiffness, joints)

@@ -18,8 +18,8 @@ from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.pick import Pick, Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load as load_scene
-from vinesim.scene.spec import reseeded
+from vinesim.scene.spec import load_scene as load_scene
+from vinesim.scene.spec import with_seed
 
 GRAVITY = 9.81
 
@@ -31,7 +31,7 @@ def vinebot() -> Description:
 
 @functools.cache
 def vineyard(seed: int) -> tuple[Model, Task]:
-    plan = reseeded(load_scene("harvest"), seed)
+    plan = with_seed(load_scene("harvest"), seed)
     model = generate(plan)
     return model, next(pick_planning.tasks(model, start_poses.spawn_pose(plan, 0)[:2]))
 

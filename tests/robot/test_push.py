@@ -80,7 +80,7 @@ def test_the_right_arm_mirrors_the_left(robot: Robot, target: tuple[float, float
 
 
 def test_targets_are_in_the_world(robot: Robot) -> None:
-    base = frames.pose([4.0, -3.0, 0.0], frames.yaw(2.5))
+    base = frames.pose([4.0, -3.0, 0.0], frames.from_yaw(2.5))
     target = frames.compose(base, frames.pose([0.65, 0.2, 1.5]))[:3]
     run = Run(robot, "left", target, base, radius=0.05)
     assert run.errors[Phase.TOUCH] < 0.01

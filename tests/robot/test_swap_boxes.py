@@ -14,7 +14,7 @@ from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.swap_boxes import LIFTED, Exchange, Swap
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 
 
 @functools.cache

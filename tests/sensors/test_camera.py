@@ -9,7 +9,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.data_files import find
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera, CameraSpec, pinhole
@@ -183,7 +183,7 @@ def test_bad_input_is_named(tmp_path) -> None:
     with pytest.raises(FileNotFoundError, match="d435"):
         CameraSpec.load("d43")
     file = tmp_path / "bad.toml"
-    shipped = find("cameras", "d435", ".toml").read_text(encoding="utf-8")
+    shipped = find_data_file("cameras", "d435", ".toml").read_text(encoding="utf-8")
     file.write_text(shipped.replace('value = 0.158, unit = "m"', 'value = 158, unit = "mm"'), encoding="utf-8")
     with pytest.raises(SensorError, match=r"nearest\.unit is 'mm'; give the value in 'm'"):
         CameraSpec.load(str(file))

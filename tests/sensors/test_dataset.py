@@ -19,9 +19,9 @@ from vinesim.client.composition.composer import NoRoom
 from vinesim.client.composition.randomizer import Life
 from vinesim.errors import UsageError
 from vinesim.robot.description.description import DescriptionError
-from vinesim.scene.data_files import NotFoundInData
+from vinesim.scene.data_files import DataFileNotFound
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import annotations, dataset
 from vinesim.sensors.export.dataset import DatasetError, Plan
 from vinesim.sensors.spec_file import SensorError
@@ -60,7 +60,7 @@ def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
 def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A data set made in this process, in one go."""
     out = tmp_path_factory.mktemp("whole") / "set"
-    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    plan = Plan(load_scene(scene), 5, "d435", (160, 120), LIFE)
     dataset.begin(plan, out)
     assert list(dataset.draw(plan, out, dataset.missing(out, IMAGES))) == list(range(IMAGES))
     dataset.finish(out, IMAGES)
@@ -187,7 +187,7 @@ def test_an_image_is_the_same_whatever_was_drawn_before(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     """The last image of a vineyard, alone: wind, company and picked bunches of the others leave no trace."""
-    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    plan = Plan(load_scene(scene), 5, "d435", (160, 120), LIFE)
     dataset.begin(plan, tmp_path)
     last = dataset.IMAGES_A_VINEYARD - 1
     list(dataset.draw(plan, tmp_path, [last]))
@@ -202,15 +202,15 @@ def _turned(q, v: np.ndarray) -> np.ndarray:
 
 
 def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    plan = Plan(load_scene(scene), 5, "d435", (160, 120), LIFE)
     before = _files(whole)
     dataset.begin(plan, whole)
     assert _files(whole) == before
     for other, words in (
-        (Plan(load(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
-        (Plan(load("vsp"), 5, "d435", (160, 120), LIFE), "scene"),
-        (Plan(load(scene), 5, "d435", (320, 240), LIFE), "size"),
-        (Plan(load(scene), 5, "d435", (160, 120)), "life"),
+        (Plan(load_scene(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
+        (Plan(load_scene("vsp"), 5, "d435", (160, 120), LIFE), "scene"),
+        (Plan(load_scene(scene), 5, "d435", (320, 240), LIFE), "size"),
+        (Plan(load_scene(scene), 5, "d435", (160, 120)), "life"),
     ):
         with pytest.raises(DatasetError, match=words):
             dataset.begin(other, whole)
@@ -223,7 +223,7 @@ def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, 
 
 def test_a_full_disk_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     """No file may grow beyond 20 kB: to a program that is a full disk, at the first picture."""
-    plan = Plan(load(scene), 5, "d435", (160, 120))
+    plan = Plan(load_scene(scene), 5, "d435", (160, 120))
     dataset.begin(plan, tmp_path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
@@ -272,7 +272,7 @@ def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "error", "words"),
     [
-        ({"camera": "kinect"}, NotFoundInData, "d435, pinhole"),
+        ({"camera": "kinect"}, DataFileNotFound, "d435, pinhole"),
         ({"size": "99999x4"}, SensorError, "16x16 to 4096x4096"),
         ({"size": "640*480"}, UsageError, "WxH"),
         ({"at": "1,2"}, UsageError, "X,Y,Z"),

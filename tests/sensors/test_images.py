@@ -20,11 +20,11 @@ def test_looking_is_level_and_right_handed() -> None:
     pose = images.looking(np.array([1.0, 2.0, 1.0]), np.array([1.0, 5.0, 1.0]))
     from vinesim import frames
 
-    axes = frames.matrix(pose[3:])
+    axes = frames.to_matrix(pose[3:])
     assert axes[:, 2] == pytest.approx([0, 1, 0])  # forward
     assert axes[:, 1] == pytest.approx([0, 0, -1])  # down
     assert axes[:, 0] == pytest.approx([1, 0, 0])  # right of someone who looks along +y
-    assert frames.matrix(images.looking(np.zeros(3), np.array([0, 0, 1.0]))[3:])[:, 2] == pytest.approx([0, 0, 1])
+    assert frames.to_matrix(images.looking(np.zeros(3), np.array([0, 0, 1.0]))[3:])[:, 2] == pytest.approx([0, 0, 1])
 
 
 def test_a_frame_comes_back_from_its_files(tmp_path) -> None:

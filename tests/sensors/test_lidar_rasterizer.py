@@ -14,7 +14,7 @@ LAG = np.arange(16) * STEP / 24.0
 """Lasers fire in turn while the head turns on."""
 STANDS = {
     "between rows": [3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0],
-    "in the canopy": [1.3, 0.15, 1.7, *frames.yaw(1.0)],
+    "in the canopy": [1.3, 0.15, 1.7, *frames.from_yaw(1.0)],
     "on its side": [2.0, 0.9, 1.2, *frames.exp(np.array([1.2, 0.4, 0.3]))],
     "at the solids": [0.7, 0.6, 1.1, *frames.exp(np.array([0.1, 0.2, 0.7]))],
 }

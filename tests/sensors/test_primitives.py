@@ -8,7 +8,7 @@ import trimesh
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.berries import berries
+from vinesim.scene.berries import lay_out_berries
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.scene.plant_primitives import Ripeness
 from vinesim.sensors.scene.primitive_batches import SPHEROID
@@ -35,7 +35,7 @@ def test_every_bunch_has_its_berries_where_its_body_is(model, primitives) -> Non
         mine = _of(primitives, Organ.BUNCH, bunch)
         round_ones = mine[primitives.shapes.kind.numpy()[mine] == 1]
         assert len(round_ones) == model.bunch_berries[bunch]
-        expected = berries(
+        expected = lay_out_berries(
             float(model.bunch_length[bunch]),
             float(model.bunch_radius[bunch]),
             int(model.bunch_berries[bunch]),
@@ -127,7 +127,7 @@ def _bent(model, bunch: int) -> tuple[np.ndarray, np.ndarray]:
     turned = int(model.bunch_cluster[bunch]) + 1
     joint_q[turned] = frames.multiply(frames.exp(np.array([0.1, 0.3, -0.2])), joint_q[turned])
     last = int(model.bunch_cluster[bunch] + model.bunch_clusters[bunch])
-    return model.forward(joint_q), np.arange(turned, last)
+    return model.forward_kinematics(joint_q), np.arange(turned, last)
 
 
 def _berries(primitives: Primitives, bunch: int, shown: bool = True) -> np.ndarray:

@@ -65,12 +65,12 @@ def test_points_of_a_lidar_that_drives_are_in_its_frame_of_their_time() -> None:
     speed = np.array([2.0, 0.5, 0.0])
 
     def pose(t: float) -> np.ndarray:
-        return frames.pose(AT[:3] + speed * t, frames.yaw(0.2))
+        return frames.pose(AT[:3] + speed * t, frames.from_yaw(0.2))
 
     scan = _turn(_lidar(), [wall], pose=pose, step=0.01)
     mine = scan.labels == label(Organ.ROBOT, 0)
     assert np.ptp(scan.offset[mine]) > 0.09
-    xyz = frames.rotate(frames.yaw(0.2), scan.xyz[mine].astype(float))
+    xyz = frames.rotate(frames.from_yaw(0.2), scan.xyz[mine].astype(float))
     at_their_time = AT[:3] + np.outer(scan.offset[mine], speed) + xyz
     assert np.abs(at_their_time[:, 0] - 6.0).max() < 0.5 * NEARLY_STILL + 1e-4
     at_the_first = scan.pose[:3] + xyz
@@ -81,10 +81,10 @@ def test_a_lidar_that_turns_near_a_wall() -> None:
     """Turning with the head at 2 rad/s it sees a straight wall bent; each point's own pose straightens it."""
     wall = sensor_scenes.thing(sensor_scenes.shape("box", 0.1, 30.0, 30.0, at=(3.1, 0.0, 1.0)))
     rate = -2.0
-    scan = _turn(_lidar(), [wall], pose=lambda t: frames.pose(AT[:3], frames.yaw(rate * t)), step=0.01)
+    scan = _turn(_lidar(), [wall], pose=lambda t: frames.pose(AT[:3], frames.from_yaw(rate * t)), step=0.01)
     mine = scan.labels == label(Organ.ROBOT, 0)
     xyz = scan.xyz[mine].astype(float)
-    turned = frames.rotate(frames.yaw(rate * scan.offset[mine].astype(float)), xyz)
+    turned = frames.rotate(frames.from_yaw(rate * scan.offset[mine].astype(float)), xyz)
     off = np.abs(turned[:, 0] - 3.0)
     assert (off < 0.5 * NEARLY_STRAIGHT * np.hypot(*turned[:, :2].T) + 1e-3).all()
     late = scan.offset[mine] > 0.08
@@ -154,13 +154,13 @@ def test_time_set_back_starts_a_revolution_anew() -> None:
 
 def test_a_track_interpolates_and_forgets() -> None:
     track = Track()
-    quarter = frames.yaw(0.2)
+    quarter = frames.from_yaw(0.2)
     track.add(1.0, AT)
     assert np.array_equal(track.at(np.array([0.0, 5.0])), np.stack([AT, AT]))
     track.add(2.0, frames.pose(np.array([2.0, 0.0, 1.0]), -quarter))  # the same rotation, written the other way round
     middle, before, after = track.at(np.array([1.5, 0.5, 2.5]))
     assert middle[:3] == pytest.approx([1.0, 0.0, 1.0])
-    assert frames.heading(middle[3:]) == pytest.approx(0.1, abs=1e-4)
+    assert frames.to_yaw(middle[3:]) == pytest.approx(0.1, abs=1e-4)
     assert np.array_equal(before, AT)
     assert after[:3] == pytest.approx([2.0, 0.0, 1.0])
     track.add(3.0, AT)

@@ -6,7 +6,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.data_files import find
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors import spec_file
@@ -210,7 +210,7 @@ def test_an_ideal_camera_measures_exactly() -> None:
     ],
 )
 def test_absurd_values_are_refused_in_one_line(tmp_path, old: str, new: str, says: str) -> None:
-    text = find("cameras", "d435", ".toml").read_text(encoding="utf-8")
+    text = find_data_file("cameras", "d435", ".toml").read_text(encoding="utf-8")
     assert old in text
     file = tmp_path / "bad.toml"
     file.write_text(text.replace(old, new), encoding="utf-8")

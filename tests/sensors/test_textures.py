@@ -9,9 +9,9 @@ from vinesim.sensors.scene import textures
 
 def test_outlines_have_the_area_of_the_leaf() -> None:
     table, _ = textures.outlines()
-    for shape in range(leaves.SHAPES):
+    for shape in range(leaves.SHAPE_COUNT):
         texels = (table[shape] > 0).sum() * (2.0 / textures.SIDE) ** 2
-        assert texels * textures.leaf_scale(np.array(shape)) ** 2 == pytest.approx(leaves.area(shape), rel=0.02)
+        assert texels * textures.leaf_scale(np.array(shape)) ** 2 == pytest.approx(leaves.blade_area(shape), rel=0.02)
 
 
 def test_octagons_hold_their_outlines() -> None:

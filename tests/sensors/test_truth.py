@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.berries import VARIETIES, berries, piece_of
+from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame, CameraInfo, RigidVisual
 from vinesim.sensors.camera import point_cloud
@@ -112,7 +112,7 @@ def test_berry_numbers_are_those_of_the_packed_bunch(grove) -> None:
     seen = truth.look(primitives, NEAR, _before(model, view, bunch))
     mine = (seen.labels == label(Organ.BUNCH, bunch)) & (seen.berries >= 0)
     assert mine.sum() > 500
-    own = berries(
+    own = lay_out_berries(
         float(model.bunch_length[bunch]),
         float(model.bunch_radius[bunch]),
         int(model.bunch_berries[bunch]),
@@ -126,7 +126,7 @@ def test_berry_numbers_are_those_of_the_packed_bunch(grove) -> None:
     local = frames.rotate(frames.conjugate(carrier[:, 3:]), _points(seen, mine) - carrier[:, :3])
     pieces = 1 + int(model.bunch_clusters[bunch])
     length = float(model.bunch_length[bunch])
-    along = piece_of(own.position, length, pieces)[number] * (length / pieces)
+    along = segment_of(own.position, length, pieces)[number] * (length / pieces)
     away = local + along[:, None] * np.array([1.0, 0.0, 0.0]) - own.position[number]
     stretch = VARIETIES[int(model.bunch_variety[bunch])].elongation
     lengthwise = (away * own.axis[number]).sum(1)

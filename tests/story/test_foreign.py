@@ -30,7 +30,7 @@ class Vineyard:
 
     def __init__(self, description: Description) -> None:
         hang = assemble([cane((0.0, 0.0, 0.0), bunch=0.5)])
-        pose = hang.forward(hang.joint_settled)[hang.bunch_body[0]]
+        pose = hang.forward_kinematics(hang.joint_settled)[hang.bunch_body[0]]
         middle = pose[:3] + frames.rotate(pose[3:].astype(float), np.array([0.085, 0.0, 0.0]))
         self.physics = Physics(assemble([cane(BUNCH - middle, bunch=0.5)]), detachment=False)
         self.robot = Robot(self.physics.rigid, description, "tiago")

@@ -28,7 +28,7 @@ from vinesim.robot.drives import Robot
 from vinesim.robot.tasks.pick import Pick
 from vinesim.robot.tasks.push import ReachAndPush
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import Primitives, still_view
 

@@ -12,7 +12,7 @@ from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import CameraSpec, Visibility, pinhole
 from vinesim.sensors.export.images import looking
@@ -27,7 +27,7 @@ AHEAD = looking(np.array([0, 0, 1.0]), np.array([1.0, 0.0, 1.0]))
 
 @functools.cache
 def demo() -> Model:
-    return generate(load("demo"))
+    return generate(load_scene("demo"))
 
 
 @functools.cache
@@ -65,7 +65,7 @@ def everything(folder: Path) -> Primitives:
     )
     trimesh.creation.icosphere(2, radius=0.15).export(folder / "ball.stl")
     ball = thing(shape("mesh", 1.0, 1.0, 1.0, at=(0, -0.3, 0.6), file=str(folder / "ball.stl")), name="mesh", index=1)
-    at = np.tile([1.2, 1.0, 0.6, *frames.yaw(0.5)], (2, 1))
+    at = np.tile([1.2, 1.0, 0.6, *frames.from_yaw(0.5)], (2, 1))
     return world(solids, ball, model=demo(), at=at, grass=3.0)[0]
 
 

@@ -19,7 +19,7 @@ from vinesim.robot.description.description import Description, load
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 
 DT = 0.01
 SIZE = (0.5, 0.3, 0.2)
@@ -131,7 +131,7 @@ class World:
         self.clients: dict[str, Client] = {}
 
     def join(self, name: str, x: float, y: float, heading: float = 0.0) -> Client:
-        pose = frames.pose([x, y, 0.0], frames.yaw(heading))
+        pose = frames.pose([x, y, 0.0], frames.from_yaw(heading))
         scene = self.scene
         client = Client(scene, self.model, cart(), self.hub.bus(name), name=name, pose=pose, clock=lambda: self.now)
         client.physics.wind = None
@@ -139,7 +139,7 @@ class World:
         return client
 
     def leave(self, name: str) -> None:
-        self.clients.pop(name).exchange.bus.close()
+        self.clients.pop(name).replicator.bus.close()
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / DT)):
@@ -171,10 +171,10 @@ def apart(a: Client, b: Client, number: int) -> float:
 
 def sent(client: Client) -> int:
     """Bytes that left about trees, boxes and bunches: streams, claims and facts."""
-    counters = client.exchange.counters
+    counters = client.replicator.counters
     return sum(family.bytes_out for family in (counters.environment, counters.event, counters.fact))
 
 
 def heard(client: Client) -> int:
-    counters = client.exchange.counters
+    counters = client.replicator.counters
     return sum(family.bytes_in for family in (counters.environment, counters.event, counters.fact))

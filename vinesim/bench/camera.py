@@ -19,7 +19,7 @@ import trimesh
 from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, Measurement
 from vinesim.sensors.camera.camera import Camera, CameraSpec, Visibility, pinhole
 from vinesim.sensors.export.images import looking
@@ -88,7 +88,7 @@ def meshed(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
 
 def demo() -> tuple[Model, Primitives]:
     """The vineyard of both benches, without grass."""
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     return model, Primitives(model, grass=0.0)
 
 

@@ -20,7 +20,7 @@ from vinesim.bench.support.network_emulator import Emulator, Line, Way
 from vinesim.client.recording.trace import Rows, remote_error
 from vinesim.client.tasks.start_poses import bunch_in_reach, spawn_pose
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
 LINES = {
@@ -70,7 +70,7 @@ def moves(rows: Rows, since: float) -> float:
 
 def watched(line: Line) -> tuple[Rows, Rows]:
     """What the picker and the visitor saw of the same bunch."""
-    scene = load("demo")
+    scene = load_scene("demo")
     bunch = str(bunch_in_reach(generate(scene), spawn_pose(scene, 0)))
     client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
     roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}

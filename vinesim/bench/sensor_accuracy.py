@@ -19,7 +19,7 @@ from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import RigidVisual, Measurement, Shape, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec, Visibility, pinhole
 from vinesim.sensors.camera.renderers import NoRenderer
@@ -191,7 +191,7 @@ def backends(spec: CameraSpec, model: Model, view: Snapshot) -> dict[str, Pixels
 
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     """Figures of all sensor models; ``plot``: a folder for the pictures."""
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     primitives, view = Primitives(model), still_view(model)
     spec = CameraSpec.load("d435")
     depths = {"plane": plane(spec), **plants(spec, model, primitives, view)}

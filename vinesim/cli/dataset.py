@@ -10,10 +10,10 @@ from multiprocessing.connection import Connection, wait
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vinesim.cli.render import pixels
+from vinesim.cli.render import parse_size
 from vinesim.client.composition.randomizer import Life
 from vinesim.errors import UsageError
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.sensors.camera import renderers
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, Plan
@@ -39,7 +39,9 @@ def run(
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     life = Life(actors) if actors > 0.0 else None
-    plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check(renderer))
+    plan = Plan(
+        load_scene(scene), seed, camera, None if size is None else parse_size(size), life, renderers.check(renderer)
+    )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crew: list[Share] = []
     try:

@@ -34,7 +34,7 @@ def run(
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
     from vinesim.sensors.camera import renderers
     from vinesim.sensors.camera.camera import Camera, CameraSpec
     from vinesim.sensors.export import annotations as formats
@@ -45,14 +45,14 @@ def run(
     from vinesim.sensors.truth import truth
 
     renderers.check(renderer)
-    eye, target = point("--at", at), point("--look", look)
+    eye, target = parse_point("--at", at), parse_point("--look", look)
     if np.linalg.norm(target - eye) < 1e-6:
         raise UsageError(f"--look {look} is where the camera stands; look at another point")
     if eye[2] <= 0.0:
         raise UsageError(f"--at {at} lies in the ground; give a height above 0")
     spec = CameraSpec.load(camera)
-    info = sized(spec, None if size is None else pixels(size))
-    plan, staged = reseeded(load(scene), seed), stage(robots, people, crates)
+    info = sized(spec, None if size is None else parse_size(size))
+    plan, staged = with_seed(load_scene(scene), seed), parse_composition(robots, people, crates)
     sun = plan.sun if hour is None else msgspec.structs.replace(plan.sun, hour=hour)
     model = generate(plan)
     view = staged.set(model)
@@ -91,7 +91,7 @@ def run(
     return 0
 
 
-def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> Stage:
+def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> Stage:
     """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
     from vinesim.client.composition.composer import CrateAt, PersonAt, RobotAt, Stage
     from vinesim.robot.description import description
@@ -103,23 +103,23 @@ def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -
         if not (mark and name):
             raise UsageError(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
         description.load(name)  # says what is wrong with it
-        placed_robots.append(RobotAt(name, *_place("--robot", where, 3)))
+        placed_robots.append(RobotAt(name, *_parse_place("--robot", where, 3)))
     for text in people:
         parts = text.split(",")
         posture = parts.pop() if len(parts) > 1 and parts[-1].strip().isidentifier() else "stand"
-        if posture not in appearance.postures():
-            raise UsageError(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.postures())}")
-        x, y, yaw = (*_place("--person", ",".join(parts), 3), 0.0)[:3]
+        if posture not in appearance.posture_names():
+            raise UsageError(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.posture_names())}")
+        x, y, yaw = (*_parse_place("--person", ",".join(parts), 3), 0.0)[:3]
         placed_people.append(PersonAt(x, y, yaw, posture))
     for text in crates:
-        crate = CrateAt(*_place("--crate", text, 4))
+        crate = CrateAt(*_parse_place("--crate", text, 4))
         if not 0.0 <= crate.fill <= 1.0:
             raise UsageError(f"--crate {text}: the fill is {crate.fill:g}; give 0 (empty) to 1 (full)")
         placed_crates.append(crate)
     return Stage(tuple(placed_robots), tuple(placed_people), tuple(placed_crates))
 
 
-def _place(option: str, text: str, most: int) -> list[float]:
+def _parse_place(option: str, text: str, most: int) -> list[float]:
     """``X,Y[,YAW[,...]]`` as two to ``most`` numbers."""
     try:
         values = [float(part) for part in text.split(",")]
@@ -131,7 +131,7 @@ def _place(option: str, text: str, most: int) -> list[float]:
     return values
 
 
-def point(option: str, text: str) -> np.ndarray:
+def parse_point(option: str, text: str) -> np.ndarray:
     """``X,Y,Z`` as a point [3] m."""
     try:
         value = np.array([float(part) for part in text.split(",")])
@@ -142,7 +142,7 @@ def point(option: str, text: str) -> np.ndarray:
     return value
 
 
-def pixels(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """``WxH`` as width and height [px]."""
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if match is None:

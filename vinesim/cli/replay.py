@@ -83,16 +83,16 @@ def _look(
 ) -> int:  # fmt: skip
     """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
     from vinesim.client.recording.replay import ReplayBus
-    from vinesim.client.spectator import Pictures, Spectator, looking_at, viewpoint
+    from vinesim.client.spectator import PictureWriter, Spectator, follow_view, standing_view
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import SceneError, load, reseeded
+    from vinesim.scene.spec import SceneError, load_scene, with_seed
 
     if scene is None and "scene" not in tape.about:
         raise UsageError(f"{tape.path} does not say which scene it is of: give --scene")
     if seed is None and "seed" in tape.about:
         seed = int(tape.about["seed"])
     try:
-        plan = reseeded(load(scene or tape.about["scene"]), seed)
+        plan = with_seed(load_scene(scene or tape.about["scene"]), seed)
     except SceneError as error:
         raise SceneError(f"the scene of {tape.path}: {error}; give --scene FILE") from error
     model = generate(plan)
@@ -102,15 +102,15 @@ def _look(
             f"{tape.path} is of scene {tape.about.get('scene', '?')!r} with digest {digest}, "
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
-    eyes = viewpoint(*place) if place is not None else looking_at(_first_pose(tape))
+    eyes = standing_view(*place) if place is not None else follow_view(_first_pose(tape))
     out.mkdir(parents=True, exist_ok=True)
     bus = ReplayBus(tape, "spectator", start=start, end=end)
     spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
-    pictures = Pictures(spectator, out, 1.0)
+    pictures = PictureWriter(spectator, out, 1.0)
     while not (bus.ended or stop.is_set()):
         bus.play(spectator.physics.dt * speed)
         if place is None and spectator.physics.rigid.robots:
-            spectator.pose = looking_at(spectator.physics.rigid.base_state(min(spectator.physics.rigid.robots))[0])
+            spectator.pose = follow_view(spectator.physics.rigid.base_state(min(spectator.physics.rigid.robots))[0])
         spectator.tick()
     pictures.save(spectator)
     print(f"{pictures.count} pictures are in {out}/", file=sys.stderr)

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 from vinesim.errors import UsageError
 
 if TYPE_CHECKING:
-    from vinesim.client.rate_loop import Pace
+    from vinesim.client.rate_loop import RateLoop
 
 log = logging.getLogger(__name__)
 
-SWITCH = 2e-4
+SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the tick wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
@@ -46,22 +46,22 @@ def run(
     if tls is not None and connect is None:
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
-    from vinesim.physics.plants.device_buffers import device_of
+    from vinesim.physics.plants.device_buffers import find_device
     from vinesim.sensors.camera import renderers
 
-    device_of(device)  # refused before anything is built
+    find_device(device)  # refused before anything is built
     renderers.check(renderer)
     if threads > 1 and device != "cpu":
         raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
     # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     stop = threading.Event()
 
     from vinesim.client.client import Client
-    from vinesim.client.rate_loop import Pace
+    from vinesim.client.rate_loop import RateLoop
     from vinesim.client.recording.trace import Trace
-    from vinesim.client.sensing.sensor_process import Senses
+    from vinesim.client.sensing.sensor_process import SensorProcess
     from vinesim.client.status import Status
     from vinesim.client.tasks.start_poses import checked_bunch, placed, start_pose
     from vinesim.client.tasks.tasks import DriveTo, LookAt, checked_job, plan_job
@@ -69,11 +69,10 @@ def run(
     from vinesim.robot.description.description import load as load_robot
     from vinesim.robot.tasks.push import ReachAndPush
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load as load_scene
-    from vinesim.scene.spec import reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     checked_job(job)
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:
         plan = placed(plan, *place)
@@ -102,7 +101,7 @@ def run(
 
         perceptions = [
             stack.enter_context(
-                Senses(
+                SensorProcess(
                     one, plan, model, description,
                     namespace=namespace if len(names) == 1 else "/".join(filter(None, (namespace, ros_name(one)))),
                     ros=ros, keep_pictures=out is not None and i == 0, sensor_hz=sensor_hz,
@@ -113,7 +112,7 @@ def run(
         ]  # fmt: skip
         senses = perceptions[0]
         client = Client(
-            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, near=near,
+            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, interest_radius=near,
             jitter_buffer=1e-3 * jitter_buffer, device=device,
             threads=threads, executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
@@ -122,28 +121,30 @@ def run(
         stack.callback(client.leave)
         for one, perception in zip(names, perceptions, strict=True):
             perception.attach(client, client.robots[one])
-        pace = Pace(client.physics.dt)
+        pace = RateLoop(client.physics.dt)
         watched = watch if watch is not None else push
         if watched is not None:
             body = int(model.bunch_body[watched])
             client.trace = Trace(model, watched, client.physics.state.body_q[body].copy(), 1 << 17)
         if back > 0.0:
-            client.jobs += [
+            client.pre_step += [
                 DriveTo(mine, start_pose(plan, spawn, queue=i)) for i, mine in enumerate(client.robots.values())
             ]
         if push is not None and client.trace is not None:
             reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
-            client.jobs.append(reach.control)
+            client.pre_step.append(reach.control)
         script = None
         if job is not None:
             script = begin(client.physics, client.robot)
-            client.jobs.append(script.control)
-            client.worth = script.worth
-            client.jobs.append(LookAt(client.robot, script.focus))
+            client.pre_step.append(script.control)
+            client.frame_score = script.worth
+            client.pre_step.append(LookAt(client.robot, script.focus))
         elif client.trace is not None:
-            client.jobs.append(LookAt(client.robot, client.trace.centre))
-        reporter = Status(client, pace, senses.sent, script)
-        speaker = threading.Thread(target=speak, args=(reporter, senses.diagnose, status, stop), name="status")
+            client.pre_step.append(LookAt(client.robot, client.trace.centre))
+        reporter = Status(client, pace, senses.sent_messages, script)
+        speaker = threading.Thread(
+            target=report_status, args=(reporter, senses.publish_diagnostics, status, stop), name="status"
+        )
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
@@ -153,7 +154,7 @@ def run(
             report = reporter.report() | senses.report()
             if script is not None:
                 report["job"] = script.report()
-            senses.save(out)
+            senses.save_picture(out)
             if client.trace is not None:
                 client.trace.rows().save(out / "trace.npz")
             save_report(out, report)
@@ -161,7 +162,7 @@ def run(
 
 
 def tick_until(
-    stop: threading.Event, tick: Callable[[], None], pace: Pace, seconds: float | None, dt: float,
+    stop: threading.Event, tick: Callable[[], None], pace: RateLoop, seconds: float | None, dt: float,
     done: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
     """Tick in time until told to ``stop`` (Ctrl-C and SIGTERM do), for so many ``seconds``, or until it is ``done``."""
@@ -189,7 +190,7 @@ def ros_name(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def speak(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
+def report_status(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
     """Once a second, say how it goes: to the terminal, and to whoever wants to ``diagnose``."""
     try:
         while not stop.wait(STATUS_PERIOD):

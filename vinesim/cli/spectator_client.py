@@ -19,16 +19,16 @@ def run(
     renderer: str, **_: Any,
 ) -> int:  # fmt: skip
     """Look until told to stop; pictures go to ``out``."""
-    from vinesim.cli.robot_client import speak, tick_until
-    from vinesim.client.rate_loop import Pace
-    from vinesim.client.spectator import Pictures, Spectator, viewpoint
+    from vinesim.cli.robot_client import report_status, tick_until
+    from vinesim.client.rate_loop import RateLoop
+    from vinesim.client.spectator import PictureWriter, Spectator, standing_view
     from vinesim.client.status import Status
     from vinesim.client.tasks.start_poses import spawn_pose
     from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.net.transport.zenoh_bus import ZenohBus
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
     from vinesim.sensors.camera import renderers
 
     if status not in ("text", "json", "none"):
@@ -36,7 +36,7 @@ def run(
     if tls is not None and connect is None:
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
     renderers.check(renderer)
-    plan = reseeded(load(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     if place is None:
         start = spawn_pose(plan, spawn)
         place = float(start[0]), float(start[1]), 2.0 * float(np.arctan2(start[5], start[6]))
@@ -49,14 +49,14 @@ def run(
         if connect is not None:
             bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
         spectator = Spectator(
-            plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads,
+            plan, model, None, bus, name=name, pose=standing_view(*place), interest_radius=near, device=device, threads=threads,
             executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
-        pictures = None if out is None else Pictures(spectator, out, 1.0 / (sensor_hz or 1.0), renderer)
+        pictures = None if out is None else PictureWriter(spectator, out, 1.0 / (sensor_hz or 1.0), renderer)
         stop = threading.Event()
-        pace = Pace(spectator.physics.dt)
+        pace = RateLoop(spectator.physics.dt)
         reporter = Status(spectator, pace)
-        speaker = threading.Thread(target=speak, args=(reporter, lambda _: None, status, stop), name="status")
+        speaker = threading.Thread(target=report_status, args=(reporter, lambda _: None, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.plants.detachment import Blade, Partings
-from vinesim.physics.plants.fault_guard import Guard
-from vinesim.physics.plants.level_of_detail import Detail
-from vinesim.physics.plants.sleep import Sleep
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.detachment import Blade, DetachmentMonitor
+from vinesim.physics.plants.fault_guard import FaultGuard
+from vinesim.physics.plants.level_of_detail import LevelOfDetail
+from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.dormant_bunches import DormantBunches
 from vinesim.physics.rigid.hand_grasp import GraspManager
@@ -39,30 +39,30 @@ class Physics:
         threads: int = 1,
         detachment: bool = True,
     ) -> None:
-        """``device``, ``threads``: see :class:`Plants`; ``detachment``: whether bunches detach when pulled too hard."""
+        """``device``, ``threads``: see :class:`ArticulationSolver`; ``detachment``: whether bunches detach when pulled too hard."""
         p = parameters
         self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
-        self.plants = Plants(
-            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, brisk=p.fast_joint_rate,
-            limit=p.max_joint_rate, bound=p.fault_joint_rate,
+        self.plants = ArticulationSolver(
+            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, fast_rate=p.fast_joint_rate,
+            max_rate=p.max_joint_rate, fault_rate=p.fault_joint_rate,
         )  # fmt: skip
         self.rigid = RigidWorld(model, parameters=p)
-        self.contact_solver = Touching(
+        self.contact_solver = ContactSolver(
             model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
         )
-        self.detachment_monitor = Partings(self.plants, self.rigid, self.contact_solver)
+        self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
         self._visuals: tuple[tuple[RigidVisual, ...], tuple[RigidVisual, ...], tuple[RigidVisual, ...]] = ((), (), ())
         self._detachment = detachment
-        self.level_of_detail = Detail(
+        self.level_of_detail = LevelOfDetail(
             self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
             patience=p.steps(p.detail_rest_duration),
         )  # fmt: skip
-        self.sleep_monitor = Sleep(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
-        self.fault_guard = Guard(self.plants)
+        self.sleep_monitor = SleepMonitor(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
+        self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
         self.detachments: tuple[Parting, ...] = ()
@@ -76,9 +76,9 @@ class Physics:
             ("wind: set the air velocity at trees near actors", self._blow),
             ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
             ("rigid: predict velocities without plant contacts", self.rigid.predict),
-            ("contacts: wake trees near moving geoms", self.contact_solver.find),
+            ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine),
-            ("plants: predict velocities without contacts", self.plants.free),
+            ("plants: predict velocities without contacts", self.plants.predict),
             ("contacts: solve for plants and rigid bodies together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._commit),
             ("rigid: integrate with contact forces", self._finish),
@@ -110,9 +110,9 @@ class Physics:
     def touched(self) -> tuple[tuple[int, str], ...]:
         """(tree, actor) for every tree pressed on or held in the last tick, sorted."""
         if not self.grasp_manager.contacts:
-            return self.contact_solver.touched
+            return self.contact_solver.touched_trees
         held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.grasp_manager.contacts)
-        return tuple(sorted({*self.contact_solver.touched, *held}))
+        return tuple(sorted({*self.contact_solver.touched_trees, *held}))
 
     @property
     def haptics(self) -> tuple[Haptic, ...]:
@@ -122,7 +122,7 @@ class Physics:
     def update_kinematics(self) -> None:
         """Bring ``state.body_q`` from the start of the last tick to its end."""
         if not self._fresh:
-            self.plants.kinematics()
+            self.plants.forward_kinematics()
             self._fresh = True
 
     def snapshot(self) -> Snapshot:
@@ -167,13 +167,13 @@ class Physics:
         """See :meth:`RigidWorld.add_human`; a remote one touches only trees whose state its own client sends."""
         self.rigid.add_human(spec, is_remote=is_remote)
         if is_remote:
-            self.contact_solver.copies.add(spec.name)
+            self.contact_solver.remote_actors.add(spec.name)
 
     def remove_human(self, name: str) -> None:
         """See :meth:`RigidWorld.remove_human`; what the hands held is let go."""
         self.rigid.remove_human(name)
         self.grasp_manager.remove_ties_of(name)
-        self.contact_solver.copies.discard(name)
+        self.contact_solver.remote_actors.discard(name)
 
     def move_human(self, name: str, pose: HumanPose) -> None:
         """Tell where a person's tracked points are at the end of the coming tick, and which hands are closed."""
@@ -184,37 +184,37 @@ class Physics:
         return self.rigid.hand_sample(name, side)
 
     def pick(self, bunch: int) -> None:
-        """Take a bunch off its vine, between ticks; see :meth:`Partings.pick`."""
+        """Take a bunch off its vine, between ticks; see :meth:`DetachmentMonitor.pick`."""
         self.detachment_monitor.pick(bunch)
         self._body_q = None
 
     def cut(self, body: int) -> None:
-        """Cut a piece of wood off its vine, between ticks; see :meth:`Partings.cut`."""
+        """Cut a piece of wood off its vine, between ticks; see :meth:`DetachmentMonitor.cut`."""
         self.detachment_monitor.cut(body)
         self._body_q = None
 
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Another client has picked a bunch; see :meth:`Partings.told_pick`."""
-        self.detachment_monitor.told_pick(bunch, pose, velocity)
+        """Another client has picked a bunch; see :meth:`DetachmentMonitor.apply_remote_pick`."""
+        self.detachment_monitor.apply_remote_pick(bunch, pose, velocity)
         self._body_q = None
 
     def apply_remote_cut(self, body: int) -> None:
-        """Another client has cut a piece of wood off; see :meth:`Partings.told_cut`."""
-        self.detachment_monitor.told_cut(body)
+        """Another client has cut a piece of wood off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
+        self.detachment_monitor.apply_remote_cut(body)
         self._body_q = None
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
         """Others say in what shape trees rest ([body of the tree, 4] each): so they do here, and none wakes for it."""
         for tree, turned in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(turned, np.float32))
-        self.plants.rest(np.array(trees, np.int32))
-        self.contact_solver.moved(np.array(trees, np.int32))
+        self.plants.put_to_sleep(np.array(trees, np.int32))
+        self.contact_solver.update_tree_bounds(np.array(trees, np.int32))
         self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
         self._body_q = None
 
     def set_detail_focus(self, points: np.ndarray, radius: float) -> None:
-        """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`Detail.watch`."""
-        self.level_of_detail.watch(points, radius)
+        """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`LevelOfDetail.set_focus`."""
+        self.level_of_detail.set_focus(points, radius)
 
     def add_blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
         """Give a robot's link a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
@@ -236,30 +236,32 @@ class Physics:
             )
 
     def _refine(self) -> None:
-        self.level_of_detail.update(self.contact_solver.near)
+        self.level_of_detail.update(self.contact_solver.near_trees)
 
     def _commit(self) -> None:
-        self.plants.commit(self.contact_solver.bodies, self.contact_solver.wrenches)
+        self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
         if len(self.plants.awake):
             self._body_q, self._fresh = None, False
 
     def _finish(self) -> None:
-        self.rigid.integrate(self.contact_solver.force)
+        self.rigid.integrate(self.contact_solver.rigid_force)
 
     def _guard(self) -> None:
-        self.fault_guard.check()
+        self.fault_guard.stop_faulty_trees()
 
     def _part(self) -> None:
-        self.detachments = self.detachment_monitor.update(strain=self._detachment)
+        self.detachments = self.detachment_monitor.update(check_load=self._detachment)
         if self.detachments:
             self._body_q = None
 
     def _hold(self) -> None:
         self.grasp_manager.end_step(self.detachments)
-        self.detachment_monitor.held = self.grasp_manager.contacts
+        self.detachment_monitor.hand_contacts = self.grasp_manager.contacts
 
     def _sleep(self) -> None:
         if not self.parameters.sleep:
             return
         held = self.grasp_manager.held_trees
-        self.sleep_monitor.update(np.union1d(self.contact_solver.near, held) if len(held) else self.contact_solver.near)
+        self.sleep_monitor.update(
+            np.union1d(self.contact_solver.near_trees, held) if len(held) else self.contact_solver.near_trees
+        )

@@ -69,7 +69,7 @@ class Embodied:
             rigid.add_robot(spec)
         back = frames.conjugate(spec.pose[3:])
         self._start = spec.pose[:3].copy()
-        self._start_turn = frames.matrix(back)
+        self._start_turn = frames.to_matrix(back)
         self._start_left = frames.multiply(back, np.eye(4)).T
         """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
         self._odometer = Odometer(*description.base_limits.slip, spec.pose)
@@ -110,13 +110,13 @@ class Odometer:
     def __init__(self, ahead: float, turning: float, pose: np.ndarray) -> None:
         """``ahead``, ``turning``: shares of the travel that are lost; ``pose`` [7] of the base at the start."""
         self._gain = 1.0 / (1.0 - ahead), 1.0 / (1.0 - turning)
-        self._seen = float(pose[0]), float(pose[1]), frames.heading(pose[3:])
+        self._seen = float(pose[0]), float(pose[1]), frames.to_yaw(pose[3:])
         self._believed = 0.0, 0.0, 0.0
 
     def roll(self, base_q: np.ndarray) -> np.ndarray:
         """Count the way to ``base_q`` [7] and return the pose [7] since the start as odometry believes it."""
         x, y, yaw = self._seen
-        self._seen = float(base_q[0]), float(base_q[1]), frames.heading(base_q[3:])
+        self._seen = float(base_q[0]), float(base_q[1]), frames.to_yaw(base_q[3:])
         turn = (self._seen[2] - yaw + np.pi) % (2.0 * np.pi) - np.pi
         c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
         way = self._seen[0] - x, self._seen[1] - y
@@ -125,7 +125,7 @@ class Odometer:
         x, y, yaw = self._believed
         c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
         self._believed = x + c * ahead - s * left, y + s * ahead + c * left, yaw + turn
-        return frames.pose([*self._believed[:2], 0.0], frames.yaw(self._believed[2]))
+        return frames.pose([*self._believed[:2], 0.0], frames.from_yaw(self._believed[2]))
 
 
 class Robot(Embodied):

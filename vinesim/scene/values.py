@@ -137,15 +137,15 @@ class HumanPose:
 
     @property
     def points(self) -> np.ndarray:
-        """[7, 7] all poses, in the order of :data:`POINTS`."""
-        return np.stack([getattr(self, name) for name in POINTS])
+        """[7, 7] all poses, in the order of :data:`POINT_NAMES`."""
+        return np.stack([getattr(self, name) for name in POINT_NAMES])
 
-    def at(self, points: np.ndarray) -> HumanPose:
+    def with_points(self, points: np.ndarray) -> HumanPose:
         """The same hands and fingers with all poses [7, 7] elsewhere."""
-        return dataclasses.replace(self, **dict(zip(POINTS, points, strict=True)))
+        return dataclasses.replace(self, **dict(zip(POINT_NAMES, points, strict=True)))
 
 
-POINTS = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
+POINT_NAMES = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
 """Poses of a :class:`HumanPose`."""
 
 

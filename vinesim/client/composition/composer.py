@@ -119,7 +119,7 @@ class Stage:
             pose = _at(one.x, one.y, one.yaw)
             rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
-            pose = appearance.posed(standing_pose(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
+            pose = appearance.apply_posture(standing_pose(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
         _apart(rigid)
 
@@ -135,7 +135,7 @@ class Stage:
 
 
 def _at(x: float, y: float, yaw: float) -> np.ndarray:
-    return frames.pose(np.array([x, y, 0.0]), frames.yaw(yaw))
+    return frames.pose(np.array([x, y, 0.0]), frames.from_yaw(yaw))
 
 
 def weights(model: Model) -> np.ndarray:
@@ -182,7 +182,7 @@ def _above(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.ran
     yaw = rng.choice([0.0, np.pi]) + rng.uniform(-0.35, 0.35)
     start = rng.uniform(-room, room) - 0.5 * length * np.array([np.cos(yaw), np.sin(yaw)])
     roll = frames.exp(np.array([rng.uniform(-np.pi, np.pi), 0.0, 0.0]))
-    return frames.pose(np.array([*start, top + radius + 0.01]), frames.multiply(frames.yaw(yaw), roll))
+    return frames.pose(np.array([*start, top + radius + 0.01]), frames.multiply(frames.from_yaw(yaw), roll))
 
 
 def _ends(physics: Physics, bunch: int) -> np.ndarray:

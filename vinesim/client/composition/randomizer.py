@@ -50,7 +50,7 @@ class Life:
         if rng.uniform() >= self.share:
             return None
         bunch = int(rng.integers(len(model.bunch_body)))
-        middle = model.forward(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
+        middle = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
         for _ in range(_TRIES):
             stage = company(model, middle, rng)
             physics = Physics(stage.furnished(model))
@@ -81,7 +81,7 @@ def company(model: Model, middle: np.ndarray, rng: np.random.Generator) -> Stage
         taken.append((spot, ROOM[kind]))
         x, y = (round(float(v), 4) for v in spot)
         if kind == "person":
-            posture = appearance.postures()[rng.integers(len(appearance.postures()))]
+            posture = appearance.posture_names()[rng.integers(len(appearance.posture_names()))]
             people.append(PersonAt(x, y, round(yaw, 4), posture, round(float(rng.normal(1.72, 0.07)), 3)))
         elif kind == "crate":
             fill = round(float(rng.choice([0.0, rng.uniform(0.1, 0.5)])), 3)

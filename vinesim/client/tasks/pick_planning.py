@@ -68,7 +68,7 @@ def tasks(model: Model, near: np.ndarray) -> Iterator[Task]:
 def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarray]]:
     """Bunch, side and pose [7] of the base, those with most clearance first."""
     points, radius, owner = _obstacles(model)
-    body_q = model.forward(model.joint_settled)[model.bunch_body]
+    body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     hold = body_q[:, :3] + HOLD * axis
     fits = (hold[:, 2] > HEIGHT[0]) & (hold[:, 2] < HEIGHT[1]) & (model.bunch_radius <= WIDEST) & (axis[:, 2] < -0.95)
@@ -80,7 +80,7 @@ def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarr
     region = np.linalg.norm(points - middle, axis=1) < reached
     points, radius, owner = points[region], radius[region], owner[region]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-    turn = frames.yaw(heading)
+    turn = frames.from_yaw(heading)
     sides = np.stack([frames.rotate(turn, np.array([AHEAD, y, 0.0]))[:, :2] for y in (ASIDE, -ASIDE)], 1)
     base = hold[bunches, None, None, :2] - sides  # [bunch, heading, side, 2]
     roomy = (free_room(model, base.reshape(-1, 2)) > ROOM).reshape(base.shape[:3])
@@ -103,8 +103,8 @@ def _stands(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarr
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Balls that fill wood and bunches at rest: points [n, 3] m, radii [n] m, and whose bunch each belongs to [n]."""
-    body_q = model.forward(model.joint_settled).astype(float)
-    owner = model.bunch_of()
+    body_q = model.forward_kinematics(model.joint_settled).astype(float)
+    owner = model.bunch_of_body()
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
     share = np.linspace(0.0, 1.0, 4)
     along = share[None] * model.body_length[wood, None]

@@ -39,7 +39,7 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
         raise NoPlace(f"scene {scene.name!r} has no start place {number}; it has: {known}")
     spawn = scene.spawns[number]
     ahead = np.array([np.cos(spawn.yaw), np.sin(spawn.yaw), 0.0])
-    return frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.yaw(spawn.yaw))
+    return frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.from_yaw(spawn.yaw))
 
 
 def start_pose(scene: Scene, number: int, back: float = 0.0, queue: int = 0) -> np.ndarray:
@@ -55,7 +55,7 @@ def placed(scene: Scene, x: float, y: float, yaw: float) -> Scene:
 
 def bunch_centres(model: Model) -> np.ndarray:
     """Centres of all bunches at rest [bunch, 3] m."""
-    body_q = model.forward(model.joint_settled)[model.bunch_body]
+    body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     return body_q[:, :3] + 0.5 * model.bunch_length[:, None] * axis
 
@@ -118,7 +118,7 @@ def stand_before_a_bunch(model: Model, near: np.ndarray) -> tuple[int, np.ndarra
         )
     distance = np.where(fits, np.linalg.norm(places - near, axis=-1), np.inf)
     bunch, turn = np.unravel_index(int(np.argmin(distance)), distance.shape)
-    return int(high[bunch]), frames.pose(np.append(places[bunch, turn], 0.0), frames.yaw(heading[turn]))
+    return int(high[bunch]), frames.pose(np.append(places[bunch, turn], 0.0), frames.from_yaw(heading[turn]))
 
 
 def way_to(model: Model, place: np.ndarray, length: float) -> np.ndarray:
@@ -132,5 +132,5 @@ def way_to(model: Model, place: np.ndarray, length: float) -> np.ndarray:
             way = goal - np.linspace(0.0, length, 40)[:, None] * back
             room = min(float(free_room(model, way).min()), float(np.linalg.norm(way - place[:2], axis=1).min()) - 0.6)
             if room > most:
-                best, most = frames.pose(np.append(goal, 0.0), frames.yaw(angle)), room
+                best, most = frames.pose(np.append(goal, 0.0), frames.from_yaw(angle)), room
     return best

@@ -71,5 +71,5 @@ def fill(physics: Physics, box: int, count: int = 6) -> None:
         # each lies along y, its middle at (x, y)
         start = np.array([x, y - 0.5 * float(model.bunch_length[bunch]), 0.10 + 0.14 * layer])
         physics.pick(bunch)
-        turned = frames.pose(start, frames.yaw(0.5 * np.pi))
+        turned = frames.pose(start, frames.from_yaw(0.5 * np.pi))
         physics.rigid.place_bunch(bunch, frames.compose(pose, turned), np.zeros(6))

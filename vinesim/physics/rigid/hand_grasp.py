@@ -12,8 +12,8 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import Touching
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.contact.contact_solver import ContactSolver
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.human_body import FINGERS, THICK, HandBody, HumanBody
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import Contact, Haptic, Parting
@@ -47,8 +47,8 @@ class _Grip:
 class GraspManager:
     """What the hands of all people hold, and what their controllers feel of it."""
 
-    def __init__(self, plants: Plants, rigid: RigidWorld, touching: Touching) -> None:
-        self.plants, self.rigid, self.touching = plants, rigid, touching
+    def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver) -> None:
+        self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the last tick, by person and hand."""
         self.contacts: tuple[Contact, ...] = ()
@@ -89,7 +89,7 @@ class GraspManager:
         gone = {parting.body: parting.bunch for parting in partings if parting.bunch >= 0}
         contacts, haptics = [], []
         if self._grips:
-            self.plants.kinematics(self.held_trees)
+            self.plants.forward_kinematics(self.held_trees)
         for person, hand in self._hands():
             key = person.spec.name, hand.side
             if (grip := self._grips.get(key)) is not None:
@@ -125,14 +125,14 @@ class GraspManager:
         key = person.spec.name, hand.side
         palm = self.rigid.hand_sample(*key).pose
         rigid = self.rigid.nearest_to_hand(*key, GRASP)
-        plant = self.touching.nearest(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
+        plant = self.contact_solver.nearest_body(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
         if plant is not None and (rigid is None or plant[0] - THICK < rigid[0]):
             body = plant[1]
             self.plants.wake(self.plants.model.body_tree[body])
             pose = self.plants.state.body_q[body].astype(float)
             hand.grasp_pose = frames.compose(frames.inverse(pose), palm)
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
-            tie = self.plants.hold(body, hand.grasp_pose[:3], person.spec.stiffness, person.damping)
+            tie = self.plants.add_tie(body, hand.grasp_pose[:3], person.spec.stiffness, person.damping)
             self._grips[key] = _Grip(body, tie, hand.grasp_pose[:3].copy(), next(iter(bunch.tolist()), -1))
             self.rigid.grasp_plant(*key, body)
         elif rigid is not None:
@@ -167,7 +167,7 @@ class GraspManager:
     def _drop(self, key: tuple[str, str]) -> None:
         grip = self._grips.pop(key, None)
         if grip is not None:
-            self.plants.let_go(grip.body, grip.tie)
+            self.plants.remove_tie(grip.body, grip.tie)
 
     def _vibrate(self, person: HumanBody, hand: HandBody) -> list[Haptic]:
         """A pulse when a touch begins, then as strong as the force."""

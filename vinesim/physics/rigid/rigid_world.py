@@ -19,7 +19,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact import collision_geoms
-from vinesim.physics.contact.effective_mass import Metric
+from vinesim.physics.contact.effective_mass import EffectiveMass
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, hand_wrenches, recompile, static_world
 from vinesim.physics.rigid.free_bunch import FreeBunch
@@ -66,7 +66,7 @@ class RigidWorld:
         self.generation = 0
         """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
         self.owners: dict[int, tuple[str, str]] = {}
-        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`geoms.Geoms` names them."""
+        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`RigidGeoms` names them."""
         self._recompile()
 
     # ------------------------------------------------------------------ who is here
@@ -180,7 +180,7 @@ class RigidWorld:
         return person.sample(person.hand(side), self.mj_data)
 
     def grasp(self, name: str, side: str, actor: str, link: str) -> None:
-        """Let a hand hold a link of an actor, a box or a bunch where it is now; names are those of ``geoms.Geoms``."""
+        """Let a hand hold a link of an actor, a box or a bunch where it is now; names are those of ``RigidGeoms``."""
         person, body = self.human(name), self._body_of_object(actor, link)
         hand = person.hand(side)
         self.update_kinematics()
@@ -480,16 +480,16 @@ class RigidWorld:
 
     @property
     def islands(self) -> np.ndarray:
-        """See :meth:`Metric.group`."""
-        return self._effective_mass.group(self.mj_data)
+        """See :meth:`EffectiveMass.island_labels`."""
+        return self._effective_mass.island_labels(self.mj_data)
 
     def is_constrained(self, bodies: np.ndarray) -> bool:
-        """See :meth:`Metric.bound`."""
-        return self._effective_mass.bound(self.mj_data, bodies)
+        """See :meth:`EffectiveMass.is_constrained`."""
+        return self._effective_mass.is_constrained(self.mj_data, bodies)
 
     def impulse_response(self, J: np.ndarray) -> np.ndarray:
-        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see :class:`Metric`."""
-        return self._effective_mass.inverse(self.mj_data, J)
+        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see :class:`EffectiveMass`."""
+        return self._effective_mass.impulse_response(self.mj_data, J)
 
     def integrate(self, force: np.ndarray | None = None) -> None:
         """Second half: integrate with generalised contact forces of plants, ``force`` [dof]."""
@@ -639,7 +639,7 @@ class RigidWorld:
         else:
             parked = {free_bunch.slot_name(slot) for slot in set(range(self._pool_size)) - set(self._bunch_slot.values())}
             self.mj_data, self.contact_force = recompile.transfer_state(*before, world, parked)
-        self._effective_mass = Metric(world)
+        self._effective_mass = EffectiveMass(world)
         self._valid_qpos = self.mj_data.qpos.copy()
         self._kinematics_current = False
         for robot in self._robots.values():
@@ -650,7 +650,7 @@ class RigidWorld:
             for hand in person.hands:
                 self._regrasp(person, hand)
         if before is None:
-            self.static_geoms = collision_geoms.standing(world)
+            self.static_geoms = collision_geoms.static_geoms(world)
         self._update_tables()
 
     def _regrasp(self, person: HumanBody, hand: HandBody) -> None:
@@ -672,12 +672,12 @@ class RigidWorld:
         own = self._visual_body > 0
         self._visual_row[self._visual_body[own]] = np.flatnonzero(own)
         self.owners = self._list_owners()
-        self.geoms = collision_geoms.listed(self.mj_model, self.owners)
+        self.geoms = collision_geoms.movable_geoms(self.mj_model, self.owners)
 
     def _list_visuals(self) -> tuple[tuple[RigidVisual, ...], np.ndarray]:
         links, bodies = [], []
         for box, size in enumerate(self.model.box_size):
-            links.append(RigidVisual(f"box/{box}", Organ.BOX, box, appearance.crate(tuple(map(float, size)), box)))
+            links.append(RigidVisual(f"box/{box}", Organ.BOX, box, appearance.crate_shapes(tuple(map(float, size)), box)))
             bodies.append(self.mj_model.body(f"box/{box}").id)
         for name, robot in self._robots.items():
             for link, shapes in robot.shapes.items():
@@ -685,7 +685,7 @@ class RigidWorld:
                     links.append(RigidVisual(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                     bodies.append(robot.bodies[link])
         for name, person in self._humans.items():
-            drawn = appearance.person(person.spec.height).parts
+            drawn = appearance.load_human_model(person.spec.height).parts
             mine = [(part, person.bodies[part]) for part in (*BODY_PARTS, *(hand.link for hand in person.hands))]
             for part, body in (*mine, *((limb, 0) for limb in VISUAL_PARTS)):  # limbs have no body: link_q() places them
                 links.append(RigidVisual(f"{name}/{part}", Organ.HUMAN, person.spec.index, drawn[part]))

@@ -161,7 +161,7 @@ def _at_most(vector: np.ndarray, length: float) -> np.ndarray:
 
 
 def axes_of(pose: np.ndarray) -> np.ndarray:
-    """The axes of a pose [7] as rows [3, 3], in its parent (frames.matrix in plain numbers: ten times as fast)."""
+    """The axes of a pose [7] as rows [3, 3], in its parent (frames.to_matrix in plain numbers: ten times as fast)."""
     x, y, z, w = pose[3:].tolist()
     return np.array(
         [

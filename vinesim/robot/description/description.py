@@ -259,8 +259,8 @@ def _locate(name: str) -> pathlib.Path:
             raise DescriptionError("tiago_pro: its files are not installed; pip install vinesim[tiago]")
         return found
     try:
-        return data_files.find("robots", name, ".urdf").resolve()
-    except data_files.NotFoundInData as error:
+        return data_files.find_data_file("robots", name, ".urdf").resolve()
+    except data_files.DataFileNotFound as error:
         raise DescriptionError(f"{name}: {error}") from error
 
 

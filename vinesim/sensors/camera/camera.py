@@ -98,7 +98,7 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> camera_raster.Pinhole:
         raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
     lens = camera_raster.Pinhole()
     lens.eye = wp.vec3(*map(float, pose[:3]))
-    lens.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+    lens.turn = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
     lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
     lens.width, lens.height, lens.reach = int(info.width), int(info.height), REACH
     wide = max(info.cx, info.width - info.cx) / info.fx

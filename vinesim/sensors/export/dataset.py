@@ -22,7 +22,7 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.spec import Scene, Season, sun_at
+from vinesim.scene.spec import Scene, Season, sun_direction
 from vinesim.scene.values import CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
@@ -236,7 +236,7 @@ def _daylight(rng: np.random.Generator) -> tuple[float, tuple[float, float, floa
     lowest = np.sin(np.radians(6.0)) - np.sin(LATITUDE) * np.sin(declination)
     half_day = float(np.degrees(np.arccos(lowest / (np.cos(LATITUDE) * np.cos(declination))))) / 15.0
     hour = 12.0 + half_day * float(rng.uniform(-1.0, 1.0))
-    return hour, sun_at(hour, float(declination), float(LATITUDE))
+    return hour, sun_direction(hour, float(declination), float(LATITUDE))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

@@ -69,7 +69,7 @@ class Sweep:
         part = slice(first * self.rows, (first + count) * self.rows)
         head = self._head
         head.eye = wp.vec3(*map(float, pose[:3]))
-        head.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+        head.turn = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
         head.first, head.end, head.reach = first, first + count, float(reach)
         low, high = self._fan
         turn = 0.5 * (low + high) + (first + 0.5 * (count - 1)) * self.step

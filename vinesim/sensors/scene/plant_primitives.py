@@ -9,7 +9,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.kernels.shading import materials
 from vinesim.scene import leaves
-from vinesim.scene.berries import VARIETIES, berries, piece_of
+from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.scene import textures
@@ -32,7 +32,7 @@ def canes(model: Model, still: int) -> Batch:
     seed = rng.uniform(size=len(model.tree_first))
     organ, tree = model.body_organ[bodies], model.body_tree[bodies]
     index = tree.copy()
-    bunch_of = model.bunch_of()[bodies]
+    bunch_of = model.bunch_of_body()[bodies]
     index = np.where(bunch_of >= 0, bunch_of, index)
     # shoots ripen from the base: green towards the tip, brown where the wood is thick
     green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
@@ -61,7 +61,7 @@ def foliage(model: Model) -> list[Batch]:
     if not count:
         return []
     rng = np.random.default_rng(11)
-    shape = leaves.shape_of(np.arange(count))
+    shape = leaves.blade_shape(np.arange(count))
     q = model.leaf_pose[:, 3:]
     rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
     base, petiole_end, size = model.leaf_base, model.leaf_pose[:, :3], model.leaf_size * textures.leaf_scale(shape)
@@ -171,7 +171,7 @@ def _bunches(
     ripeness: Ripeness | None,
 ) -> list[Batch]:
     ones = [
-        berries(
+        lay_out_berries(
             float(model.bunch_length[b]),
             float(model.bunch_radius[b]),
             int(model.bunch_berries[b]),
@@ -187,7 +187,7 @@ def _bunches(
     whole = model.bunch_length[which].astype(float)
 
     def piece_at(position: np.ndarray, owner: np.ndarray) -> np.ndarray:
-        inner = piece_of(position, whole[owner], pieces[owner])
+        inner = segment_of(position, whole[owner], pieces[owner])
         return first_piece[owner] + inner
 
     def placed(points: np.ndarray, piece: np.ndarray, owner: np.ndarray) -> np.ndarray:

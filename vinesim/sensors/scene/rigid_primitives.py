@@ -9,7 +9,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.kernels.shading import materials
-from vinesim.scene.appearance import smooth
+from vinesim.scene.appearance import smooth_normals
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual, Mesh, Shape
@@ -135,5 +135,5 @@ def _read(file: str, scale: tuple[float, ...]) -> Mesh:
             linked = member[faces]
             whole = (linked[:, 0] != linked[:, 1]) & (linked[:, 1] != linked[:, 2]) & (linked[:, 0] != linked[:, 2])
             vertices, faces, cells = merged, linked[whole], int(cells * 0.75)
-        _meshes[key] = Mesh(vertices[faces].astype(np.float32), smooth(vertices, faces))
+        _meshes[key] = Mesh(vertices[faces].astype(np.float32), smooth_normals(vertices, faces))
     return _meshes[key]

@@ -102,7 +102,7 @@ def litter(low: np.ndarray, high: np.ndarray, age: float, still: int) -> Batch |
     return batch(
         LEAF,
         columns(spot, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
-        b=columns(rib, leaves.shape_of(np.arange(n))),
+        b=columns(rib, leaves.blade_shape(np.arange(n))),
         c=columns(up, rng.uniform(size=n)),
         d=bend,
         material=int(materials.FOLIAGE),

@@ -12,9 +12,9 @@ import numpy as np
 
 from vinesim.scene import leaves
 
-GRASS, HERB = leaves.SHAPES, leaves.SHAPES + 1
+GRASS, HERB = leaves.SHAPE_COUNT, leaves.SHAPE_COUNT + 1
 """Numbers of the outlines that are not vine leaves: a tuft of grass, a broad weed."""
-OUTLINES = leaves.SHAPES + 2
+OUTLINES = leaves.SHAPE_COUNT + 2
 SIDE = 256
 """Texels along each side of the tables."""
 _EDGE_SCALE = 400.0
@@ -30,7 +30,7 @@ def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
 
 def leaf_scale(shape: np.ndarray) -> np.ndarray:
     """Length from petiole to tip in units of ``Model.leaf_size``, by outline [shape]."""
-    tips = np.array([leaves.outline(np.zeros(1), i)[0] for i in range(leaves.SHAPES)])
+    tips = np.array([leaves.blade_outline(np.zeros(1), i)[0] for i in range(leaves.SHAPE_COUNT)])
     return tips[shape]
 
 
@@ -66,8 +66,8 @@ def outlines() -> tuple[np.ndarray, np.ndarray]:
     theta, radius = np.arctan2(u, v), np.hypot(u, v)
     table = np.zeros((OUTLINES, SIDE, SIDE))
     knots = np.linspace(-np.pi, np.pi, 8193)
-    for shape in range(leaves.SHAPES):
-        edge = leaves.outline(knots, shape) / leaf_scale(shape)
+    for shape in range(leaves.SHAPE_COUNT):
+        edge = leaves.blade_outline(knots, shape) / leaf_scale(shape)
         table[shape] = _distance(radius < np.interp(theta, knots, edge))
     table[GRASS] = _distance(_tuft())
     table[HERB] = _distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
@@ -96,7 +96,7 @@ def blades() -> np.ndarray:
     """Vein strength, relief slope along u and v, tone: [outline, SIDE/2, SIDE/2, 4] float32."""
     u, v = _grid(SIDE)
     table = np.zeros((OUTLINES, SIDE, SIDE, 4), np.float32)
-    for shape in range(leaves.SHAPES):
+    for shape in range(leaves.SHAPE_COUNT):
         rng = np.random.default_rng(71 + shape)
         vein, crease = np.zeros_like(u), np.zeros_like(u)
         for angle, length in ((0.0, 1.0), (54.0, 0.86), (-54.0, 0.86), (112.0, 0.62), (-112.0, 0.62)):

@@ -2,7 +2,7 @@
 
 All of it follows from the primitives, not from the picture: noise and range limits of a camera change nothing here.
 Everything is tied to ids that are the same on every client: bunch numbers of the model, and berry numbers as
-:func:`vinesim.scene.berries.berries` counts them.
+:func:`vinesim.scene.berries.lay_out_berries` counts them.
 """
 
 from __future__ import annotations
