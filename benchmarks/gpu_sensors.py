@@ -46,7 +46,9 @@ def things() -> RigidVisual:
     """One solid of each kind, side by side."""
     shapes = [("box", 0.2, 0.1, 0.3), ("cylinder", 0.08, 0.2), ("capsule", 0.07, 0.2), ("ellipsoid", 0.1, 0.05, 0.2)]
     at = frames.pose(np.array([[0.3 * i, 0.0, 0.0] for i in range(len(shapes))]))
-    return RigidVisual("things", Organ.ROBOT, 0, tuple(Shape(k, tuple(s), q) for (k, *s), q in zip(shapes, at, strict=True)))
+    return RigidVisual(
+        "things", Organ.ROBOT, 0, tuple(Shape(k, tuple(s), q) for (k, *s), q in zip(shapes, at, strict=True))
+    )
 
 
 def world(model: Model, device: str) -> tuple[Primitives, Snapshot]:

@@ -268,7 +268,10 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
     assert off < 1e-3
     np.testing.assert_allclose(force[400:, 0, :, 1].mean(0), force[400:, 1, :, 1].mean(0), rtol=0.01)
     np.testing.assert_allclose(
-        ours.rigid.joint_measurements("grip")[2][2:], oracle.rigid.joint_measurements("grip")[2][2:], rtol=0.01, atol=0.01 * effort
+        ours.rigid.joint_measurements("grip")[2][2:],
+        oracle.rigid.joint_measurements("grip")[2][2:],
+        rtol=0.01,
+        atol=0.01 * effort,
     )
 
 
@@ -286,7 +289,9 @@ def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
         ours.step()
         oracle.step()
         force.append([[force_on(ours, f)[1], oracle.contact_force_on(f)[1]] for f in FINGERS])
-        off = max(off, float(np.linalg.norm(middle_of(ours.snapshot().body_q[body]) - middle_of(oracle.body_pose(body)))))
+        off = max(
+            off, float(np.linalg.norm(middle_of(ours.snapshot().body_q[body]) - middle_of(oracle.body_pose(body))))
+        )
     force = np.array(force)
     for phase in (slice(150, 240), slice(400, 450)):
         mine, theirs = force[phase].mean(0).T

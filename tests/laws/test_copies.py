@@ -81,7 +81,9 @@ def test_across_the_network_the_stronger_wins_too(left, right, delay):
     seen = []
     for tick in range(1200):
         for own in worlds:
-            post[own].append((*worlds[own].base_state(own), *(x.copy() for x in worlds[own].joint_measurements(own)[:2])))
+            post[own].append(
+                (*worlds[own].base_state(own), *(x.copy() for x in worlds[own].joint_measurements(own)[:2]))
+            )
         for own, other in (("left", "right"), ("right", "left")):
             if tick >= delay:
                 worlds[own].follow_remote(other, *post[other].popleft())

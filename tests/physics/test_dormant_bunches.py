@@ -46,9 +46,13 @@ def test_who_is_near_gets_a_body_with_the_weight_it_had():
     world, other = physics.rigid.mj_model, fallen.rigid.mj_model
     assert world.body("loose/0").mass == pytest.approx(other.body("loose/0").mass)
     np.testing.assert_allclose(world.body("loose/0").inertia, other.body("loose/0").inertia, rtol=1e-4)
-    np.testing.assert_allclose(physics.support_tracker.object_state(BUNCH(1))[0], frames.pose([1.0, 0.0, 0.05]), atol=1e-9)
+    np.testing.assert_allclose(
+        physics.support_tracker.object_state(BUNCH(1))[0], frames.pose([1.0, 0.0, 0.05]), atol=1e-9
+    )
     with pytest.raises(ValueError, match="bunch 1 is loose already"):
-        physics.dormant_bunches.rigid.add_bunch(1, physics.rigid._free_bunches[1], frames.pose([0.0, 0, 0]), np.zeros(6))
+        physics.dormant_bunches.rigid.add_bunch(
+            1, physics.rigid._free_bunches[1], frames.pose([0.0, 0, 0]), np.zeros(6)
+        )
 
 
 def test_a_tree_whose_bunch_was_laid_down_moves_without_it_when_it_wakes():

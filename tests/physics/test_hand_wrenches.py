@@ -89,7 +89,9 @@ def test_a_hand_that_holds_a_link_gives_its_pull():
     np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], rtol=0.02, atol=0.05)
     body = rigid.mj_model.body(f"probe/{near[2]}").id
     jacobian = rigid.jacobian("probe", near[2], rigid.mj_data.xipos[body])
-    np.testing.assert_allclose(jacobian.T @ wrench, rigid.gravity_effort("probe") - rigid.joint_measurements("probe")[2], atol=0.05)
+    np.testing.assert_allclose(
+        jacobian.T @ wrench, rigid.gravity_effort("probe") - rigid.joint_measurements("probe")[2], atol=0.05
+    )
 
 
 # ---------------------------------------------------------------------- copies of people

@@ -11,7 +11,7 @@ import pytest
 from tests.physics.test_rigid_world import arm, step, yard
 from tests.support.contact_scenes import probe
 from vinesim import frames
-from vinesim.physics.rigid.human_body import VISUAL_PARTS, BODY_PARTS, THICK, HumanError, posture, standing_pose
+from vinesim.physics.rigid.human_body import BODY_PARTS, THICK, VISUAL_PARTS, HumanError, posture, standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene import appearance
@@ -142,7 +142,9 @@ def test_a_hand_stays_outside_when_its_controller_is_inside():
     assert hand.force[0] == pytest.approx(100.0 * (hand.controller[0] - hand.pose[0]), rel=0.01)
     rigid.move_human("eva", spec.pose)
     step(rigid, 150)
-    assert np.abs(rigid.hand_sample("eva", "right").pose - spec.pose.right).max() < 1e-3  # free again, and no offset left
+    assert (
+        np.abs(rigid.hand_sample("eva", "right").pose - spec.pose.right).max() < 1e-3
+    )  # free again, and no offset left
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0, 8.0])
@@ -360,7 +362,8 @@ def limbs_of(pose: HumanPose) -> tuple[RigidWorld, dict[str, np.ndarray]]:
 def test_arms_reach_from_shoulders_to_wrists(posture: str):
     """Bones keep their lengths, elbows join, and both arms of a mirrored pose mirror each other."""
     look = appearance.load_human_model(1.75)
-    pose = appearance.apply_posture(standing_pose(frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(0.7))), posture, 1.75
+    pose = appearance.apply_posture(
+        standing_pose(frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(0.7))), posture, 1.75
     )
     _, at = limbs_of(pose)
     for side, sign in (("left", 1.0), ("right", -1.0)):
@@ -494,7 +497,10 @@ def test_a_robot_is_taken_by_the_link_and_let_go():
     rigid.release("eva", "right")
     step(rigid, 300)
     assert rigid.hand_sample("eva", "right").held is None
-    assert np.abs(rigid.hand_sample("eva", "right").pose[:3] - rigid.hand_sample("eva", "right").controller[:3]).max() < 1e-3
+    assert (
+        np.abs(rigid.hand_sample("eva", "right").pose[:3] - rigid.hand_sample("eva", "right").controller[:3]).max()
+        < 1e-3
+    )
     assert abs(rigid.joint_measurements("probe")[0][0]) < 1e-4
 
 
@@ -527,12 +533,16 @@ def test_others_join_and_leave_while_a_hand_holds():
     np.testing.assert_array_equal(rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose)
     step(rigid, 30)
     step(alone, 30)
-    np.testing.assert_allclose(rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose, atol=1e-9)
+    np.testing.assert_allclose(
+        rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose, atol=1e-9
+    )
     rigid.remove_robot("bert")
     rigid.remove_human("ida")
     step(rigid, 30)
     step(alone, 30)
-    np.testing.assert_allclose(rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose, atol=1e-9)
+    np.testing.assert_allclose(
+        rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose, atol=1e-9
+    )
     assert rigid.hand_sample("eva", "right").held == ("box/0", "box")
     rigid.remove_human("eva")
     assert rigid.humans == ()

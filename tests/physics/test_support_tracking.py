@@ -49,7 +49,11 @@ def test_boxes_start_at_rest_on_the_ground_and_a_picked_bunch_moves_until_it_lie
     assert physics.support_tracker.moving == [BUNCH(0)]
     settle(physics)
     assert physics.support_tracker.pose_on_support(BUNCH(0))[0] == ""
-    np.testing.assert_allclose(physics.support_tracker.pose_on_support(BUNCH(0))[1], physics.support_tracker.object_state(BUNCH(0))[0], atol=1e-12)
+    np.testing.assert_allclose(
+        physics.support_tracker.pose_on_support(BUNCH(0))[1],
+        physics.support_tracker.object_state(BUNCH(0))[0],
+        atol=1e-12,
+    )
 
 
 def test_in_a_box_it_lies_in_the_frame_of_the_box_wherever_that_goes():
@@ -83,7 +87,9 @@ def test_on_a_robot_a_box_rests_in_the_frame_of_its_link_and_what_is_in_it_in_th
     for _ in range(100):
         run(physics, 1, robot, 0.5)
         assert physics.support_tracker.moving == []
-    pose, velocity = physics.support_tracker.to_world("anna/base_footprint", physics.support_tracker.pose_on_support(BOX(0))[1])
+    pose, velocity = physics.support_tracker.to_world(
+        "anna/base_footprint", physics.support_tracker.pose_on_support(BOX(0))[1]
+    )
     here, speed = physics.support_tracker.object_state(BOX(0))
     np.testing.assert_allclose(pose[:3], here[:3], atol=1e-6)
     np.testing.assert_allclose(velocity[:3], speed[:3], atol=0.02)

@@ -494,7 +494,9 @@ def bunch_in_hand(description: Description, effort: float) -> tuple[Yard, int]:
     yard.robot.command_gripper("gripper_left", 0.08)
     yard.run(0.5)
     middle = yard.robot.frame_pose("gripper_left_grasping_link")
-    ball = FreeBunch(0.3, np.zeros(3), np.full(3, 1e-4), np.zeros(3), np.zeros((1, 3)), np.zeros((1, 3)), np.array([0.03]))
+    ball = FreeBunch(
+        0.3, np.zeros(3), np.full(3, 1e-4), np.zeros(3), np.zeros((1, 3)), np.zeros((1, 3)), np.array([0.03])
+    )
     yard.rigid.add_bunch(0, ball, middle, np.zeros(6))
     yard.robot.command_gripper("gripper_left", 0.0, effort)
     body = yard.rigid.mj_model.body("loose/0").id

@@ -18,7 +18,7 @@ from vinesim.robot.description import description
 from vinesim.scene import appearance
 from vinesim.scene.appearance import AppearanceError
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.values import HumanSpec, RigidVisual, Mesh, Shape
+from vinesim.scene.values import HumanSpec, Mesh, RigidVisual, Shape
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import looking
 from vinesim.sensors.scene import rigid_primitives

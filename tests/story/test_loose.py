@@ -85,7 +85,11 @@ def test_a_bunch_is_told_of_from_cut_to_rest_then_nothing_until_it_is_gripped():
         world.run(seconds)
     world.until(lambda: at_rest(world), 5.0)
     world.run(0.1)
-    assert ada.physics.support_tracker.pose_on_support(BUNCH(0))[0] == bob.physics.support_tracker.pose_on_support(BUNCH(0))[0] == ""
+    assert (
+        ada.physics.support_tracker.pose_on_support(BUNCH(0))[0]
+        == bob.physics.support_tracker.pose_on_support(BUNCH(0))[0]
+        == ""
+    )
     assert pose_of(ada, BUNCH(0))[2] < lying + 0.05
     assert apart(ada, bob, BUNCH(0)) < 1e-3
 
@@ -130,7 +134,11 @@ def test_a_box_that_rides_on_a_robot_costs_nothing_and_is_where_the_robot_is():
     world.until(lambda: ada.physics.support_tracker.moving, 1.0)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)
-    assert bob.physics.support_tracker.pose_on_support(BOX(1))[0] == ada.physics.support_tracker.pose_on_support(BOX(1))[0] == "ada/base_footprint"
+    assert (
+        bob.physics.support_tracker.pose_on_support(BOX(1))[0]
+        == ada.physics.support_tracker.pose_on_support(BOX(1))[0]
+        == "ada/base_footprint"
+    )
     before = sent(ada), sent(bob)
     start = pose_of(ada, BOX(1))[0]
     drive(ada, 1.0)

@@ -67,7 +67,9 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     assert visitor.physics.support_tracker.pose_on_support(bunch)[0] == f"box/{task.box}"
     world = visitor.physics.rigid.mj_model
     world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    visitor.physics.support_tracker.set_state(bunch, visitor.physics.support_tracker.object_state(bunch)[0], np.zeros(6))
+    visitor.physics.support_tracker.set_state(
+        bunch, visitor.physics.support_tracker.object_state(bunch)[0], np.zeros(6)
+    )
     run(100)
     weighed = np.mean([(run(), pressed_on_ground(visitor.physics, task.box))[1] for _ in range(50)]) - empty
     assert weighed == pytest.approx(float(model.body_mass[model.bunch_body[task.bunch]]) * GRAVITY, rel=0.03)

@@ -20,7 +20,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import RigidVisual, Measurement, Shape, Snapshot
+from vinesim.scene.values import Measurement, RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec, Visibility, pinhole
 from vinesim.sensors.camera.renderers import NoRenderer
 from vinesim.sensors.export.images import depth_colours, looking, write_png

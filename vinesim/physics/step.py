@@ -21,7 +21,17 @@ from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.support_tracking import SupportTracker
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, RigidVisual, Parting, RobotSpec, Snapshot
+from vinesim.scene.values import (
+    Contact,
+    HandSample,
+    Haptic,
+    HumanPose,
+    HumanSpec,
+    Parting,
+    RigidVisual,
+    RobotSpec,
+    Snapshot,
+)
 
 
 class Physics:

@@ -119,7 +119,9 @@ class Stage:
             pose = _at(one.x, one.y, one.yaw)
             rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
-            pose = appearance.apply_posture(standing_pose(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
+            pose = appearance.apply_posture(
+                standing_pose(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height
+            )
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
         _apart(rigid)
 

@@ -71,7 +71,9 @@ class ObjectSync:
         if lie:
             bunches = [unthing(fact.thing)[1] for fact in lie]
             self._changed_trees.update(self._tree_of(bunch) for bunch in bunches)
-            self.physics.dormant_bunches.add(bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie]))
+            self.physics.dormant_bunches.add(
+                bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie])
+            )
 
     def _apply_object_record(self, fact: Fact, holds: bool) -> bool:
         """Let a box or a bunch be where a fact says; True if it is a bunch that has no body here and needs none yet."""
@@ -84,7 +86,9 @@ class ObjectSync:
         if fact.moving:
             self._clear_resting(number)
             pose = np.array(fact.pose)
-            self._ensure_body(number, *(self.physics.support_tracker.to_world(fact.parent, pose) or (pose, np.zeros(6))))
+            self._ensure_body(
+                number, *(self.physics.support_tracker.to_world(fact.parent, pose) or (pose, np.zeros(6)))
+            )
             self.physics.support_tracker.set_moving([number])
             return False
         self._set_resting(number, fact)
@@ -220,7 +224,9 @@ class ObjectSync:
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
         """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
         riding = self.physics.support_tracker
-        found = {number for number in riding.moving if self._supporting_actor(number) == name} | riding.objects_moved_by(name)
+        found = {
+            number for number in riding.moving if self._supporting_actor(number) == name
+        } | riding.objects_moved_by(name)
         for number, actor in (*riding.touched, *self.physics.touched):
             other = thing_named(actor)
             if other in mine or (actor == name and is_tree(number)):

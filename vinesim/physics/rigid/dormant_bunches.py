@@ -25,7 +25,9 @@ NEAR = 2.5
 class DormantBunches:
     """Picked bunches without bodies, each at a pose in the frame of its parent."""
 
-    def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver, riding: SupportTracker) -> None:
+    def __init__(
+        self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver, riding: SupportTracker
+    ) -> None:
         self.plants, self.rigid, self.contact_solver, self.riding = plants, rigid, contact_solver, riding
         self._loose: dict[int, FreeBunch] = {}
         self._parent: dict[int, str] = {}

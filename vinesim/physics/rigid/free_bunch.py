@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.static_world import ALL_BITS, FRICTION, FREE_BUNCH, CRATE_FLOOR
+from vinesim.physics.rigid.static_world import ALL_BITS, CRATE_FLOOR, FREE_BUNCH, FRICTION
 from vinesim.scene.values import Shape
 
 POOL_SIZE = 12

@@ -366,7 +366,7 @@ class HumanBody:
             velocity = d.qvel[hand.v]
             if hand.on_plant:
                 velocity[:] = d.xfrc_applied[hand.body] = 0.0
-            elif hand.free < LINGER:
+            elif hand.steps_since_contact < LINGER:
                 turning = frames.rotate(here[3:], velocity[3:])
                 force = self.spec.stiffness * offset + self.damping * (step / dt - velocity[:3])
                 moment = TURN * angle + TURN_DAMPING * (spin / dt - turning)
@@ -388,7 +388,9 @@ class HumanBody:
                 d.qvel[hand.v] = 0.0
                 hand.steps_since_contact = LINGER
 
-    def _look(self, m: mujoco.MjModel, d: mujoco.MjData, hand: HandBody, at: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def _look(
+        self, m: mujoco.MjModel, d: mujoco.MjData, hand: HandBody, at: np.ndarray, step: np.ndarray
+    ) -> np.ndarray:
         """A step [3] m of a fast free hand, shortened if something is in its way."""
         length = float(np.linalg.norm(step))
         if length < THICK or hand.busy:
@@ -420,12 +422,14 @@ class HumanBody:
     def sample(self, hand: HandBody, d: mujoco.MjData) -> HandSample:
         """What is known of a hand."""
         pose = np.concatenate([d.qpos[hand.q][:3], frames.from_wxyz(d.qpos[hand.q][3:])])
-        return HandSample(pose, self.controller(hand).copy(), hand.force.copy(), hand.steps_since_contact == 0, hand.held)
+        return HandSample(
+            pose, self.controller(hand).copy(), hand.force.copy(), hand.steps_since_contact == 0, hand.held
+        )
 
     # ------------------------------------------------------------------ holding
 
     def grasp(self, m: mujoco.MjModel, d: mujoco.MjData, hand: HandBody, body: int | None) -> None:
-        """Weld a hand to a MuJoCo body at ``hand.grip``; None: it only stops touching, and rides on a plant.
+        """Weld a hand to a MuJoCo body at ``hand.grasp_pose``; None: it only stops touching, and rides on a plant.
 
         A hand that holds meets nothing: what it holds does.
         """

@@ -23,7 +23,7 @@ from vinesim.physics.contact.effective_mass import EffectiveMass
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, hand_wrenches, recompile, static_world
 from vinesim.physics.rigid.free_bunch import FreeBunch
-from vinesim.physics.rigid.human_body import HAND, VISUAL_PARTS, BODY_PARTS, HandBody, HumanError, HumanBody, wake_body
+from vinesim.physics.rigid.human_body import BODY_PARTS, HAND, VISUAL_PARTS, HandBody, HumanBody, HumanError, wake_body
 from vinesim.physics.rigid.robot_body import GIVE, LinkSensor, RobotBody, build_error
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.scene import appearance
@@ -91,7 +91,13 @@ class RigidWorld:
         """
         robots, people = tuple(self._robots.values()), tuple(self._humans.values())
         if isinstance(spec, HumanSpec):
-            return self._compile_world(robots, (*people, HumanBody(spec, self._free_collision_bit("human", spec.name, HumanError), is_remote=is_remote)))
+            return self._compile_world(
+                robots,
+                (
+                    *people,
+                    HumanBody(spec, self._free_collision_bit("human", spec.name, HumanError), is_remote=is_remote),
+                ),
+            )
         robot = RobotBody(spec, self._free_collision_bit("robot", spec.name, RobotError))
         try:
             return self._compile_world((*robots, robot), people)
@@ -107,14 +113,19 @@ class RigidWorld:
         those = (*draft.robots, *draft.humans)
         (newcomer, *more) = [actor for actor in those if actor not in here] or [None]
         others = tuple(actor for actor in those if actor is not newcomer)
-        if newcomer is None or more or others != here or draft.bunch_slots <= max(self._bunch_slot.values(), default=-1):
+        if (
+            newcomer is None
+            or more
+            or others != here
+            or draft.bunch_slots <= max(self._bunch_slot.values(), default=-1)
+        ):
             return False
         if isinstance(newcomer, HumanBody):
             self._humans[newcomer.spec.name] = newcomer
             self._replace_world(draft)
             return True
         spec = newcomer.spec
-        self.robot(spec.name) = newcomer
+        self._robots[spec.name] = newcomer
         self._replace_world(draft)
         self.place_robot(spec.name, spec.pose, spec.home)
         return True
@@ -122,7 +133,7 @@ class RigidWorld:
     def remove_robot(self, name: str) -> None:
         """Let a robot leave; all others go on exactly where they are."""
         self.robot(name)
-        del self.robot(name)
+        del self._robots[name]
         self._recompile()
 
     def place_robot(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
@@ -142,7 +153,11 @@ class RigidWorld:
 
     def actor_position(self, name: str) -> np.ndarray:
         """[3] m where a robot's base or a person's hips are."""
-        return self.human(name).part_poses[BODY_PARTS.index("hips"), :3] if name in self._humans else self.base_state(name)[0][:3]
+        return (
+            self.human(name).part_poses[BODY_PARTS.index("hips"), :3]
+            if name in self._humans
+            else self.base_state(name)[0][:3]
+        )
 
     def human(self, name: str) -> HumanBody:
         """The body of a person who is here."""
@@ -516,7 +531,12 @@ class RigidWorld:
 
     def rebind(self, world: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Let the robots live in another world, in which their joints and bodies have the same names."""
-        self.mj_model, self.mj_data, self.contact_force, self._kinematics_current = world, data, np.zeros(world.nv), False
+        self.mj_model, self.mj_data, self.contact_force, self._kinematics_current = (
+            world,
+            data,
+            np.zeros(world.nv),
+            False,
+        )
         for robot in self._robots.values():
             robot.locate(world)
 
@@ -554,7 +574,7 @@ class RigidWorld:
 
     def robot(self, name: str) -> RobotBody:
         try:
-            return self.robot(name)
+            return self._robots[name]
         except KeyError:
             raise ValueError(f"no robot {name!r} here; there are: {', '.join(self._robots) or 'none'}") from None
 
@@ -637,7 +657,9 @@ class RigidWorld:
         if before is None:
             self.mj_data, self.contact_force = mujoco.MjData(world), np.zeros(world.nv)
         else:
-            parked = {free_bunch.slot_name(slot) for slot in set(range(self._pool_size)) - set(self._bunch_slot.values())}
+            parked = {
+                free_bunch.slot_name(slot) for slot in set(range(self._pool_size)) - set(self._bunch_slot.values())
+            }
             self.mj_data, self.contact_force = recompile.transfer_state(*before, world, parked)
         self._effective_mass = EffectiveMass(world)
         self._valid_qpos = self.mj_data.qpos.copy()
@@ -677,7 +699,9 @@ class RigidWorld:
     def _list_visuals(self) -> tuple[tuple[RigidVisual, ...], np.ndarray]:
         links, bodies = [], []
         for box, size in enumerate(self.model.box_size):
-            links.append(RigidVisual(f"box/{box}", Organ.BOX, box, appearance.crate_shapes(tuple(map(float, size)), box)))
+            links.append(
+                RigidVisual(f"box/{box}", Organ.BOX, box, appearance.crate_shapes(tuple(map(float, size)), box))
+            )
             bodies.append(self.mj_model.body(f"box/{box}").id)
         for name, robot in self._robots.items():
             for link, shapes in robot.shapes.items():
@@ -687,7 +711,10 @@ class RigidWorld:
         for name, person in self._humans.items():
             drawn = appearance.load_human_model(person.spec.height).parts
             mine = [(part, person.bodies[part]) for part in (*BODY_PARTS, *(hand.link for hand in person.hands))]
-            for part, body in (*mine, *((limb, 0) for limb in VISUAL_PARTS)):  # limbs have no body: link_q() places them
+            for part, body in (
+                *mine,
+                *((limb, 0) for limb in VISUAL_PARTS),
+            ):  # limbs have no body: link_q() places them
                 links.append(RigidVisual(f"{name}/{part}", Organ.HUMAN, person.spec.index, drawn[part]))
                 bodies.append(body)
         for bunch, body in self._free_bunches.items():
@@ -703,5 +730,7 @@ class RigidWorld:
             owner.update({body: (name, link) for link, body in robot.bodies.items()})
         for name, person in self._humans.items():
             owner.update({body: (name, link) for link, body in person.bodies.items()})
-        owner.update({m.body(free_bunch.slot_name(slot)).id: (f"bunch/{i}", "bunch") for i, slot in self._bunch_slot.items()})
+        owner.update(
+            {m.body(free_bunch.slot_name(slot)).id: (f"bunch/{i}", "bunch") for i, slot in self._bunch_slot.items()}
+        )
         return owner

@@ -161,7 +161,9 @@ class TrajectoryController:
         self._knots, self._points, self._slopes = trajectory.times, trajectory.positions, trajectory.velocities
         if trajectory.times[0] > 0.0:  # from where they are, or should be
             by_servo = np.isin(self.robot.interface[active], (Interface.POSITION, Interface.VELOCITY))
-            here = np.where(by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active])
+            here = np.where(
+                by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active]
+            )
             self._knots = np.concatenate([[0.0], self._knots])
             self._points = np.concatenate([here[None], self._points])
             if self._slopes is not None:

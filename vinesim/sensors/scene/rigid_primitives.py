@@ -12,7 +12,7 @@ from vinesim.kernels.shading import materials
 from vinesim.scene.appearance import smooth_normals
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.values import RigidVisual, Mesh, Shape
+from vinesim.scene.values import Mesh, RigidVisual, Shape
 from vinesim.sensors.scene.plant_primitives import Ripeness, bunches
 from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, batch
 
