@@ -20,7 +20,7 @@ from vinesim.scene.appearance import AppearanceError
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import HumanSpec, Mesh, RigidVisual, Shape
 from vinesim.sensors.camera.camera import Camera
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene import rigid_primitives
 
 ROOM = 0.06
@@ -40,7 +40,7 @@ def person(name: str, height: float = 1.75) -> RigidWorld:
 def silhouette(shapes: tuple[RigidVisual, ...], poses: np.ndarray, eye: np.ndarray) -> np.ndarray:
     """Pixels [height, width] that show a person who stands at the origin."""
     primitives, _ = sensor_scenes.world(*shapes, at=poses)
-    _, seen = sensor_scenes.raster(primitives, looking(eye, np.array([0.0, 0.0, 0.95])))
+    _, seen = sensor_scenes.raster(primitives, look_at(eye, np.array([0.0, 0.0, 0.95])))
     names = np.where(seen >= 0, primitives.label[np.maximum(seen, 0)], 0)
     return names == label(Organ.HUMAN, 4)
 
@@ -119,7 +119,7 @@ def test_a_head_is_as_large_as_a_head() -> None:
 
 def test_normals_survive_their_packing() -> None:
     way = frames.normalize(np.random.default_rng(3).normal(size=(4000, 3)))
-    code = rigid_primitives.packed(way)
+    code = rigid_primitives.pack_normals(way)
     assert (code == np.round(code)).all()
     assert code.min() >= 1.0
     assert code.max() < 2**24
@@ -152,7 +152,7 @@ def test_neighbouring_crates_differ_in_colour() -> None:
 
 
 def test_every_surface_has_its_material() -> None:
-    assert set(appearance.SURFACES) == set(rigid_primitives._MATERIAL)
+    assert set(appearance.SURFACES) == set(rigid_primitives._MATERIALS)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
         rigid = RigidWorld(sensor_scenes.empty())
         rigid.add_human(HumanSpec("eva", 4, dataclasses.replace(pose, **hand)))
         primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
-        depth, _ = sensor_scenes.raster(primitives, looking(np.array([1.1, -0.4, 1.4]), np.array([0.5, -0.4, 1.42])))
+        depth, _ = sensor_scenes.raster(primitives, look_at(np.array([1.1, -0.4, 1.4]), np.array([0.5, -0.4, 1.42])))
         views[name] = depth < 0.75
     rows = {name: np.flatnonzero(view.any(1)) for name, view in views.items()}
     scale = sensor_scenes.SMALL.fx / 0.6
@@ -216,13 +216,13 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
 def test_a_lamp_is_seen_in_its_colour() -> None:
     """F41: the lit tier of a robot's signal tower is the greenest thing in a picture of it, in the shade too."""
     rigid = RigidWorld(sensor_scenes.empty())
-    rigid.add_robot(description.load("vinebot").spec("bot"))
+    rigid.add_robot(description.load_description("vinebot").to_spec("bot"))
     primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
-    pose = looking(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
+    pose = look_at(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.6, 0.3, 0.5)).render(primitives, pose)
     _, seen = sensor_scenes.raster(primitives, pose)
-    material = primitives.looks.material.numpy()
-    tint = primitives.looks.tint.numpy()
+    material = primitives.materials.material.numpy()
+    tint = primitives.materials.tint.numpy()
     lit = (seen >= 0) & (material[seen] == int(materials.LAMP)) & (tint[seen][..., 1] > 2.0 * tint[seen][..., 0])
     assert lit.sum() > 20
     green = frame.rgb[..., 1].astype(int) - frame.rgb[..., 0]

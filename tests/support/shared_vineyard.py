@@ -15,7 +15,7 @@ from vinesim.client.client import Client
 from vinesim.net.codec import messages
 from vinesim.net.replication.retained import Facts
 from vinesim.net.transport.bus import EVERY, MemoryBus, MemoryHub
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.model import Model
@@ -73,13 +73,13 @@ rotor = [0.5, 0.5]
 
 
 @functools.cache
-def cart() -> Description:
+def cart() -> RobotDescription:
     """A flat cart with a rim around its deck, and before it a hand of two fingers that goes up and down."""
     with tempfile.TemporaryDirectory() as folder:
         file = pathlib.Path(folder) / "cart.urdf"
         file.write_text(CART)
         file.with_suffix(".toml").write_text(SIDECAR)
-        return load(file)
+        return load_description(file)
 
 
 @functools.cache

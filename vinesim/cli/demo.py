@@ -25,7 +25,7 @@ from rich.table import Table
 
 from vinesim.client.recording import touch_plot
 from vinesim.client.recording.trace import Rows, remote_error
-from vinesim.robot.description.description import Mount
+from vinesim.robot.description.description import SensorMount
 from vinesim.ros import ros_setup
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
@@ -141,7 +141,7 @@ def process_group() -> Iterator[list[Process]]:
 
 def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
     """Run the demo and write ``out``; 0 if all went well."""
-    from vinesim.robot.description.description import load as load_robot
+    from vinesim.robot.description.description import load_description as load_robot
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
 
@@ -208,12 +208,12 @@ def run_job(
     out: pathlib.Path,
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
-    from vinesim.client.tasks.tasks import UnknownJob
-    from vinesim.robot.description.description import load as load_robot
+    from vinesim.client.tasks.tasks import UnknownTask
+    from vinesim.robot.description.description import load_description as load_robot
     from vinesim.scene.spec import load_scene, with_seed
 
     if job not in JOBS:
-        raise UnknownJob(f"no job {job!r}; give push, {' or '.join(JOBS)}")
+        raise UnknownTask(f"no job {job!r}; give push, {' or '.join(JOBS)}")
     console = Console(stderr=True)
     robot, scene = robot or JOBS[job][0], scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
@@ -295,17 +295,20 @@ def choose_poses(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[
     from vinesim.client.tasks import start_poses
 
     try:
-        return start_poses.bunch_in_reach(model, start_poses.spawn_pose(plan, 0)), (["--spawn", "0"], ["--spawn", "1"])
-    except start_poses.NoPlace:
-        bunch, pusher = start_poses.stand_before_a_bunch(model, start_poses.spawn_pose(plan, 0)[:2])
-    poses = (pusher, start_poses.way_to(model, pusher, APPROACH_DISTANCE))
+        return start_poses.find_reachable_bunch(model, start_poses.spawn_pose(plan, 0)), (
+            ["--spawn", "0"],
+            ["--spawn", "1"],
+        )
+    except start_poses.PlacementError:
+        bunch, pusher = start_poses.find_push_pose(model, start_poses.spawn_pose(plan, 0)[:2])
+    poses = (pusher, start_poses.find_approach_pose(model, pusher, APPROACH_DISTANCE))
     pusher_at, visitor_at = (
         ["--place", *(f"{v:.4f}" for v in (p[0], p[1], 2.0 * math.atan2(p[5], p[6])))] for p in poses
     )
     return bunch, (pusher_at, visitor_at)
 
 
-def monitored_topics(cameras: Sequence[Mount]) -> list[str]:
+def monitored_topics(cameras: Sequence[SensorMount]) -> list[str]:
     """What the stranger subscribes to: all of the pusher's topics, of the visitor's its joints and first picture."""
     topics = [
         "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",

@@ -30,7 +30,7 @@ def run(
     from vinesim.client.rate_loop import RateLoop
     from vinesim.client.recording.trace import Trace
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import bunch_centres, checked_bunch, placed, start_pose
+    from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch, with_start_pose
     from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
@@ -41,9 +41,9 @@ def run(
     sys.setswitchinterval(SWITCH_INTERVAL)
     plan = with_seed(load_scene(scene), seed)
     if place is not None:
-        plan, spawn = placed(plan, *place), 0
+        plan, spawn = with_start_pose(plan, *place), 0
     model = generate(plan)
-    checked_bunch(model, reach)
+    validate_bunch(model, reach)
     name = name or f"human-{os.getpid()}"
     start = start_pose(plan, spawn)
     walker = ScriptedHuman(start, height)

@@ -50,7 +50,7 @@ def run(
     from vinesim.sensors.camera import renderers
 
     find_device(device)  # refused before anything is built
-    renderers.check(renderer)
+    renderers.check_renderer(renderer)
     if threads > 1 and device != "cpu":
         raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
@@ -63,29 +63,29 @@ def run(
     from vinesim.client.recording.trace import Trace
     from vinesim.client.sensing.sensor_process import SensorProcess
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import checked_bunch, placed, start_pose
-    from vinesim.client.tasks.tasks import DriveTo, LookAt, checked_job, plan_job
+    from vinesim.client.tasks.start_poses import start_pose, validate_bunch, with_start_pose
+    from vinesim.client.tasks.tasks import DriveTo, LookAt, plan_task, validate_task_name
     from vinesim.net.transport.bus import MemoryHub
-    from vinesim.robot.description.description import load as load_robot
-    from vinesim.robot.tasks.push import ReachAndPush
+    from vinesim.robot.description.description import load_description as load_robot
+    from vinesim.robot.tasks.push import PushBunch
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
 
-    checked_job(job)
+    validate_task_name(job)
     plan = with_seed(load_scene(scene), seed)
     descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:
-        plan = placed(plan, *place)
+        plan = with_start_pose(plan, *place)
         spawn = 0
     model = generate(plan)
     start = start_pose(plan, spawn, back)
     if job is not None:
-        begin, start = plan_job(job, model, start_pose(plan, spawn))
+        begin, start = plan_task(job, model, start_pose(plan, spawn))
         back = 0.0
     name = name or f"robot-{os.getpid()}"
     names = [name] if len(descriptions) == 1 else [f"{name}_{i + 1}" for i in range(len(descriptions))]
     for bunch in (push, watch):
-        checked_bunch(model, bunch)
+        validate_bunch(model, bunch)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
 
@@ -131,13 +131,13 @@ def run(
                 DriveTo(mine, start_pose(plan, spawn, queue=i)) for i, mine in enumerate(client.robots.values())
             ]
         if push is not None and client.trace is not None:
-            reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
+            reach = PushBunch(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
             client.pre_step.append(reach.control)
         script = None
         if job is not None:
             script = begin(client.physics, client.robot)
             client.pre_step.append(script.control)
-            client.frame_score = script.worth
+            client.frame_score = script.frame_score
             client.pre_step.append(LookAt(client.robot, script.focus))
         elif client.trace is not None:
             client.pre_step.append(LookAt(client.robot, client.trace.centre))
@@ -148,7 +148,7 @@ def run(
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
-        done = (lambda: False) if script is None else (lambda: script.done)
+        done = (lambda: False) if script is None else (lambda: script.is_done)
         tick_until(stop, client.tick, pace, seconds, client.physics.dt, done)
         if out is not None:
             report = reporter.report() | senses.report()

@@ -35,7 +35,7 @@ def run(
         raise UsageError(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
-    renderers.check(renderer)
+    renderers.check_renderer(renderer)
     plan = with_seed(load_scene(scene), seed)
     if place is None:
         start = spawn_pose(plan, spawn)

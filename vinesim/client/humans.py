@@ -73,7 +73,7 @@ class RemoteHuman:
         """Be where ``update`` says at the end of the coming tick."""
         self.rigid.move_human(self.name, update.pose)
 
-    def leave(self) -> None:
+    def remove(self) -> None:
         """Go."""
         self.rigid.remove_human(self.name)
 

@@ -162,7 +162,7 @@ def pose_difference(
     turn_out: wp.array2d(dtype=wp.float64),
     turn_within_out: wp.array2d(dtype=wp.float64),
 ):
-    """Way and turn from one pose to another, the turn in the axes of the world and of the first pose."""
+    """One thread finds way [m] and turn [rad] from one pose to another, the turn in axes of the world and of the first."""
     i = wp.tid()
     way = position(goal, i) - position(start, i)
     q = orientation(start, i)

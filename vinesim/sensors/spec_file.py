@@ -56,6 +56,6 @@ def _check(path: pathlib.Path, spec: msgspec.Struct, place: str = "") -> None:
             _check(path, found, f"{place}{field}.")
 
 
-def dice(seed: int, name: str, number: int) -> np.random.Generator:
+def noise_rng(seed: int, name: str, number: int) -> np.random.Generator:
     """Random numbers of one image or revolution: the same for the same (seed, sensor, number), on every machine."""
     return np.random.default_rng([seed & 0xFFFFFFFF, zlib.crc32(name.encode()), number & 0xFFFFFFFF])

@@ -259,7 +259,7 @@ def _parsed(given: RobotSpec, bit: int) -> mujoco.MjSpec:
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         if joint.name in driven:
             joint.actgravcomp = True
-            joint.armature = driven[joint.name].rotor
+            joint.armature = driven[joint.name].armature
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
     return child
