@@ -83,7 +83,9 @@ def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_c
     def run(prepared: bool) -> bytes:
         physics = world(vinebot)
         physics.rigid.command("host", vinebot.home + 0.2)
-        draft = physics.rigid.compile_with(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
+        draft = (
+            physics.rigid.compile_with(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
+        )
         for _ in range(20):
             physics.step()
         if draft is None:

@@ -57,7 +57,9 @@ def test_a_base_keeps_to_its_speeds():
 
 def test_an_obstacle_is_noticed():
     wall = {"fixed_start": [[1.0, 0.0, -0.3]], "fixed_end": [[1.0, 0.0, 2.0]], "fixed_radius": [[0.1, 0.1]]}
-    robot = Robot(RigidWorld(assemble([], **wall)), load_description("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0]))
+    robot = Robot(
+        RigidWorld(assemble([], **wall)), load_description("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0])
+    )
     way = WaypointFollower(robot, np.array([[2.0, 0.0]]))
     poses = drive(way, 30.0)
     assert way.is_stuck

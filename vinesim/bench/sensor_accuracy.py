@@ -80,7 +80,9 @@ def measure_plane(spec: CameraSpec) -> DepthStatistics:
     return found
 
 
-def measure_plants(spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot) -> dict[str, DepthStatistics]:
+def measure_plants(
+    spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot
+) -> dict[str, DepthStatistics]:
     """Leaves and bunches, looked at from all ranges around some bunches."""
     rng = np.random.default_rng(SEED)
     camera = Camera(spec, spec.info("optical"), seed=SEED)
