@@ -152,7 +152,7 @@ def test_neighbouring_crates_differ_in_colour() -> None:
 
 
 def test_every_surface_has_its_material() -> None:
-    assert set(appearance.SURFACES) == set(rigid_primitives._MATERIAL)
+    assert set(appearance.SURFACES) == set(rigid_primitives._MATERIALS)
 
 
 @pytest.mark.parametrize(

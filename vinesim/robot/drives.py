@@ -1,6 +1,6 @@
 """A robot in this client's world: commands in, limited set-points out, and what it knows of itself.
 
-    robot = Robot(rigid, load("vinebot"), "robot_1")
+    robot = Robot(rigid, load_description("vinebot"), "robot_1")
     robot.command_position([0.3], ["torso_lift_joint"])
     robot.command_base(0.4, 0.0, time)
     ...
