@@ -135,13 +135,13 @@ class Physics:
             self.plants.forward_kinematics()
             self._fresh = True
 
-    def ⟦OURS snapshot⟦BASE view⟦THEIRS wake(self, trees: np.ndarray) -> None:
+    def wake(self, trees: np.ndarray) -> None:
         """Wake trees [k] whose joints were written from outside, between steps, and bring their poses up to date."""
-        self.sleep.wake(trees)
+        self.sleep_monitor.wake(trees)
         self.plants.forward_kinematics(trees)
         self._body_q = None
 
-    def view⟧(self) -> Snapshot:
+    def snapshot(self) -> Snapshot:
         """The world after the last tick. While no tree is awake, views share one array of plant poses."""
         if self._body_q is None:
             self.update_kinematics()
