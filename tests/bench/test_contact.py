@@ -11,9 +11,9 @@ from vinesim.cli.bench import BENCHES
 
 def test_every_tick_is_shared_out_to_mujoco_us_and_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "SCENE", "demo")
-    monkeypatch.setattr(bench, "TICKS", 20)
-    monkeypatch.setattr(bench, "WARM", 2)
-    monkeypatch.setattr(bench, "_beside", lambda *_: iter(()))
+    monkeypatch.setattr(bench, "MEASURED_STEPS", 20)
+    monkeypatch.setattr(bench, "WARM_UP_STEPS", 2)
+    monkeypatch.setattr(bench, "_compare_with_mujoco", lambda *_: iter(()))
     found = list(BENCHES["tick"]())
     assert {m.unit for m in found} == {"ms/tick"}
     for robots in ("1 robot,", "10 robots,"):

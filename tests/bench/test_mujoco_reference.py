@@ -3,25 +3,25 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim.bench import scenes as scenes
-from vinesim.bench.mujoco_reference import Whole
+from vinesim.bench.mujoco_reference import MujocoScene
 from vinesim.physics.step import Physics
 
 
 def test_the_peer_of_the_contact_bench_does_the_same_work() -> None:
     """A bar lifts three canes, a hand holds the bunch of a fourth: as many contacts, and bodies in the same place."""
-    model = scenes.row(4)
-    robots = [scenes.bar("bar", 0, 3), scenes.hand("hand", scenes.bunch_at(3))]
-    ours, theirs = Physics(model), Whole(model, robots)
+    model = scenes.cane_row(4)
+    robots = [scenes.bar("bar", 0, 3), scenes.gripper("hand", scenes.bunch_center(3))]
+    ours, theirs = Physics(model), MujocoScene(model, robots)
     for robot in robots:
         ours.add_robot(robot)
-    scenes.sleepless(ours, np.arange(4))
+    scenes.keep_awake(ours, np.arange(4))
     for tick in range(200):
         for world in (ours, theirs):
             slowly = min(1.0, tick / 100)
             world.rigid.command("bar", np.array([0.08 * slowly]))
             world.rigid.command("hand", slowly * np.array([0.04, 0.05, 0.05]))
             world.step()
-    assert len(ours.contacts) == theirs.touching() == 5
+    assert len(ours.contacts) == theirs.plant_contact_count() == 5
     place = np.array([theirs.data.body(f"plant/{b}").xpos for b in range(len(model.body_mass))])
     mine = ours.state.body_q[:, :3]  # both are those of the last tick's start
     rest = model.forward(model.joint_settled)[:, :3]
@@ -31,12 +31,12 @@ def test_the_peer_of_the_contact_bench_does_the_same_work() -> None:
 
 
 def test_a_row_rests_as_it_is_drawn() -> None:
-    model = scenes.row(2)
-    physics = scenes.sleepless(Physics(model), np.arange(2))
+    model = scenes.cane_row(2)
+    physics = scenes.keep_awake(Physics(model), np.arange(2))
     for _ in range(100):
         physics.step()
     drawn = model.forward(model.joint_settled)
     np.testing.assert_allclose(physics.view().body_q[:, :3], drawn[:, :3], atol=1e-4)
     np.testing.assert_allclose(
-        drawn[model.bunch_body, :3] - [0, 0, 0.085], [scenes.bunch_at(0), scenes.bunch_at(1)], atol=1e-6
+        drawn[model.bunch_body, :3] - [0, 0, 0.085], [scenes.bunch_center(0), scenes.bunch_center(1)], atol=1e-6
     )

@@ -81,19 +81,19 @@ def test_people_and_robots_meet_and_part(vinebot):
     eva = world.join("eva", None, frames.pose(np.array([3.0, 0.0, 0.0])), height=1.6)
     ida = world.join("ida", None, frames.pose(np.array([0.0, 3.0, 0.0])), height=1.9)
     world.run(0.8)
-    assert set(anna.others) == {"eva", "ida"}
-    assert set(eva.others) == {"anna", "ida"}
-    assert set(ida.others) == {"anna", "eva"}
+    assert set(anna.remote_actors) == {"eva", "ida"}
+    assert set(eva.remote_actors) == {"anna", "ida"}
+    assert set(ida.remote_actors) == {"anna", "eva"}
     for client in world.clients:
         assert len(client.physics.rigid.people) == 2
         assert client.physics.rigid.person("eva").spec.height == pytest.approx(1.6)
         assert client.physics.rigid.person("ida").spec.height == pytest.approx(1.9)
     for name in ("eva", "ida"):
         np.testing.assert_allclose(parts_of(anna, name), parts_of(world.clients[1 + (name == "ida")], name), atol=2e-3)
-    ida.exchange.bus.close()
+    ida.replicator.bus.close()
     world.clients.remove(ida)
     world.run(0.2)
-    assert set(anna.others) == {"eva"}
+    assert set(anna.remote_actors) == {"eva"}
     assert anna.physics.rigid.people == ("eva",)
 
 
@@ -162,7 +162,7 @@ def test_fingers_are_seen():
     world.join("eva", None, SIDE, lambda _: pose)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(0.5)
-    heard = ida.exchange.receive(world.now).people["eva"].pose
+    heard = ida.replicator.receive(world.now).people["eva"].pose
     assert heard.right_fingers == pytest.approx((0.2, 0.0, 1.0, 1.0, 1.0), abs=1 / 255)
 
 
@@ -259,7 +259,7 @@ class Shove:
         return sum((wrench[:3] for wrench in borne), np.zeros(3))
 
     def forces_said(self) -> int:
-        return self.human.exchange.counters.force.bytes_out
+        return self.human.replicator.counters.force.bytes_out
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.02, 0.05, 0.1])
@@ -377,7 +377,7 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     here, there = (pose[:3] + frames.rotate(pose[3:], middle) for pose in poses_now)
     assert np.linalg.norm(here - centre) > 0.05
     assert np.linalg.norm(there - here) < 0.02
-    assert anna.exchange.owner(int(world.model.body_tree[body])) == "eva"
+    assert anna.replicator.owner(int(world.model.body_tree[body])) == "eva"
     assert anna.physics.hand("eva", "right").holds is None
     np.testing.assert_allclose(
         anna.physics.hand("eva", "right").pose[:3], eva.physics.hand("eva", "right").pose[:3], atol=0.01

@@ -4,7 +4,7 @@ import multiprocessing
 
 import pytest
 
-from vinesim.client.sensing.latest_value import Mailbox, poller
+from vinesim.client.sensing.latest_value import LatestValue, poller
 
 
 def read_all(mailbox, pipe):
@@ -24,12 +24,12 @@ def context():
 
 
 def test_the_newest_letter_replaces_what_was_not_read(context):
-    mailbox = Mailbox(100, context)
+    mailbox = LatestValue(100, context)
     try:
         assert mailbox.take(0.0) is None
         for i in range(5):
             assert mailbox.put(b"letter %d" % i)
-        reader = Mailbox.__new__(Mailbox)
+        reader = LatestValue.__new__(LatestValue)
         reader.__dict__.update(mailbox.__getstate__())
         assert reader.take(0.0) == b"letter 4"
         assert reader.take(0.0) is None
@@ -38,7 +38,7 @@ def test_the_newest_letter_replaces_what_was_not_read(context):
 
 
 def test_a_letter_that_is_too_large_is_refused(context):
-    mailbox = Mailbox(10, context)
+    mailbox = LatestValue(10, context)
     try:
         with pytest.raises(ValueError, match="11 bytes for a mailbox of 10"):
             mailbox.put(bytes(11))
@@ -47,11 +47,11 @@ def test_a_letter_that_is_too_large_is_refused(context):
 
 
 def test_the_writer_never_waits_for_the_reader(context):
-    mailbox = Mailbox(10, context)
+    mailbox = LatestValue(10, context)
     try:
         mailbox._lock.acquire()
         assert mailbox.put(b"x") is False
-        assert mailbox.missed == 1
+        assert mailbox.missed_writes == 1
         mailbox._lock.release()
         assert mailbox.put(b"y")
     finally:
@@ -59,7 +59,7 @@ def test_the_writer_never_waits_for_the_reader(context):
 
 
 def test_letters_cross_to_another_process_in_order_and_the_last_arrives(context):
-    mailbox = Mailbox(100, context)
+    mailbox = LatestValue(100, context)
     ours, theirs = context.Pipe()
     process = context.Process(target=read_all, args=(mailbox, theirs))
     process.start()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from vinesim.client import rate_loop as module
-from vinesim.client.rate_loop import Pace
+from vinesim.client.rate_loop import RateLoop
 
 
 class FakeTime:
@@ -36,7 +36,7 @@ def run(pace, clock, works):
 
 
 def test_a_late_tick_does_not_shift_the_beat(clock):
-    pace = Pace(0.01)
+    pace = RateLoop(0.01)
     starts = run(pace, clock, [0.001, 0.025, 0.001, 0.001, 0.001, 0.001])
     assert starts == pytest.approx([0.0, 0.01, 0.035, 0.036, 0.04, 0.05])
     assert pace.overruns == 1
@@ -45,24 +45,24 @@ def test_a_late_tick_does_not_shift_the_beat(clock):
 
 
 def test_real_time_factor_is_simulated_over_wall_time(clock):
-    pace = Pace(0.01)
+    pace = RateLoop(0.01)
     run(pace, clock, [0.002] * 101)
     assert pace.real_time_factor == pytest.approx(1.01 / 1.002)
-    slow = Pace(0.01)
+    slow = RateLoop(0.01)
     run(slow, clock, [0.02] * 20)
     assert slow.real_time_factor == pytest.approx(0.5)
     assert slow.overruns == 20
 
 
 def test_a_long_stall_is_dropped_and_counted(clock):
-    pace = Pace(0.01)
+    pace = RateLoop(0.01)
     starts = run(pace, clock, [0.001, 3.0] + [0.001] * 10)
     assert pace.dropped in (298, 299)
     assert np.diff(starts)[-5:] == pytest.approx([0.01] * 5)
 
 
 def test_percentiles_are_of_the_work(clock):
-    pace = Pace(0.01)
+    pace = RateLoop(0.01)
     run(pace, clock, [0.001] * 99 + [0.009])
     median, worst = pace.work_ms(50, 100)
     assert median == pytest.approx(1.0)

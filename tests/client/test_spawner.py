@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from vinesim import frames
-from vinesim.client.remote.spawner import Arrivals, described
+from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import Description, load
@@ -62,14 +62,14 @@ def world(description: Description) -> Physics:
 
 def test_no_tick_waits_and_then_it_stands_where_it_is_by_now(vinebot):
     physics, later = world(vinebot), Later()
-    arrivals = Arrivals(physics.rigid, vinebot, later)
-    arrivals.expect(greeting(vinebot))
+    arrivals = RemoteSpawner(physics.rigid, vinebot, later)
+    arrivals.enqueue(greeting(vinebot))
     for tick in range(5):
-        assert arrivals.embody("guest", standing(vinebot, 0.1 * tick)) is None
+        assert arrivals.spawn("guest", standing(vinebot, 0.1 * tick)) is None
         physics.step()
     assert physics.rigid.robots == ("host",)
     later.work()
-    guest = arrivals.embody("guest", standing(vinebot, 0.5))
+    guest = arrivals.spawn("guest", standing(vinebot, 0.5))
     assert guest is not None
     assert guest.name == "guest"
     assert "guest" not in arrivals
@@ -99,26 +99,26 @@ def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_c
 
 def test_a_world_that_changed_meanwhile_is_prepared_anew(vinebot):
     physics, later = world(vinebot), Later()
-    arrivals = Arrivals(physics.rigid, vinebot, later)
-    arrivals.expect(greeting(vinebot))
+    arrivals = RemoteSpawner(physics.rigid, vinebot, later)
+    arrivals.enqueue(greeting(vinebot))
     update = standing(vinebot, 0.0)
-    arrivals.embody("guest", update)
+    arrivals.spawn("guest", update)
     later.work()
     physics.rigid.add_robot(vinebot.spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
-    assert arrivals.embody("guest", update) is None
+    assert arrivals.spawn("guest", update) is None
     assert physics.rigid.robots == ("host", "other")
-    assert arrivals.embody("guest", update) is None
+    assert arrivals.spawn("guest", update) is None
     later.work()
-    assert arrivals.embody("guest", update) is not None
+    assert arrivals.spawn("guest", update) is not None
     assert physics.rigid.robots == ("host", "other", "guest")
 
 
 def test_who_leaves_before_being_ready_never_comes(vinebot):
     physics, later = world(vinebot), Later()
-    arrivals = Arrivals(physics.rigid, vinebot, later)
-    arrivals.expect(greeting(vinebot))
-    arrivals.embody("guest", standing(vinebot, 0.0))
-    arrivals.forget("guest")
+    arrivals = RemoteSpawner(physics.rigid, vinebot, later)
+    arrivals.enqueue(greeting(vinebot))
+    arrivals.spawn("guest", standing(vinebot, 0.0))
+    arrivals.cancel("guest")
     later.work()
     assert "guest" not in arrivals
     assert physics.rigid.robots == ("host",)
@@ -134,9 +134,9 @@ def test_who_leaves_before_being_ready_never_comes(vinebot):
 )
 def test_a_robot_that_cannot_be_is_named_once_and_the_world_goes_on(vinebot, caplog, change, words):
     physics = world(vinebot)
-    arrivals = Arrivals(physics.rigid, vinebot)
-    arrivals.expect(greeting(vinebot, **change))
-    assert arrivals.embody("guest", standing(vinebot, 0.0)) is None
+    arrivals = RemoteSpawner(physics.rigid, vinebot)
+    arrivals.enqueue(greeting(vinebot, **change))
+    assert arrivals.spawn("guest", standing(vinebot, 0.0)) is None
     assert "guest" not in arrivals
     (record,) = caplog.records
     assert words in record.getMessage()
@@ -148,6 +148,6 @@ def test_a_strangers_word_is_no_path(vinebot, tmp_path, monkeypatch):
     """The name in a greeting names a file; it must stay in the folder made for it."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     text = vinebot.urdf.replace("<robot ", "<!-- another --><robot ", 1)
-    found = described(greeting(vinebot, urdf=text, robot="../escaped"), vinebot)
+    found = resolve_description(greeting(vinebot, urdf=text, robot="../escaped"), vinebot)
     assert found.joints == vinebot.joints
     assert list(tmp_path.rglob("*")) == []

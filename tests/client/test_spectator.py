@@ -12,13 +12,13 @@ from tests.client.test_recorder import World
 from tests.client.test_replay import recorded_trees
 from tests.support.recorded_world import TICK, Light, vineyard
 from vinesim import frames
-from vinesim.cli.replay import WrongUse
 from vinesim.cli.replay import run as replay
 from vinesim.client.client import Client
 from vinesim.client.recording.recorder import Recorder
 from vinesim.client.recording.replay import ReplayBus
-from vinesim.client.spectator import ASIDE, EYES, Spectator, looking_at, viewpoint
+from vinesim.client.spectator import EYE_HEIGHT, FOLLOW_DISTANCE, Spectator, follow_view, standing_view
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_file import NotARecording, Recording, Tape, read
 from vinesim.net.transport.bus import MemoryHub
@@ -40,7 +40,7 @@ def bent(tmp_path_factory) -> Tape:
 def watch(tape: Tape) -> tuple[list[bytes], dict[int, np.ndarray]]:
     """States of all plants of a spectator beside the tree, tick by tick; those of the tree by the tick's number."""
     bus = ReplayBus(tape, "viewer")
-    pose = viewpoint(1.5, 0.0, np.pi)
+    pose = standing_view(1.5, 0.0, np.pi)
     spectator = Spectator(load("demo"), vineyard(), None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
     here = vineyard().bodies_of(0)
     states, tree = [], {}
@@ -48,7 +48,7 @@ def watch(tape: Tape) -> tuple[list[bytes], dict[int, np.ndarray]]:
         bus.play(TICK)
         spectator.tick()
         states.append(spectator.physics.state.joint_q.tobytes() + spectator.physics.state.joint_qd.tobytes())
-        if 0 in spectator._copies:
+        if 0 in spectator._remote_trees:
             tree[len(states)] = spectator.physics.state.joint_q[here].copy()
     return states, tree
 
@@ -101,14 +101,14 @@ def test_a_spectator_owns_nothing_even_when_an_owner_goes():
 
 
 def test_eyes():
-    eyes = viewpoint(2.0, 3.0, np.pi / 2)
+    eyes = standing_view(2.0, 3.0, np.pi / 2)
     np.testing.assert_allclose(frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0])), [0.0, 1.0, 0.0], atol=1e-9)
     for yaw in (0.0, 2.5, -1.0):
         robot = frames.pose([1.0, -2.0, 0.0], frames.yaw(yaw))
-        eyes = looking_at(robot)
+        eyes = follow_view(robot)
         ahead = frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0]))
-        assert eyes[2] == EYES
-        np.testing.assert_allclose(eyes[:2] + ASIDE * ahead[:2], robot[:2], atol=1e-9)
+        assert eyes[2] == EYE_HEIGHT
+        np.testing.assert_allclose(eyes[:2] + FOLLOW_DISTANCE * ahead[:2], robot[:2], atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
     picker = Client(
         scene, model, load_robot("vinebot"), hub.bus("picker"), name="picker", pose=start, clock=lambda: hub.time
     )
-    eyes = looking_at(start)
+    eyes = follow_view(start)
     spectator = Spectator(scene, model, None, hub.bus("viewer"), name="viewer", pose=eyes, clock=lambda: hub.time)
     with Recording(path) as recording:
         recorder = Recorder(hub.bus("recorder", live=False), recording, clock=lambda: hub.time)
@@ -134,9 +134,9 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
             picker.tick()
             spectator.tick()
             recorder.step()
-        assert set(spectator.others) == {"picker"}
-        assert spectator.exchange.counters.environment.bytes_out == 0
-        assert picker.others == {}  # a spectator has no body
+        assert set(spectator.remote_actors) == {"picker"}
+        assert spectator.replicator.counters.environment.bytes_out == 0
+        assert picker.remote_actors == {}  # a spectator has no body
         head = picker.robot.description.joints.index("head_1_joint")
         assert spectator.physics.rigid.read("picker")[0][head] == pytest.approx(0.5, abs=0.05)
     return path
@@ -162,5 +162,5 @@ def test_another_vineyard_is_refused(robot_tape, tmp_path):
     with pytest.raises(NotARecording, match=r"digest .*: give its --scene and --seed"):
         replay(**options(robot_tape, tmp_path / "out", seed=8))
     assert not (tmp_path / "out").exists()
-    with pytest.raises(WrongUse, match=r"lasts \d"):
+    with pytest.raises(UsageError, match=r"lasts \d"):
         replay(**options(robot_tape, tmp_path / "out", start=60.0))

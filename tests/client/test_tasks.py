@@ -31,7 +31,7 @@ def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Script]:
         clock=lambda: 0.01 * next(now),
     )  # fmt: skip
     script = begin(client.physics, client.robot)
-    client.jobs += [script.control, LookAt(client.robot, script.focus)]
+    client.pre_step += [script.control, LookAt(client.robot, script.focus)]
     return client, script
 
 

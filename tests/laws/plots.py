@@ -18,7 +18,7 @@ import warp as wp
 from tests.laws import test_contact, test_rod_in_space
 from tests.support import beam_theory
 from tests.support.contact_scenes import bunch_scene, grasp, gripper
-from vinesim.bench.mujoco_reference import Whole
+from vinesim.bench.mujoco_reference import MujocoScene
 from vinesim.physics.step import Physics
 
 matplotlib.use("Agg")
@@ -148,7 +148,7 @@ def damping() -> Table:
 def grasped() -> Table:
     """A bunch grasped, lifted, moved, pulled, let go: ours and the same scene wholly in MuJoCo."""
     model, body, middle = bunch_scene()
-    ours, oracle = Physics(model), Whole(model, [gripper(middle)])
+    ours, oracle = Physics(model), MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     place, force = np.zeros((2, 800, 3)), np.zeros((2, 800))
     for tick in range(800):
@@ -158,8 +158,8 @@ def grasped() -> Table:
             rigid.push("grip", "hand", np.array([0.0, 0.0, pull]))
         ours.step()
         oracle.step()
-        place[:, tick] = [test_contact.middle_of(q) for q in (ours.view().body_q[body], oracle.body_q(body))]
-        force[:, tick] = abs(test_contact.force_on(ours, "left")[1]), abs(oracle.force_on("left")[1])
+        place[:, tick] = [test_contact.middle_of(q) for q in (ours.view().body_q[body], oracle.body_pose(body))]
+        force[:, tick] = abs(test_contact.force_on(ours, "left")[1]), abs(oracle.contact_force_on("left")[1])
     time = 0.01 * np.arange(800)
     figure, (way, press) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
     for axis, name, colour in ((1, "aside", LEAF), (2, "up", GRAPE)):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.description.description import Description, load
 from vinesim.robot.drives import Robot
@@ -56,7 +57,7 @@ class Stand:
     """A robot, and a clock."""
 
     def __init__(self, description: Description, **scene: np.ndarray) -> None:
-        self.rigid = Rigid(assemble([], **scene), dt=DT)
+        self.rigid = Rigid(assemble([], **scene), parameters=PhysicsParameters(dt=DT))
         self.robot = Robot(self.rigid, description, "anna")
         self.time = 0.0
 

@@ -7,8 +7,8 @@ import pytest
 
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from vinesim import frames
-from vinesim.bench.mujoco_reference import Whole
-from vinesim.physics.contact.contact_solver import STIFFNESS, Touching
+from vinesim.bench.mujoco_reference import MujocoScene
+from vinesim.physics.contact.contact_solver import CONTACT_STIFFNESS, ContactSolver
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
@@ -27,7 +27,7 @@ def force_on(physics: Physics, link: str) -> np.ndarray:
 
 def with_contacts(physics: Physics, **options) -> Physics:
     """The same physics, its contacts made with other options."""
-    Touching.__init__(physics.touching, physics.model, physics.plants, physics.rigid, **options)
+    ContactSolver.__init__(physics.contact_solver, physics.model, physics.plants, physics.rigid, **options)
     return physics
 
 
@@ -65,7 +65,7 @@ def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
 def held():
     """Close, lift, move, pull, let go: ours and the oracle's bunch, finger forces and efforts, tick by tick."""
     model, body, middle = bunch_scene()
-    ours, oracle = Physics(model), Whole(model, [gripper(middle)])
+    ours, oracle = Physics(model), MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     rows = {key: [] for key in ("ours", "oracle", "force", "oracle_force", "effort", "oracle_effort")}
     for tick in range(800):
@@ -76,9 +76,9 @@ def held():
         ours.step()
         oracle.step()
         rows["ours"].append(middle_of(ours.view().body_q[body]))
-        rows["oracle"].append(middle_of(oracle.body_q(body)))
+        rows["oracle"].append(middle_of(oracle.body_pose(body)))
         rows["force"].append([force_on(ours, finger) for finger in FINGERS])
-        rows["oracle_force"].append([oracle.force_on(finger) for finger in FINGERS])
+        rows["oracle_force"].append([oracle.contact_force_on(finger) for finger in FINGERS])
         rows["effort"].append(ours.rigid.read("grip")[2])
         rows["oracle_effort"].append(oracle.rigid.read("grip")[2])
     return {key: np.array(value) for key, value in rows.items()} | {"physics": ours, "body": body}
@@ -113,7 +113,7 @@ def test_released_bunch_swings_home(held):
     physics.rigid.command("grip", np.zeros(4))
     for _ in range(2500):
         physics.step()
-    assert physics.touching.count == 0
+    assert physics.contact_solver.count == 0
     assert np.linalg.norm(middle_of(physics.view().body_q[body]) - middle) < 5e-3
 
 
@@ -141,13 +141,13 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
     model, _, middle = bunch_scene()
     physics = Physics(model)
     physics.add_robot(gripper(middle))
-    rigid, touching = physics.rigid, physics.touching
+    rigid, touching = physics.rigid, physics.contact_solver
     plant_error = rigid_error = 0.0
     pressed = 0
     for tick in range(400):
         rigid.command("grip", grasp(0.01 * tick)[0])
         rigid.prep()
-        touching.find()
+        touching.wake_near_trees()
         physics.plants.free()
         start = physics.state.body_q.copy()
         touching.solve()
@@ -158,16 +158,16 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
             rows = slice(0, len(touching.bodies))
             pushed = np.einsum("uitj,tj->ui", response[rows], touching.wrenches) * physics.dt
             predicted = physics.plants.velocity_free[touching.bodies] + pushed
-            free = free + rigid.inverse(touching.force[None])[:, 0] * physics.dt
+            free = free + rigid.inverse(touching.rigid_force[None])[:, 0] * physics.dt
             on_plants, on_robot = (
                 touching.wrenches[:, :3].sum(0),
                 sum((c.force for c in touching.contacts), np.zeros(3)),
             )
             np.testing.assert_allclose(on_plants, -on_robot, atol=1e-9)
             base = rigid._robots["grip"].base_v[:2]
-            np.testing.assert_allclose(touching.force[base], on_robot[:2], atol=1e-9)
+            np.testing.assert_allclose(touching.rigid_force[base], on_robot[:2], atol=1e-9)
         physics._commit()
-        rigid.finish(touching.force)
+        rigid.finish(touching.rigid_force)
         if touching.count:
             plant_error = max(plant_error, np.abs(realised(physics, start)[touching.bodies] - predicted).max())
         rigid_error = max(rigid_error, np.abs(rigid.data.qvel - free).max())
@@ -183,8 +183,8 @@ def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, g
     """
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005) for i in range(5)])
     spec = bar((0.7, -0.08, 0.95), damping=damping)
-    ours, oracle = Physics(model), Whole(model, [spec], dt=0.01 / substeps, give=give)
-    ours.touching.branches = False  # in the oracle canes pass through each other
+    ours, oracle = Physics(model), MujocoScene(model, [spec], dt=0.01 / substeps, contact_time_constant=give)
+    ours.contact_solver.plant_plant_contacts = False  # in the oracle canes pass through each other
     ours.add_robot(spec)
     for rigid in (ours.rigid, oracle.rigid):
         rigid.command("bar", np.zeros(1), np.array([speed]))
@@ -196,12 +196,12 @@ def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, g
         on_bar, theirs = force_on(ours, "bar"), np.zeros(3)
         for _ in range(substeps):
             oracle.step()
-            theirs += oracle.force_on("bar") / substeps
+            theirs += oracle.contact_force_on("bar") / substeps
         force.append((on_bar[1], theirs[1]))
         met.update(tree for tree, _ in ours.touched)
-        np.testing.assert_allclose(ours.touching.wrenches[:, :3].sum(0), -on_bar, atol=1e-9)
-        if ours.touching.force is not None:
-            np.testing.assert_allclose(ours.touching.force[base], on_bar[:2], atol=1e-9)
+        np.testing.assert_allclose(ours.contact_solver.wrenches[:, :3].sum(0), -on_bar, atol=1e-9)
+        if ours.contact_solver.rigid_force is not None:
+            np.testing.assert_allclose(ours.contact_solver.rigid_force[base], on_bar[:2], atol=1e-9)
     return ours, np.array(force), met
 
 
@@ -247,7 +247,7 @@ def test_a_fast_sweep_agrees_with_hard_contacts_in_quarters_of_a_millisecond():
 def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
     model, body, middle = bunch_scene()
     spec = gripper(middle, effort=effort)
-    ours, oracle = Physics(model, picking=False), Whole(model, [spec])
+    ours, oracle = Physics(model, picking=False), MujocoScene(model, [spec])
     ours.add_robot(spec)
     held, force, off = [], [], 0.0
     for tick in range(450):
@@ -260,9 +260,9 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
         oracle.step()
         mine = middle_of(ours.view().body_q[body])
         held.append(mine - ours.rigid.link_pose("grip", "left")[:3])
-        force.append([[world.force_on(f) if world is oracle else force_on(ours, f) for f in FINGERS]
+        force.append([[world.contact_force_on(f) if world is oracle else force_on(ours, f) for f in FINGERS]
                       for world in (ours, oracle)])  # fmt: skip
-        off = max(off, float(np.linalg.norm(mine - middle_of(oracle.body_q(body)))))
+        off = max(off, float(np.linalg.norm(mine - middle_of(oracle.body_pose(body)))))
     held, force = np.array(held), np.array(force)
     assert np.linalg.norm(held[440:].mean(0) - held[240:250].mean(0)) < 5e-5
     assert off < 1e-3
@@ -275,7 +275,7 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
 def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
     model, body, middle = bunch_scene()
     spec = gripper(middle, mimic=True)
-    ours, oracle = Physics(model), Whole(model, [spec])
+    ours, oracle = Physics(model), MujocoScene(model, [spec])
     ours.add_robot(spec)
     force, off = [], 0.0
     for tick in range(450):
@@ -285,8 +285,8 @@ def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
             rigid.push("grip", "hand", np.array([0.0, 0.0, -20.0 * ramp(t, 2.5, 3.0)]))
         ours.step()
         oracle.step()
-        force.append([[force_on(ours, f)[1], oracle.force_on(f)[1]] for f in FINGERS])
-        off = max(off, float(np.linalg.norm(middle_of(ours.view().body_q[body]) - middle_of(oracle.body_q(body)))))
+        force.append([[force_on(ours, f)[1], oracle.contact_force_on(f)[1]] for f in FINGERS])
+        off = max(off, float(np.linalg.norm(middle_of(ours.view().body_q[body]) - middle_of(oracle.body_pose(body)))))
     force = np.array(force)
     for phase in (slice(150, 240), slice(400, 450)):
         mine, theirs = force[phase].mean(0).T
@@ -315,7 +315,7 @@ def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
         force.append([force_on(ours, finger) for finger in FINGERS])
     held, force = np.array(held), np.array(force)
     closed = 4000.0 * (0.074 - (0.085 - 0.01 - 0.006))
-    expected = closed / (1.0 + 4000.0 / (2.0 * STIFFNESS))
+    expected = closed / (1.0 + 4000.0 / (2.0 * CONTACT_STIFFNESS))
     np.testing.assert_allclose(force[110:119, 0, 1], expected, rtol=0.01)
     np.testing.assert_allclose(force[110:119, 1, 1], -expected, rtol=0.01)
     assert ours.view().body_q[body, 2] - home[body, 2] > 0.08
@@ -327,7 +327,7 @@ def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
     ours.rigid.command("grip", np.zeros(4))
     for _ in range(1500):
         ours.step()
-    assert ours.touching.count == 0
+    assert ours.contact_solver.count == 0
     assert np.abs(ours.view().body_q - home)[:, :3].max() < 1e-3
 
 
@@ -359,9 +359,9 @@ def test_thirty_kilograms_press_on_pieces_of_half_a_gram(servo, stiffness):
 @pytest.mark.parametrize("speed", [0.5, 3.0])
 def test_contact_without_damping_gives_no_energy(stiffness, speed):
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005, beta=0.0) for i in range(5)])
-    physics = with_contacts(Physics(model), stiffness=stiffness, branches=False)
-    physics.touching.damping = 0.0
-    physics.touching._record()
+    physics = with_contacts(Physics(model), stiffness=stiffness, plant_plant_contacts=False)
+    physics.contact_solver.damping = 0.0
+    physics.contact_solver._record()
     physics.add_robot(bar((0.7, -0.08, 0.95)))
     drive = physics.rigid._robots["bar"].v
     physics.rigid.data.qvel[drive] = speed
@@ -410,7 +410,7 @@ def test_what_rests_on_a_cane_weighs_what_it_weighs(places):
 def test_what_is_dragged_along_a_cane_rubs_as_the_oracle_says():
     """Mean force over three pieces within 1 %; from tick to tick it is smooth but for the corners between pieces."""
     model, spec = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)]), probe((0.5, 0.0, 1.03))
-    ours, oracle = Physics(model), Whole(model, [spec], dt=0.0005, give=0.004)
+    ours, oracle = Physics(model), MujocoScene(model, [spec], dt=0.0005, contact_time_constant=0.004)
     ours.add_robot(spec)
     force = []
     for tick in range(1000):
@@ -422,7 +422,7 @@ def test_what_is_dragged_along_a_cane_rubs_as_the_oracle_says():
         theirs = np.zeros(3)
         for _ in range(20):
             oracle.step()
-            theirs += oracle.force_on("rod") / 20
+            theirs += oracle.contact_force_on("rod") / 20
         force.append([force_on(ours, "rod"), theirs])
     force = np.array(force)[650:]
     np.testing.assert_allclose(force[:, 0].mean(0)[[0, 2]], force[:, 1].mean(0)[[0, 2]], rtol=0.01)

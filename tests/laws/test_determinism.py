@@ -34,8 +34,8 @@ def a_day() -> tuple[str, dict[str, int]]:
     """Hash of three hundred ticks, and how often each thing happened in them."""
     seen = dict.fromkeys(("contacts", "partings", "woken", "rested", "stopped"), 0)
     h = hashlib.blake2b(digest_size=16)
-    physics = Physics(scenes.row(5))
-    robots = [scenes.bar("bar", 0, 2), scenes.hand("hand", scenes.bunch_at(2))]
+    physics = Physics(scenes.cane_row(5))
+    robots = [scenes.bar("bar", 0, 2), scenes.gripper("hand", scenes.bunch_center(2))]
     for robot in robots:
         physics.add_robot(robot)
     physics.sleep.patience = 20

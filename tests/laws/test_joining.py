@@ -51,7 +51,7 @@ def command(physics: Physics, tick: int) -> None:
 
 def numbers(physics: Physics) -> dict[str, bytes]:
     """Every number that the next tick starts from, by the name of what it belongs to."""
-    world, data, touching = physics.rigid.world, physics.rigid.data, physics.touching
+    world, data, touching = physics.rigid.world, physics.rigid.data, physics.contact_solver
     found = {"plants": physics.state.joint_q.tobytes() + physics.state.joint_qd.tobytes()}
     for i in range(world.njnt):
         joint = world.joint(i)

@@ -10,7 +10,7 @@ from tests.laws.test_trees import energy, forked
 from tests.support import beam_theory
 from tests.support.beam_theory import Rod
 from vinesim import frames
-from vinesim.bench.mujoco_reference import compile_plants, copy_state
+from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.scene.builder import Tree, Wood, assemble
 from vinesim.scene.state import State
@@ -102,7 +102,7 @@ def test_forked_trees_rest_where_mujocos_do() -> None:
     plants.wake(np.arange(4))
     peer = compile_plants(model)
     data = mujoco.MjData(peer)
-    copy_state(plants.state, data)
+    copy_state_to_mujoco(plants.state, data)
     drawn = model.forward(plants.state.joint_q)[:, :3]
     for _ in range(4000):
         plants.free()

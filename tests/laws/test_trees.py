@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.clustered_trees import fall, momenta
 from vinesim import frames
-from vinesim.bench.mujoco_reference import compile_plants, copy_state
+from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.scene.builder import GRAVITY, Tree, Wood, assemble
 from vinesim.scene.model import Model
@@ -63,7 +63,7 @@ def test_free_motion_in_space_is_mujocos() -> None:
     # our solver takes off the damping that its scheme adds; MuJoCo keeps both
     peer = compile_plants(model, dt=DT, damping=model.joint_damping[:, 1] - DT * model.joint_stiffness[:, 1])
     data = mujoco.MjData(peer)
-    copy_state(plants.state, data)
+    copy_state_to_mujoco(plants.state, data)
     worst = travelled = 0.0
     start = None
     for _ in range(100):
@@ -91,7 +91,7 @@ def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
 
     peer = compile_plants(model, dt=DT)
     data = mujoco.MjData(peer)
-    copy_state(state, data)
+    copy_state_to_mujoco(state, data)
     mujoco.mj_forward(peer, data)
     inertia = np.zeros((peer.nv, peer.nv))
     mujoco.mj_fullM(peer, data, inertia)

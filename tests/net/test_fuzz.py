@@ -98,7 +98,7 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     for _ in range(60):
         tick()
         evil.tick(now[0])
-    assert EVIL in client.exchange.actors
+    assert EVIL in client.replicator.actors
     wild = storm(model, evil, 3, now[0])
     publishers: dict = {}
     for _ in range(60):
@@ -113,8 +113,8 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     assert np.isfinite(state.joint_qd).all()
     base, _ = client.physics.rigid.base("ada")
     assert np.linalg.norm(base[:3] - pose[:3]) < 0.5
-    assert client.exchange.counters.malformed > 100
-    assert client.exchange.actors == {}
+    assert client.replicator.counters.malformed > 100
+    assert client.replicator.actors == {}
 
 
 def test_real_sessions_and_the_server_live_through_a_storm():

@@ -1,4 +1,4 @@
-"""Touching: closest points, waking, the same tick, books that balance, room that runs out in words."""
+"""Contact solver: closest points, waking, the same tick, books that balance, room that runs out in words."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from vinesim import frames
 from vinesim.kernels.contact import solver
-from vinesim.physics.contact.contact_solver import Touching, shapes_of
+from vinesim.physics.contact.contact_solver import ContactSolver, plant_capsules
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import Tree, Wood, assemble
@@ -205,7 +205,7 @@ def test_segment_along_a_face_touches_in_its_middle():
 
 def test_spheres_of_a_bunch_fill_its_spheroid_and_no_more():
     model, body, _ = bunch_scene()
-    shapes = shapes_of(model)
+    shapes = plant_capsules(model)
     of = (shapes.bunch == 0) & (model.body_organ[shapes.body] == Organ.BUNCH)
     assert (shapes.body[of] == body).all()
     assert (np.diff(shapes.body) >= 0).all()
@@ -289,19 +289,24 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
 def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     model, _, middle = bunch_scene()
     physics = Physics(model)
-    physics.touching = Touching(model, physics.plants, physics.rigid, capacity=2)
+    physics.contact_solver = ContactSolver(model, physics.plants, physics.rigid, capacity=2)
     physics.add_robot(gripper(middle))
-    stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+    stages = (
+        physics.rigid.prep,
+        physics.contact_solver.wake_near_trees,
+        physics.plants.free,
+        physics.contact_solver.solve,
+    )
     for tick in range(250):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         for stage in stages:
             stage()
         physics._commit()
         physics._finish()
-        assert physics.touching.count <= 2
-    assert physics.touching.dropped > 0
-    assert "left out" in physics.touching.complaint
-    assert "capacity" in physics.touching.complaint
+        assert physics.contact_solver.count <= 2
+    assert physics.contact_solver.dropped_contacts > 0
+    assert "left out" in physics.contact_solver.overflow_message
+    assert "capacity" in physics.contact_solver.overflow_message
     assert len(physics.contacts) == 2
 
 
@@ -313,7 +318,7 @@ def test_nothing_touches_a_bunch_that_was_picked():
     for tick in range(120):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         physics.step()
-    assert physics.touching.count == 0
+    assert physics.contact_solver.count == 0
 
 
 def test_a_robot_that_joins_does_not_shake_a_grasp():
@@ -346,7 +351,7 @@ def test_islands_do_not_feel_each_other():
             for i in which:
                 physics.rigid.command(f"bar{i}", np.zeros(1), np.array([0.5]))
             physics.step()
-            islands = max(islands, physics.touching.islands)
+            islands = max(islands, physics.contact_solver.islands)
         assert islands == len(which)
         ends.append(physics.state.joint_q.copy())
     np.testing.assert_allclose(ends[0], np.concatenate(ends[1:]), atol=1e-5)
@@ -406,7 +411,7 @@ def test_rigid_groups_join_what_a_constraint_couples():
 def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "wind", "holding", "rigid", "touching", "detail", "plants", "touching", "plants", "rigid", "guard", "parting",
+        "wind", "holding", "rigid", "contacts", "detail", "plants", "contacts", "plants", "rigid", "guard", "parting",
         "holding", "sleep",
     ]  # fmt: skip
     physics.plants.wake(1)
@@ -424,7 +429,7 @@ def test_a_tree_that_a_robot_reaches_into_stays_awake():
     physics.add_robot(bar((0.7, -0.034, 0.95), stiffness=1000.0, damping=100.0))
     for _ in range(400):
         physics.step()
-    assert physics.touching.near.tolist() == [0]
+    assert physics.contact_solver.near_trees.tolist() == [0]
     assert physics.plants.awake.tolist() == [0]
 
 
@@ -433,7 +438,7 @@ def test_a_copy_touches_only_trees_of_which_its_owner_tells():
     reached = int(physics.model.tree_first[20])
     at = physics.state.body_q[reached + 5, :3].copy()
     physics.add_robot(bar(at, "ghost"))
-    physics.touching.copies.add("ghost")
+    physics.contact_solver.remote_actors.add("ghost")
     asleep = physics.state.joint_q.copy()
     for _ in range(5):
         physics.step()
@@ -441,7 +446,7 @@ def test_a_copy_touches_only_trees_of_which_its_owner_tells():
     assert len(physics.plants.awake) == 0
     assert np.array_equal(physics.state.joint_q, asleep)
 
-    physics.touching.told[20] = True
+    physics.contact_solver.remote_trees[20] = True
     physics.step()
     assert {tree for tree, _ in physics.touched} == {20}
 
@@ -462,7 +467,7 @@ def test_what_stands_neither_wakes_a_tree_nor_keeps_it_awake():
     for _ in range(60):
         physics.step()
     assert len(physics.plants.awake) == 0
-    assert physics.touching.near.tolist() == []
+    assert physics.contact_solver.near_trees.tolist() == []
 
 
 def test_a_swinging_cane_stops_at_a_pole():
@@ -512,10 +517,10 @@ def clustered() -> Model:
 
 def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fine():
     model = clustered()
-    shapes, bunch = shapes_of(model), int(model.bunch_body[0])
-    assert (shapes.bunch == 0).sum() == (shapes.when > 0).sum()
-    assert set(shapes.body[shapes.when == 1]) == {bunch}
-    assert set(shapes.body[shapes.when == 2]) == {bunch + 1, bunch + 2}
+    shapes, bunch = plant_capsules(model), int(model.bunch_body[0])
+    assert (shapes.bunch == 0).sum() == (shapes.level > 0).sum()
+    assert set(shapes.body[shapes.level == 1]) == {bunch}
+    assert set(shapes.body[shapes.level == 2]) == {bunch + 1, bunch + 2}
     assert (np.diff(shapes.body) >= 0).all()
     met = {}
     for fine in (False, True):
@@ -526,7 +531,12 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         physics.add_robot(bar(at, damping=200.0))
         physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
         seen = set()
-        stages = (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve)
+        stages = (
+            physics.rigid.prep,
+            physics.contact_solver.wake_near_trees,
+            physics.plants.free,
+            physics.contact_solver.solve,
+        )
         for _ in range(40):
             for stage in stages:
                 stage()
@@ -556,7 +566,7 @@ def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
     ]  # fmt: skip
     physics = Physics(assemble(trees), picking=False)
     if options:
-        Touching.__init__(physics.touching, physics.model, physics.plants, physics.rigid, **options)
+        ContactSolver.__init__(physics.contact_solver, physics.model, physics.plants, physics.rigid, **options)
     physics.add_robot(bar((rng.uniform(0.3, 0.9), -0.2, 1.0), damping=float(rng.choice([0.0, 300.0]))))
     physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
     speed = rng.uniform(0.3, 3.0)
@@ -570,7 +580,7 @@ def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
 @given(seed=st.integers(0, 2**31))
 def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed):
     physics, robots = scene_by_chance(seed)
-    touching, rigid = physics.touching, physics.rigid
+    touching, rigid = physics.contact_solver, physics.rigid
     pressed = 0
     for _ in range(60):
         physics.step()
@@ -590,25 +600,25 @@ def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed)
         for name in robots:
             base = rigid._robots[name].base_v[:2]
             on_robot = sum((c.force for c in outside if c.actor == name), np.zeros(3))
-            np.testing.assert_allclose(touching.force[base], on_robot[:2], atol=1e-9)
+            np.testing.assert_allclose(touching.rigid_force[base], on_robot[:2], atol=1e-9)
     assume(pressed > 0)
     assert np.isfinite(physics.state.joint_qd).all()
 
 
 def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axis: np.ndarray) -> np.ndarray:
     """Least distance [tree] of the shapes of each tree and a capsule on a robot's link, from many points of both."""
-    touching, model = physics.touching, physics.model
-    body_q = model.forward(physics.state.joint_q)[touching.shapes.body]
+    touching, model = physics.contact_solver, physics.model
+    body_q = model.forward(physics.state.joint_q)[touching.capsules.body]
     t = np.linspace(0.0, 1.0, 9)[:, None, None]
-    along = touching.shapes.start + t * (touching.shapes.end - touching.shapes.start)
+    along = touching.capsules.start + t * (touching.capsules.end - touching.capsules.start)
     points = body_q[:, :3] + frames.rotate(body_q[:, 3:], along.astype(float))
     pose = physics.rigid.link_pose(name, link)
     turn = frames.rotate(pose[3:], axis)
     apart = points - pose[:3]
     apart -= np.clip(apart @ turn, -half, half)[..., None] * turn
-    gap = (np.linalg.norm(apart, axis=-1) - touching.shapes.radius - radius).min(0)
+    gap = (np.linalg.norm(apart, axis=-1) - touching.capsules.radius - radius).min(0)
     least = np.full(len(model.tree_first), np.inf)
-    np.minimum.at(least, model.body_tree[touching.shapes.body], gap)
+    np.minimum.at(least, model.body_tree[touching.capsules.body], gap)
     return least
 
 
@@ -643,14 +653,28 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
 
     def run() -> tuple:
         physics = Physics(model)
-        Touching.__init__(physics.touching, model, physics.plants, physics.rigid, capacity=100, branches=False)
+        ContactSolver.__init__(
+            physics.contact_solver, model, physics.plants, physics.rigid, capacity=100, plant_plant_contacts=False
+        )
         for i in range(15):
             physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
         physics.plants.wake(np.arange(460))
-        for stage in (physics.rigid.prep, physics.touching.find, physics.plants.free, physics.touching.solve):
+        for stage in (
+            physics.rigid.prep,
+            physics.contact_solver.wake_near_trees,
+            physics.plants.free,
+            physics.contact_solver.solve,
+        ):
             stage()
-        t = physics.touching
-        return t.count, t.dropped, t.complaint, t._gap[:100].copy(), t.bodies.tobytes() + t.wrenches.tobytes(), t
+        t = physics.contact_solver
+        return (
+            t.count,
+            t.dropped_contacts,
+            t.overflow_message,
+            t._gap[:100].copy(),
+            t.bodies.tobytes() + t.wrenches.tobytes(),
+            t,
+        )
 
     count, dropped, complaint, gap, result, touching = run()
     assert count == 100

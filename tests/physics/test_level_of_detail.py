@@ -91,7 +91,7 @@ def test_touched_pushed_released_coarsened_without_a_jump():
     for tick in pushed(physics, middle(model)):
         if first_touch is None and any(c.actor == "bar" for c in physics.contacts):
             first_touch = tick
-        if first_touch is not None and gone is None and not len(physics.touching.near):
+        if first_touch is not None and gone is None and not len(physics.contact_solver.near_trees):
             gone = tick
         turn = frames.log(frames.multiply(
             frames.conjugate(model.joint_settled[clusters(model)]), physics.state.joint_q[clusters(model)]

@@ -479,7 +479,7 @@ def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
     rigid = Rigid(model)
     bunch = loose(shapes)
     rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
-    spec = yard_module.furnished(model, rigid.dt)
+    spec = yard_module.furnished(model, rigid.parameters)
     loose_module.drop(spec, bunch)
     ours, theirs = rigid.world, spec.compile()
     a, b = ours.body("loose/0").id, theirs.nbody - 1

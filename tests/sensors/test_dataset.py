@@ -15,9 +15,9 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
 from vinesim.cli.render import run as render
-from vinesim.cli.robot_client import WrongUse
 from vinesim.client.composition.composer import NoRoom
 from vinesim.client.composition.randomizer import Life
+from vinesim.errors import UsageError
 from vinesim.robot.description.description import DescriptionError
 from vinesim.scene.data_files import NotFoundInData
 from vinesim.scene.ids import Organ, label
@@ -274,20 +274,20 @@ def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
     [
         ({"camera": "kinect"}, NotFoundInData, "d435, pinhole"),
         ({"size": "99999x4"}, SensorError, "16x16 to 4096x4096"),
-        ({"size": "640*480"}, WrongUse, "WxH"),
-        ({"at": "1,2"}, WrongUse, "X,Y,Z"),
-        ({"at": "1,2,nan"}, WrongUse, "X,Y,Z"),
-        ({"look": "0.4,1.2,1.3"}, WrongUse, "where the camera stands"),
-        ({"at": "1,2,-0.1"}, WrongUse, "in the ground"),
-        ({"at": "0,0,1"}, WrongUse, "inside"),
-        ({"robots": ["vinebot"]}, WrongUse, "give NAME@X,Y,YAW"),
-        ({"robots": ["vinebot@1"]}, WrongUse, "--robot is at '1'; give X,Y,YAW"),
+        ({"size": "640*480"}, UsageError, "WxH"),
+        ({"at": "1,2"}, UsageError, "X,Y,Z"),
+        ({"at": "1,2,nan"}, UsageError, "X,Y,Z"),
+        ({"look": "0.4,1.2,1.3"}, UsageError, "where the camera stands"),
+        ({"at": "1,2,-0.1"}, UsageError, "in the ground"),
+        ({"at": "0,0,1"}, UsageError, "inside"),
+        ({"robots": ["vinebot"]}, UsageError, "give NAME@X,Y,YAW"),
+        ({"robots": ["vinebot@1"]}, UsageError, "--robot is at '1'; give X,Y,YAW"),
         ({"robots": ["dalek@1,2"]}, DescriptionError, "dalek.* give a path or one of: logistic, vinebot"),
         ({"robots": ["vinebot@0.1,0.1"]}, NoRoom, r"robot_0 stands \d+ cm deep in (trunk|pole)"),
-        ({"people": ["1,1,0,dance"]}, WrongUse, "posture 'dance' is none of stand, pick"),
+        ({"people": ["1,1,0,dance"]}, UsageError, "posture 'dance' is none of stand, pick"),
         ({"people": ["1,1.2", "1.1,1.2"]}, NoRoom, "person_. stands .* deep in person_.; move one"),
-        ({"crates": ["1,1,0,1.5"]}, WrongUse, "the fill is 1.5; give 0"),
-        ({"crates": ["1,inf"]}, WrongUse, "--crate is at '1,inf'; give X,Y,YAW,FILL"),
+        ({"crates": ["1,1,0,1.5"]}, UsageError, "the fill is 1.5; give 0"),
+        ({"crates": ["1,inf"]}, UsageError, "--crate is at '1,inf'; give X,Y,YAW,FILL"),
     ],
 )
 def test_what_cannot_be_drawn_is_said(tmp_path: pathlib.Path, changed: dict, error: type, words: str) -> None:

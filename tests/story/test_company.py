@@ -46,7 +46,7 @@ class Farm:
         base, _ = self.farm.physics.rigid.base("farm_2")
         local = frames.rotate(frames.conjugate(base[3:]), centre - base[:3])
         side = "left" if local[1] >= 0.0 else "right"
-        self.farm.jobs.append(ReachAndPush(robot, side, lambda: centre, repeat=False).control)
+        self.farm.pre_step.append(ReachAndPush(robot, side, lambda: centre, repeat=False).control)
 
     def until(self, condition, limit: float) -> None:
         for _ in range(round(limit / DT)):
@@ -62,9 +62,9 @@ class Farm:
 def test_two_robots_of_one_client_are_two_actors_to_the_others():
     world = Farm()
     farm, visitor = world.farm, world.visitor
-    world.until(lambda: len(visitor.others) == 2 and len(farm.others) == 1, 3.0)
-    assert set(visitor.others) == {"farm_1", "farm_2"}
-    assert set(farm.others) == {"visitor"}
+    world.until(lambda: len(visitor.remote_actors) == 2 and len(farm.remote_actors) == 1, 3.0)
+    assert set(visitor.remote_actors) == {"farm_1", "farm_2"}
+    assert set(farm.remote_actors) == {"visitor"}
     assert farm.physics.rigid.robots == ("farm_1", "farm_2", "visitor")
 
     # each moves by its own commands, in both worlds
@@ -77,8 +77,8 @@ def test_two_robots_of_one_client_are_two_actors_to_the_others():
 
     # what the second one touches is told by it, and moves on the visitor's side
     world.reach()
-    world.until(lambda: visitor.exchange.owner(world.tree) == "farm_2", 15.0)
-    assert farm.exchanges["farm_2"].owner(world.tree) == "farm_2"
+    world.until(lambda: visitor.replicator.owner(world.tree) == "farm_2", 15.0)
+    assert farm.replicators["farm_2"].owner(world.tree) == "farm_2"
     here = world.model.bodies_of(world.tree)
     rest = world.model.joint_settled[here]
 
@@ -89,17 +89,17 @@ def test_two_robots_of_one_client_are_two_actors_to_the_others():
 
     world.until(lambda: moved(farm) > 0.2, 10.0)
     world.until(lambda: moved(visitor) > 0.15, 1.0)
-    assert farm.exchange.counters.environment.bytes_out == 0
-    assert farm.exchanges["farm_2"].counters.environment.bytes_out > 0
+    assert farm.replicator.counters.environment.bytes_out == 0
+    assert farm.replicators["farm_2"].counters.environment.bytes_out > 0
 
 
 def test_a_companion_is_nobody_that_must_be_told():
     """With the visitor 20 m away, one robot touches a vine beside its companion: not one byte leaves."""
     world = Farm(visitor_back=20.0)
     world.reach()
-    world.until(lambda: world.farm.far.ticks_touching > 20, 15.0)
-    assert world.farm.far.bytes == 0
-    assert sum(e.counters.environment.bytes_out for e in world.farm.exchanges.values()) == 0
+    world.until(lambda: world.farm.interest_audit.ticks_touching > 20, 15.0)
+    assert world.farm.interest_audit.bytes == 0
+    assert sum(e.counters.environment.bytes_out for e in world.farm.replicators.values()) == 0
 
 
 def test_robots_of_one_client_start_side_by_side_then_in_line():

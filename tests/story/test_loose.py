@@ -16,7 +16,7 @@ from vinesim.scene.values import HumanPose
 
 
 def drive(client: Client, speed: float) -> None:
-    client.jobs[:] = [lambda time: client.robot.command_base(speed, 0.0, time)]
+    client.pre_step[:] = [lambda time: client.robot.command_base(speed, 0.0, time)]
 
 
 def ask(client: Client, lift: float, fingers: float) -> None:
@@ -27,12 +27,12 @@ def near_worlds(*others: tuple[float, float]) -> tuple[World, Client, Client]:
     world = World()
     ada = world.join("ada", *(others[0] if others else (0.25, 0.0)))
     bob = world.join("bob", *(others[1] if len(others) > 1 else (1.0, -2.0)))
-    world.until(lambda: "ada" in bob.others and "bob" in ada.others, 1.0)
+    world.until(lambda: "ada" in bob.remote_actors and "bob" in ada.remote_actors, 1.0)
     return world, ada, bob
 
 
 def at_rest(world: World) -> bool:
-    return not any(client.things.moving or client.exchange.mine for client in world.clients.values())
+    return not any(client.objects.moving or client.replicator.mine for client in world.clients.values())
 
 
 def fill(client: Client, box: int = 0) -> None:
@@ -52,7 +52,7 @@ def test_a_bunch_is_told_of_from_cut_to_rest_then_nothing_until_it_is_gripped():
     worst = 0.0
     while not at_rest(world):
         world.run(0.05)
-        assert bob.exchange.owner(BUNCH(0)) in ("ada", None)
+        assert bob.replicator.owner(BUNCH(0)) in ("ada", None)
         worst = max(worst, apart(ada, bob, BUNCH(0)))
         assert world.now < 110.0
     # it falls at 4 m/s and is seen 25 ms late
@@ -70,7 +70,7 @@ def test_a_bunch_is_told_of_from_cut_to_rest_then_nothing_until_it_is_gripped():
         ask(ada, lift, fingers)
         world.run(seconds)
     assert (sent(ada), sent(bob)) > before
-    assert ada.exchange.owner(BUNCH(0)) == bob.exchange.owner(BUNCH(0)) == "ada"
+    assert ada.replicator.owner(BUNCH(0)) == bob.replicator.owner(BUNCH(0)) == "ada"
     world.run(0.6)
     assert pose_of(bob, BUNCH(0))[2] > lying + 0.15
     assert apart(ada, bob, BUNCH(0)) < 0.01
@@ -104,15 +104,15 @@ def test_in_a_box_a_bunch_is_silent_and_a_pushed_box_is_one_stream():
     assert sent(ada) == before
     start, told = pose_of(ada, BOX(0))[0], []
     drive(ada, 0.12)
-    counted = ada.exchange.counters.environment.bytes_out, ada.exchange.counters.environment.messages_out
+    counted = ada.replicator.counters.environment.bytes_out, ada.replicator.counters.environment.messages_out
     while pose_of(ada, BOX(0))[0] < start + 0.15:
         world.run(0.05)
-        told.append([bob.exchange.owner(number) for number in (BOX(0), BUNCH(0), BUNCH(1))])
+        told.append([bob.replicator.owner(number) for number in (BOX(0), BUNCH(0), BUNCH(1))])
         assert apart(ada, bob, BOX(0)) < 0.015
         assert max(apart(ada, bob, BUNCH(bunch)) for bunch in range(2)) < 0.06
     assert {owner for owner, *_ in told} == {"ada", None}
     assert {owner for _, *owners in told for owner in owners} == {None}
-    counters = ada.exchange.counters.environment
+    counters = ada.replicator.counters.environment
     size, messages = counters.bytes_out - counted[0], counters.messages_out - counted[1]
     assert size == messages * (14 + 26), "one record a message: the box"
     drive(ada, -0.2)
@@ -188,7 +188,7 @@ def test_two_cut_one_bunch_in_the_same_tick_and_it_is_one_bunch_of_one_owner():
     for client in (ada, bob):
         client.physics.pick(0)
     world.run(0.1)
-    assert ada.exchange.owner(BUNCH(0)) == bob.exchange.owner(BUNCH(0)) == "ada"
+    assert ada.replicator.owner(BUNCH(0)) == bob.replicator.owner(BUNCH(0)) == "ada"
     world.until(lambda: at_rest(world), 5.0)
     world.run(0.2)
     assert apart(ada, bob, BUNCH(0)) < 1e-3
@@ -207,7 +207,7 @@ def test_a_cut_cane_falls_for_everybody_near_and_lies_the_same():
     falling = ada.physics.state.body_q[body, 2]
     assert falling < 1.2
     assert abs(bob.physics.state.body_q[body, 2] - falling) < 0.12
-    world.until(lambda: ada.exchange.owner(1) is None and bob.exchange.owner(1) is None, 12.0)
+    world.until(lambda: ada.replicator.owner(1) is None and bob.replicator.owner(1) is None, 12.0)
     for client in (ada, bob):
         client.physics.refresh()
     here = ada.model.bodies_of(1)
@@ -228,8 +228,8 @@ def test_every_kind_of_thing_that_moves_has_a_channel():
     assert {organ for organ, number in named.items() if number is not None} == {Organ.BOX, Organ.BUNCH}
     assert {organ for organ, number in named.items() if number is None} <= {Organ.ROBOT, Organ.HUMAN}
     assert {link.name.partition("/")[0] for link in view.links if thing_named(link.name) is None} == {"ada", "bob"}
-    assert bob.exchange.actors.keys() == {"ada"}
-    assert {Kind(number >> 24) for number in ada.exchange.mine} == {Kind.BUNCH, Kind.TREE}
+    assert bob.replicator.actors.keys() == {"ada"}
+    assert {Kind(number >> 24) for number in ada.replicator.mine} == {Kind.BUNCH, Kind.TREE}
     assert set(Kind) == {Kind.TREE, Kind.BUNCH, Kind.BOX}
 
 
@@ -313,7 +313,7 @@ def test_while_the_server_is_away_everybody_works_on_and_all_agree_afterwards():
     world.run(0.3)
     for number in (BUNCH(0), BUNCH(1)):
         assert apart(ada, bob, number) < 5e-3
-        assert ada.exchange.fact(number) == bob.exchange.fact(number) == world.server.facts.of(number)
+        assert ada.replicator.fact(number) == bob.replicator.fact(number) == world.server.facts.of(number)
 
 
 def test_a_robot_that_leaves_leaves_behind_what_rode_on_it():
@@ -326,8 +326,8 @@ def test_a_robot_that_leaves_leaves_behind_what_rode_on_it():
     assert world.server.facts.of(BOX(1)).parent == "ada/base_footprint"
     ada.leave()
     world.leave("ada")
-    world.until(lambda: "ada" not in bob.others, 0.2)
-    world.until(lambda: bob.exchange.owner(BOX(1)) == "bob", 1.0)
+    world.until(lambda: "ada" not in bob.remote_actors, 0.2)
+    world.until(lambda: bob.replicator.owner(BOX(1)) == "bob", 1.0)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.1)
     fact = world.server.facts.of(BOX(1))
@@ -361,7 +361,7 @@ def test_a_person_takes_a_bunch_off_its_vine_carries_it_and_lets_it_fall_for_eve
     world.run(0.1)
     for client in (ada, bob):
         assert not client.physics.state.bunch_attached[0]
-        assert client.exchange.owner(BUNCH(0)) == "eva"
+        assert client.replicator.owner(BUNCH(0)) == "eva"
         assert apart(eva, client, BUNCH(0)) < 0.06
     world.until(lambda: eva.physics.hand("eva", "right").holds is None, 2.0)
     world.until(lambda: at_rest(world), 8.0)

@@ -47,12 +47,12 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     run(100)
     empty = float(model.box_mass[task.box]) * GRAVITY
     pick = Pick(worker.physics, worker.robot, task)
-    worker.jobs.append(pick.control)
+    worker.pre_step.append(pick.control)
     bunch, worst = thing(Kind.BUNCH, task.bunch), []
     while not pick.done:
         run()
         cut = not worker.physics.state.bunch_attached[task.bunch]
-        if cut and visitor.exchange.owner(bunch) == "worker":
+        if cut and visitor.replicator.owner(bunch) == "worker":
             here, there = (client.physics.riding.read(bunch)[0] for client in (worker, visitor))
             worst.append(float(np.linalg.norm(here[:3] - there[:3])))
     assert pick.picked, pick.reason
@@ -71,7 +71,7 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     run(100)
     weighed = np.mean([(run(), pressed_on_ground(visitor.physics, task.box))[1] for _ in range(50)]) - empty
     assert weighed == pytest.approx(float(model.body_mass[model.bunch_body[task.bunch]]) * GRAVITY, rel=0.03)
-    counters = worker.exchange.counters
+    counters = worker.replicator.counters
     told = counters.environment, counters.event, counters.fact
     assert sum(family.bytes_out for family in told) < 100e3
     assert max(worst) < 0.03

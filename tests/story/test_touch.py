@@ -42,7 +42,7 @@ class World:
         self.reach = ReachAndPush(
             self.picker.robot, self.picker.side_of(self.picker.trace.centre()), self.picker.trace.centre, repeat=False
         )
-        self.picker.jobs.append(self.reach.control)
+        self.picker.pre_step.append(self.reach.control)
 
     def tick(self):
         for client in self.clients.values():
@@ -66,12 +66,12 @@ def world():
     world = World()
     yield world
     for client in world.clients.values():
-        client.exchange.bus.close()
+        client.replicator.bus.close()
 
 
 def test_the_whole_way(world):
     picker, visitor = world.picker, world.visitor
-    world.until(lambda: "visitor" in picker.others and "picker" in visitor.others, 3.0)
+    world.until(lambda: "visitor" in picker.remote_actors and "picker" in visitor.remote_actors, 3.0)
 
     # 1, 2: a finger meets the bunch: equal and opposite forces, in the same tick
     rest = picker.trace.centre()
@@ -90,9 +90,9 @@ def test_the_whole_way(world):
     assert len(awake) < 0.2 * len(world.model.tree_first)
 
     # 5: the one who touches owns, everywhere
-    world.until(lambda: visitor.exchange.owner(world.tree) == "picker", 1.0)
-    assert picker.exchange.owner(world.tree) == "picker"
-    assert picker.exchange.counters.environment.bytes_out > 0
+    world.until(lambda: visitor.replicator.owner(world.tree) == "picker", 1.0)
+    assert picker.replicator.owner(world.tree) == "picker"
+    assert picker.replicator.counters.environment.bytes_out > 0
 
     # 6: the copy follows while the bunch is held away from where it hung
     world.until(lambda: picker.trace.displacement > 0.03)
@@ -105,30 +105,30 @@ def test_the_whole_way(world):
 
     # the hand goes, the bunch swings out and sleeps, all copies agree, and silence follows
     world.until(lambda: world.reach.phase.value == "done", 20.0)
-    picker.jobs.clear()
+    picker.pre_step.clear()
     away = picker.robot.description.home
     picker.robot.command_position(away)
     world.until(lambda: world.tree not in picker.physics.sleep.moving, 60.0)
-    world.until(lambda: visitor.exchange.owner(world.tree) is None, 2.0)
+    world.until(lambda: visitor.replicator.owner(world.tree) is None, 2.0)
     here = world.model.bodies_of(world.tree)
     mine, theirs = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]
     assert np.abs(np.abs((mine * theirs).sum(1)) - 1.0).max() < 1e-6
-    sent = picker.exchange.counters.environment.bytes_out
+    sent = picker.replicator.counters.environment.bytes_out
     for _ in range(100):
         world.tick()
-    assert picker.exchange.counters.environment.bytes_out == sent
+    assert picker.replicator.counters.environment.bytes_out == sent
     assert np.linalg.norm(picker.trace.centre() - rest) < 0.01
 
 
 def test_nobody_near_hears_nothing():
     world = World(visitor_back=20.0)
-    world.until(lambda: "visitor" in world.picker.others)
+    world.until(lambda: "visitor" in world.picker.remote_actors)
     world.until(lambda: world.picker.trace.displacement > 0.03)
-    assert world.picker.far.ticks_touching > 0
-    assert world.picker.far.bytes == 0
-    assert world.picker.exchange.counters.environment.bytes_out == 0
-    assert world.visitor.exchange.counters.environment.bytes_in == 0
-    assert world.picker.exchange.counters.actor.bytes_out > 0
+    assert world.picker.interest_audit.ticks_touching > 0
+    assert world.picker.interest_audit.bytes == 0
+    assert world.picker.replicator.counters.environment.bytes_out == 0
+    assert world.visitor.replicator.counters.environment.bytes_in == 0
+    assert world.picker.replicator.counters.actor.bytes_out > 0
 
 
 def test_twice_the_same_bits():

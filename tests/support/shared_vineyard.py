@@ -139,7 +139,7 @@ class World:
         return client
 
     def leave(self, name: str) -> None:
-        self.clients.pop(name).exchange.bus.close()
+        self.clients.pop(name).replicator.bus.close()
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / DT)):
@@ -171,10 +171,10 @@ def apart(a: Client, b: Client, number: int) -> float:
 
 def sent(client: Client) -> int:
     """Bytes that left about trees, boxes and bunches: streams, claims and facts."""
-    counters = client.exchange.counters
+    counters = client.replicator.counters
     return sum(family.bytes_out for family in (counters.environment, counters.event, counters.fact))
 
 
 def heard(client: Client) -> int:
-    counters = client.exchange.counters
+    counters = client.replicator.counters
     return sum(family.bytes_in for family in (counters.environment, counters.event, counters.fact))

@@ -16,7 +16,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.bench import scenes as scenes
-from vinesim.bench.mujoco_reference import Whole
+from vinesim.bench.mujoco_reference import MujocoScene
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
@@ -24,55 +24,64 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import load
 from vinesim.scene.values import Measurement, RobotSpec
 
-CANES = (64, 256)
-LIFTED = 12
-HELD = (14, 20, 26, 32)
+CANE_COUNTS = (64, 256)
+LIFTED_CANES = 12
+HELD_CANES = (14, 20, 26, 32)
 SCENE = "tendone"
-ROBOTS = (1, 10)
-PLACE = (15.5, 17.2)
+ROBOT_COUNTS = (1, 10)
+ROBOT_POSITION = (15.5, 17.2)
 """Of the robot in the block: its arms reach into the row behind it [m]."""
-AWAKE = 20
-TICKS, WARM = 1000, 100
+AWAKE_TREES = 20
+MEASURED_STEPS, WARM_UP_STEPS = 1000, 100
 
 
-def contact() -> Iterator[Measurement]:
+def contact_measurements() -> Iterator[Measurement]:
     """Canes with their bunches, all awake: a bar lifts twelve, four hands hold a bunch each."""
-    robots = [scenes.bar("bar", 0, LIFTED), *(scenes.hand(f"hand{i}", scenes.bunch_at(i)) for i in HELD)]
-    for canes, ticks in zip(CANES, (20, 5), strict=True):
-        case = f"{canes} canes and bunches, {LIFTED} lifted, {len(HELD)} held"
-        yield from _beside(case, "contact", scenes.row(canes), robots, ticks)
+    robots = [
+        scenes.bar("bar", 0, LIFTED_CANES),
+        *(scenes.gripper(f"hand{i}", scenes.bunch_center(i)) for i in HELD_CANES),
+    ]
+    for canes, ticks in zip(CANE_COUNTS, (20, 5), strict=True):
+        case = f"{canes} canes and bunches, {LIFTED_CANES} lifted, {len(HELD_CANES)} held"
+        yield from _compare_with_mujoco(case, "contact", scenes.cane_row(canes), robots, ticks)
 
 
-def tick(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
+def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
     """One hand and the vine it holds, beside the peer; then the shipped block with one ``robot`` and with ten.
 
     The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
     on the headland. All swing their joints.
     """
-    yield from _beside("1 hand, 1 held vine", "tick", scenes.row(1), [scenes.hand("hand", scenes.bunch_at(0))], 100)
+    yield from _compare_with_mujoco(
+        "1 hand, 1 held vine", "tick", scenes.cane_row(1), [scenes.gripper("hand", scenes.bunch_center(0))], 100
+    )
     model = generate(load(SCENE))
     with _one_core():
-        for count in ROBOTS:
-            yield from _block(model, robot, raised, count)
+        for count in ROBOT_COUNTS:
+            yield from _measure_vineyard(model, robot, raised, count)
 
 
-def _block(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> Iterator[Measurement]:
+def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> Iterator[Measurement]:
     """Tick by tick, and stage by stage, each with its own clock."""
     physics = Physics(model)
     for i in range(count):
-        pose = frames.pose([*PLACE, 0.0], frames.yaw(0.5 * np.pi)) if i == 0 else frames.pose([4.0 * i, -6.0, 0.0])
+        pose = (
+            frames.pose([*ROBOT_POSITION, 0.0], frames.yaw(0.5 * np.pi))
+            if i == 0
+            else frames.pose([4.0 * i, -6.0, 0.0])
+        )
         home = robot.home if i else raised
         physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
         physics.rigid.drive_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))
-    _swing(physics, robot, raised, 0)
+    _swing_joints(physics, robot, raised, 0)
     physics.step()
-    reached = physics.touching.near
-    away = np.linalg.norm(model.tree_pose[:, :2] - PLACE, axis=1)
+    reached = physics.contact_solver.near_trees
+    away = np.linalg.norm(model.tree_pose[:, :2] - ROBOT_POSITION, axis=1)
     away[reached] = -1.0
-    scenes.sleepless(physics, np.sort(np.argsort(away, kind="stable")[:AWAKE]))
-    seconds, contacts = np.zeros((TICKS, len(physics.stages) + 1)), 0
-    for i in range(-WARM, TICKS):
-        _swing(physics, robot, raised, i + WARM)
+    scenes.keep_awake(physics, np.sort(np.argsort(away, kind="stable")[:AWAKE_TREES]))
+    seconds, contacts = np.zeros((MEASURED_STEPS, len(physics.stages) + 1)), 0
+    for i in range(-WARM_UP_STEPS, MEASURED_STEPS):
+        _swing_joints(physics, robot, raised, i + WARM_UP_STEPS)
         marks = [time.perf_counter()]
         for _, stage in physics.stages:
             stage()
@@ -82,22 +91,22 @@ def _block(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> It
             seconds[i, :-1], seconds[i, -1] = np.diff(marks), marks[-1] - marks[0]
             contacts += len(physics.contacts)
     milliseconds = 1e3 * seconds
-    whose = np.array([_whose(name) for name, _ in physics.stages])
+    whose = np.array([_share_of(name) for name, _ in physics.stages])
     awake, bunches = len(physics.plants.awake), len(model.bunch_body)
-    case = f"{count} robot{'s' * (count > 1)}, {awake} trees awake, {bunches} bunches, {contacts / TICKS:.0f} contacts"
+    case = f"{count} robot{'s' * (count > 1)}, {awake} trees awake, {bunches} bunches, {contacts / MEASURED_STEPS:.0f} contacts"
     for share, text in (("", "tick"), ("MuJoCo", "MuJoCo's share"), ("ours", "ours"), ("rest", "the rest")):
         of = milliseconds[:, :-1][:, whose == share].sum(1) if share else milliseconds[:, -1]
         for name, percent in (("p50", 50), ("p99", 99)):
             yield Measurement("tick", f"{case}: {text}, {name}", float(np.percentile(of, percent)), "ms/tick")
 
 
-def _whose(stage: str) -> str:
-    """Rigid stages call MuJoCo and do little else; plants, wind and touching are ours; the rest hands over."""
+def _share_of(stage: str) -> str:
+    """Rigid stages call MuJoCo and do little else; plants, wind and contacts are ours; the rest hands over."""
     room = stage.split(":")[0]
-    return {"rigid": "MuJoCo", "plants": "ours", "touching": "ours", "wind": "ours"}.get(room, "rest")
+    return {"rigid": "MuJoCo", "plants": "ours", "contacts": "ours", "wind": "ours"}.get(room, "rest")
 
 
-def _swing(physics: Physics, robot: RobotSpec, raised: np.ndarray, tick: int) -> None:
+def _swing_joints(physics: Physics, robot: RobotSpec, raised: np.ndarray, tick: int) -> None:
     for i, name in enumerate(physics.rigid.robots):
         wave = 0.05 * np.sin(0.05 * tick + i)
         physics.rigid.command(name, (robot.home if i else raised) + wave)
@@ -117,15 +126,15 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _beside(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -> Iterator[Measurement]:
-    theirs = Whole(model, robots)
+def _compare_with_mujoco(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -> Iterator[Measurement]:
+    theirs = MujocoScene(model, robots)
     ours = [Physics(model)]
     if len(model.tree_first) > 1:
         ours.append(Physics(model, threads=2))
     for physics in ours:
         for robot in robots:
             physics.add_robot(robot)
-        scenes.sleepless(physics, np.arange(len(model.tree_first)))
+        scenes.keep_awake(physics, np.arange(len(model.tree_first)))
     for world in (*ours, theirs):
         for i in range(150):  # grasp, and lift
             _command(world.rigid, robots, i)
@@ -139,9 +148,9 @@ def _beside(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -
             _command(world.rigid, robots, clock[which])
             world.step()
             clock[which] += 1
-        met[which] += 1, (world.touching() if isinstance(world, Whole) else len(world.contacts))
+        met[which] += 1, (world.plant_contact_count() if isinstance(world, MujocoScene) else len(world.contacts))
 
-    seconds = scenes.interleaved(*(lambda i=i: steps(i) for i in range(len(clock))))
+    seconds = scenes.interleaved_medians(*(lambda i=i: steps(i) for i in range(len(clock))))
     counts = met[:, 1] / met[:, 0]
     peer = 1e3 * seconds[-1] / ticks
     for i, threads in enumerate(("one thread", "two threads")[: len(ours)]):

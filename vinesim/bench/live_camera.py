@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 from vinesim.client.client import Client
-from vinesim.client.rate_loop import Pace
+from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import Trace
-from vinesim.client.sensing.sensor_process import Senses
+from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.tasks.start_poses import bunch_in_reach, spawn_pose, start_pose
 from vinesim.client.tasks.tasks import LookAt
 from vinesim.net.transport.bus import MemoryHub
@@ -43,7 +43,9 @@ def _run(pictures: bool) -> _Run:
     description = load_robot("vinebot")
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(MemoryHub().bus("robot"))
-        senses = stack.enter_context(Senses("robot", plan, model, description, ros=False, keep_pictures=pictures))
+        senses = stack.enter_context(
+            SensorProcess("robot", plan, model, description, ros=False, keep_pictures=pictures)
+        )
         arrivals = stack.enter_context(ThreadPoolExecutor(1, "arrivals"))
         client = Client(plan, model, description, bus, name="robot", pose=start_pose(plan, 0), executor=arrivals)
         stack.callback(client.leave)
@@ -52,8 +54,8 @@ def _run(pictures: bool) -> _Run:
         body = int(model.bunch_body[bunch])
         client.trace = Trace(model, bunch, client.physics.state.body_q[body].copy(), 1 << 14)
         reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
-        client.jobs += [reach.control, LookAt(client.robot, client.trace.centre)]
-        warm, pace = Pace(client.physics.dt), Pace(client.physics.dt)
+        client.pre_step += [reach.control, LookAt(client.robot, client.trace.centre)]
+        warm, pace = RateLoop(client.physics.dt), RateLoop(client.physics.dt)
         camera = description.cameras[0].name
         before = {"frames": 0, "frames_dropped": 0}
         for beat, ticks in ((warm, SETTLED), (pace, round(SECONDS / client.physics.dt))):

@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import shapes_of
+from vinesim.physics.contact.contact_solver import plant_capsules
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, furnished
@@ -31,11 +32,11 @@ def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
     spec.memory = 1 << 28
-    _grow(spec, model, model.joint_damping[:, 1] if damping is None else damping)
+    _add_plants(spec, model, model.joint_damping[:, 1] if damping is None else damping)
     return spec.compile()
 
 
-def _grow(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[mujoco.MjsBody]:
+def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[mujoco.MjsBody]:
     """Add all trees to a world; ``damping`` [body] N m s/rad. Returns MuJoCo's bodies, without geoms."""
     made: list[mujoco.MjsBody] = []
     for body in range(len(model.body_mass)):
@@ -55,27 +56,29 @@ def _grow(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[mujoco
     return made
 
 
-class Whole:
+class MujocoScene:
     """A scene of plants and robots wholly in MuJoCo: one world, ball joints, a capsule or spheres for every body.
 
     Robots meet plants; plants do not meet each other (they may in ours: that is work the peer is spared). ``rigid``
     takes commands as ever. The scheme of ``discrete`` adds dt K of damping, which is taken off, down to nothing.
 
-    ``give`` [s] is the time constant of every contact; the default of MuJoCo, 0.02, is soft: at 3 m/s it lets things
+    ``contact_time_constant`` [s] is the time constant of every contact; the default of MuJoCo, 0.02, is soft: at 3 m/s it lets things
     overlap by centimetres.
     """
 
-    def __init__(self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01, give: float | None = None) -> None:
-        self.rigid = mine = Rigid(model, dt=dt)
+    def __init__(
+        self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01, contact_time_constant: float | None = None
+    ) -> None:
+        self.rigid = mine = Rigid(model, parameters=PhysicsParameters(dt=dt))
         for robot in robots:
             mine.add_robot(robot)
-        spec = furnished(model, dt)
+        spec = furnished(model, mine.parameters)
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         for bit, robot in enumerate(robots, FIRST_ACTOR):
             RobotBody(robot, bit).attach(spec)
-        made = _grow(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
-        shapes = shapes_of(model)
+        made = _add_plants(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
+        shapes = plant_capsules(model)
         for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
             kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
             if (start != end).any():
@@ -85,8 +88,8 @@ class Whole:
                 friction=ROUGH, solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
             )  # fmt: skip
         world = spec.compile()
-        if give is not None:
-            world.geom_solref[:] = give, 1.0
+        if contact_time_constant is not None:
+            world.geom_solref[:] = contact_time_constant, 1.0
             world.geom_solimp[:] = 0.99, 0.999, 0.001, 0.5, 2.0
         data = mujoco.MjData(world)
         for j in range(mine.world.njnt):
@@ -104,13 +107,13 @@ class Whole:
         mujoco.mj_step(self.world, self.data)
         self.rigid.stale()
 
-    def body_q(self, body: int) -> np.ndarray:
+    def body_pose(self, body: int) -> np.ndarray:
         """Pose [7] of a plant's body after the last step."""
         self.rigid.refresh()
         there = self.data.body(f"plant/{body}")
         return np.concatenate([there.xpos, frames.from_wxyz(there.xquat)])
 
-    def force_on(self, link: str) -> np.ndarray:
+    def contact_force_on(self, link: str) -> np.ndarray:
         """[3] N of all contacts on the robot link of this name in the last step."""
         total, wrench = np.zeros(3), np.zeros(6)
         for number in range(self.data.ncon):
@@ -123,14 +126,14 @@ class Whole:
             total += (float(other) - float(one)) * force
         return total
 
-    def touching(self) -> int:
+    def plant_contact_count(self) -> int:
         """Contacts of the last tick between plants and robots."""
         bodies = self.world.geom_bodyid[self.data.contact.geom]
         is_plant = np.array([self.world.body(i).name.startswith("plant/") for i in range(self.world.nbody)])
         return int((is_plant[bodies].sum(1) == 1).sum())
 
 
-def copy_state(state: State, data: mujoco.MjData) -> None:
+def copy_state_to_mujoco(state: State, data: mujoco.MjData) -> None:
     """Our joints into MuJoCo, whose ball rates are in the moved body's axes."""
     data.qpos[:] = frames.to_wxyz(state.joint_q).ravel()
     data.qvel[:] = frames.rotate(frames.conjugate(state.joint_q), state.joint_qd).ravel()

@@ -13,7 +13,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
-from vinesim.bench.scenes import interleaved
+from vinesim.bench.scenes import interleaved_medians
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.scene.builder import Tree, Wood, assemble
 from vinesim.scene.ids import Organ
@@ -21,10 +21,10 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Measurement
 
-CANES = 64
+CANE_COUNT = 64
 
 
-def cane(side: float) -> Tree:
+def plain_cane(side: float) -> Tree:
     """A horizontal cane with a bunch hanging from its tip."""
     tree = Tree(frames.pose(np.array([0.0, side, 2.0])))
     last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.006), 16)[-1]
@@ -35,39 +35,39 @@ def cane(side: float) -> Tree:
     return tree
 
 
-def vineyard(count: int) -> Model:
+def cane_scene(count: int) -> Model:
     """Canes half a metre apart."""
-    return assemble([cane(0.5 * i) for i in range(count)])
+    return assemble([plain_cane(0.5 * i) for i in range(count)])
 
 
-def ready(model: Model, awake: int) -> Plants:
+def warmed_up_solver(model: Model, awake: int) -> Plants:
     """Plants with their first trees awake and every kernel warm."""
     plants = Plants(model, State.at_rest(model))
     plants.wake(np.arange(awake))
-    steps(plants, 5)
+    run_steps(plants, 5)
     return plants
 
 
-def steps(plants: Plants, count: int) -> None:
+def run_steps(plants: Plants, count: int) -> None:
     """Whole ticks without contacts."""
     for _ in range(count):
         plants.free()
         plants.commit()
 
 
-def plants() -> Iterator[Measurement]:
+def plant_measurements() -> Iterator[Measurement]:
     """64 canes awake, touched by nobody, on one thread and on two."""
     ticks = 40
-    model = vineyard(CANES)
-    whole = ready(model, CANES)
-    halves = [ready(vineyard(CANES // 2), CANES // 2) for _ in range(2)]
+    model = cane_scene(CANE_COUNT)
+    whole = warmed_up_solver(model, CANE_COUNT)
+    halves = [warmed_up_solver(cane_scene(CANE_COUNT // 2), CANE_COUNT // 2) for _ in range(2)]
     peer = compile_plants(model)
     data = mujoco.MjData(peer)
     for _ in range(5):
         mujoco.mj_step(peer, data)
 
     def together() -> None:
-        threads = [Thread(target=steps, args=(half, ticks)) for half in halves]
+        threads = [Thread(target=run_steps, args=(half, ticks)) for half in halves]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -78,8 +78,9 @@ def plants() -> Iterator[Measurement]:
             mujoco.mj_step(peer, data)
 
     one, two, theirs = (
-        1e3 * seconds / ticks for seconds in interleaved(lambda: steps(whole, ticks), together, mujoco_steps)
+        1e3 * seconds / ticks
+        for seconds in interleaved_medians(lambda: run_steps(whole, ticks), together, mujoco_steps)
     )
     name = f"MuJoCo {mujoco.mj_versionString()} discrete"
-    yield Measurement("plants", f"{CANES} canes awake, one thread", one, "ms/tick", name, theirs, theirs / one)
-    yield Measurement("plants", f"{CANES} canes awake, two threads", two, "ms/tick", name, theirs, theirs / two)
+    yield Measurement("plants", f"{CANE_COUNT} canes awake, one thread", one, "ms/tick", name, theirs, theirs / one)
+    yield Measurement("plants", f"{CANE_COUNT} canes awake, two threads", two, "ms/tick", name, theirs, theirs / two)

@@ -21,11 +21,11 @@ from vinesim.scene.values import Drive, RobotSpec
 SPACING = 0.15
 """Between canes [m]."""
 HEIGHT = 2.0
-REACH = 0.085
+BUNCH_CENTER = 0.085
 """From the bunch's stalk to its middle [m]."""
 
 
-def cane(side: float) -> Tree:
+def cane_with_bunch(side: float) -> Tree:
     """A level cane along x with a bunch hanging from its tip."""
     tree = Tree(frames.pose(np.array([0.0, side, HEIGHT])))
     last = tree.rod(-1, 1.0, (0.006, 0.006), Wood(5e9, 800.0, 0.01, shear=2.5e9), 16)[-1]
@@ -34,7 +34,7 @@ def cane(side: float) -> Tree:
     last = tree.rod(last, 0.08, (0.002, 0.002), stalk, 2, organ=Organ.PEDUNCLE, rest=down)[-1]
     spring = np.asarray(tree.bodies[last]["stiffness"])
     bunch = tree.add(
-        last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=0.5, com=(REACH, 0, 0), length=0.17,
+        last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=0.5, com=(BUNCH_CENTER, 0, 0), length=0.17,
         radius=(0.04, 0.04), inertia=(3.2e-4, 8.7e-4, 8.7e-4), stiffness=spring, damping=0.01 * spring + 2e-3,
     )  # fmt: skip
     tree.bunches.append({"body": bunch, "length": 0.17, "radius": 0.045, "berries": 80, "pull": 500.0, "bend": 50.0})
@@ -42,9 +42,9 @@ def cane(side: float) -> Tree:
     return tree
 
 
-def row(count: int) -> Model:
+def cane_row(count: int) -> Model:
     """Canes side by side, the first at y = 0. Copies of one: ten thousand grow in seconds."""
-    one = cane(0.0)
+    one = cane_with_bunch(0.0)
     trees = []
     for i in range(count):
         tree = Tree(frames.pose(np.array([0.0, SPACING * i, HEIGHT])))
@@ -53,9 +53,9 @@ def row(count: int) -> Model:
     return assemble(trees)
 
 
-def bunch_at(cane: int) -> np.ndarray:
+def bunch_center(cane: int) -> np.ndarray:
     """Middle of a resting bunch [3] m."""
-    return np.array([1.0, SPACING * cane, HEIGHT - 0.08 - REACH])
+    return np.array([1.0, SPACING * cane, HEIGHT - 0.08 - BUNCH_CENTER])
 
 
 def _inertial(mass: float) -> str:
@@ -72,7 +72,7 @@ def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0")
     )
 
 
-def hand(name: str, at: np.ndarray) -> RobotSpec:
+def gripper(name: str, at: np.ndarray) -> RobotSpec:
     """Two flat fingers open by 17 cm about a point; drives: lift, and one for each finger (0.05 is a firm grasp)."""
     finger = "<collision><geometry><box size='0.02 0.04 0.07'/></geometry></collision>"
     urdf = (
@@ -104,14 +104,14 @@ def bar(name: str, first: int, count: int) -> RobotSpec:
     return RobotSpec(name, 1, urdf, "base_footprint", frames.pose(middle), drives, np.zeros(1))
 
 
-def sleepless(physics: Physics, trees: np.ndarray) -> Physics:
+def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
     """Wake some trees and let nothing fall asleep again."""
     physics.sleep.quiet = -1.0
     physics.plants.wake(trees)
     return physics
 
 
-def interleaved(*works: Callable[[], None], rounds: int = 9) -> list[float]:
+def interleaved_medians(*works: Callable[[], None], rounds: int = 9) -> list[float]:
     """Median seconds of each work, all taking turns so that the machine's moods hit all alike."""
     seconds = np.zeros((rounds, len(works)))
     for row in seconds:

@@ -93,25 +93,25 @@ class Pair:
         self.first, self.second = self.clients
         self.inbox = Inbox()
         """What the second client was told in its last tick."""
-        receive = self.second.exchange.receive
+        receive = self.second.replicator.receive
 
         def overhear(now: float) -> Inbox:
             self.inbox = receive(now)
             return self.inbox
 
-        self.second.exchange.receive = overhear
+        self.second.replicator.receive = overhear
 
     def push(self, who: Client, **options: float) -> ReachAndPush:
         """Let a robot push the bunch, once."""
         rest = _trace(who).centre()
         reach = ReachAndPush(who.robot, who.side_of(rest), lambda: rest, repeat=False, **options)
-        who.jobs.append(reach.control)
+        who.pre_step.append(reach.control)
         return reach
 
     def take_back(self) -> None:
         """Let whoever touches the tree take it from whoever has it, again and again: the rule that is not ours."""
         for client in self.clients:
-            client.exchange.send = functools.partial(_grab, client, client.exchange.send)
+            client.replicator.send = functools.partial(_grab, client, client.replicator.send)
 
     def tick(self) -> None:
         """One tick of everybody."""
@@ -124,8 +124,8 @@ class Pair:
         """Until each has a copy of the other, and the clock is known."""
         for _ in range(150):
             self.tick()
-        assert self.first.others
-        assert self.second.others
+        assert self.first.remote_actors
+        assert self.second.remote_actors
 
 
 def _grab(
@@ -136,7 +136,7 @@ def _grab(
     grabbed: list[int],
     **options: Any,
 ) -> Any:
-    others = [tree for tree in touched if client.exchange.owner(tree) not in (None, client.name)]
+    others = [tree for tree in touched if client.replicator.owner(tree) not in (None, client.name)]
     return send(*args, touched=touched, grabbed=[*grabbed, *others], **options)
 
 
@@ -272,7 +272,7 @@ def one_push(delay: float, *, quiet: float = 0.0) -> Rows:
     robot.command_position(robot.description.home)
     for _ in range(round(quiet / DT)):
         recorder.tick()
-        if all(client.exchange.owner(pair.tree) is None for client in pair.clients):
+        if all(client.replicator.owner(pair.tree) is None for client in pair.clients):
             until += 1
             if until > 100:
                 break

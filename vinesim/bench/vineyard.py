@@ -13,18 +13,18 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load
 from vinesim.scene.values import Measurement, RobotSpec
 
-AWAKE = 20
-ASLEEP = (1_000, 10_000)
-TICKS = 1000
+AWAKE_TREES = 20
+SLEEPING_TREES = (1_000, 10_000)
+MEASURED_STEPS = 1000
 
 
-def asleep(robot: RobotSpec) -> Iterator[Measurement]:
+def sleeping_measurements(robot: RobotSpec) -> Iterator[Measurement]:
     """Twenty canes with none, a thousand and ten thousand asleep beside them; then the budget of ``robot``'s client."""
     worlds = []
-    for sleepers in (0, *ASLEEP):
-        physics = Physics(scenes.row(AWAKE + sleepers))
-        physics.add_robot(scenes.hand("hand", scenes.bunch_at(0)))
-        worlds.append(scenes.sleepless(physics, np.arange(AWAKE)))
+    for sleepers in (0, *SLEEPING_TREES):
+        physics = Physics(scenes.cane_row(AWAKE_TREES + sleepers))
+        physics.add_robot(scenes.gripper("hand", scenes.bunch_center(0)))
+        worlds.append(scenes.keep_awake(physics, np.arange(AWAKE_TREES)))
 
     def steps(physics: Physics) -> None:
         for _ in range(20):
@@ -33,23 +33,25 @@ def asleep(robot: RobotSpec) -> Iterator[Measurement]:
 
     for physics in worlds:
         steps(physics)
-    alone, *among = (1e3 * s / 20 for s in scenes.interleaved(*(lambda p=p: steps(p) for p in worlds), rounds=25))
-    for sleepers, value in zip(ASLEEP, among, strict=True):
-        case = f"{AWAKE} canes awake, 1 hand, {sleepers} bunches asleep: whole tick"
-        yield Measurement("asleep", case, value, "ms/tick", f"none asleep, {AWAKE} awake", alone, alone / value)
+    alone, *among = (
+        1e3 * s / 20 for s in scenes.interleaved_medians(*(lambda p=p: steps(p) for p in worlds), rounds=25)
+    )
+    for sleepers, value in zip(SLEEPING_TREES, among, strict=True):
+        case = f"{AWAKE_TREES} canes awake, 1 hand, {sleepers} bunches asleep: whole tick"
+        yield Measurement("asleep", case, value, "ms/tick", f"none asleep, {AWAKE_TREES} awake", alone, alone / value)
     del worlds
-    yield from _budget(robot)
+    yield from _measure_tendone(robot)
 
 
-def _budget(robot: RobotSpec) -> Iterator[Measurement]:
+def _measure_tendone(robot: RobotSpec) -> Iterator[Measurement]:
     """The shipped tendone, one tick at a time: median and 99th percentile on one core."""
     model = generate(load("tendone"))
     physics = Physics(model)
     physics.add_robot(robot)
     distance = np.linalg.norm(model.tree_pose[:, :2] - robot.pose[:2], axis=1)
-    scenes.sleepless(physics, np.sort(np.argsort(distance, kind="stable")[:AWAKE]))
-    seconds = np.zeros(TICKS)
-    for i in range(-100, TICKS):
+    scenes.keep_awake(physics, np.sort(np.argsort(distance, kind="stable")[:AWAKE_TREES]))
+    seconds = np.zeros(MEASURED_STEPS)
+    for i in range(-100, MEASURED_STEPS):
         start = time.perf_counter()
         physics.step()
         if i >= 0:

@@ -11,33 +11,33 @@ from vinesim.scene.values import Measurement
 
 
 def _plants() -> Iterator[Measurement]:
-    from vinesim.bench.plants import plants
+    from vinesim.bench.plants import plant_measurements
 
-    return plants()
+    return plant_measurements()
 
 
 def _contact() -> Iterator[Measurement]:
-    from vinesim.bench.contact import contact
+    from vinesim.bench.contact import contact_measurements
 
-    return contact()
+    return contact_measurements()
 
 
 def _tick() -> Iterator[Measurement]:
-    from vinesim.bench.contact import tick
+    from vinesim.bench.contact import step_measurements
     from vinesim.robot.description.description import load
 
     robot = load("vinebot")
     raised = robot.home.copy()
     for joint, position in RAISED.items():
         raised[robot.joints.index(joint)] = position
-    return tick(robot.spec("robot"), raised)
+    return step_measurements(robot.spec("robot"), raised)
 
 
 def _asleep() -> Iterator[Measurement]:
-    from vinesim.bench.vineyard import asleep
+    from vinesim.bench.vineyard import sleeping_measurements
     from vinesim.robot.description.description import load
 
-    return asleep(load("vinebot").spec("robot"))
+    return sleeping_measurements(load("vinebot").spec("robot"))
 
 
 def _camera() -> Iterator[Measurement]:

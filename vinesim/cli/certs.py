@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import pathlib
 
+from vinesim.errors import UsageError
 from vinesim.net.transport.access_control import SERVER, Role
 from vinesim.net.transport.certificates import new as new_certificate
-
-
-class WrongUse(ValueError):
-    """Options that cannot be meant; the text says which."""
 
 
 def new(actor: str, folder: pathlib.Path, role: str, hosts: list[str]) -> int:
     """Make certificates and say which files they are."""
     possible = [each.value for each in Role if each != Role.SERVER]
     if role not in possible:
-        raise WrongUse(f"--role {role!r}: give {', '.join(possible)}")
+        raise UsageError(f"--role {role!r}: give {', '.join(possible)}")
     for path in new_certificate(folder, actor, Role.SERVER if actor == SERVER else Role(role), hosts):
         print(path)
     return 0

@@ -11,8 +11,8 @@ from multiprocessing.connection import Connection, wait
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vinesim.cli.render import pixels
-from vinesim.cli.robot_client import WrongUse
 from vinesim.client.composition.randomizer import Life
+from vinesim.errors import UsageError
 from vinesim.scene.spec import load
 from vinesim.sensors.camera import renderers
 from vinesim.sensors.export import dataset
@@ -35,9 +35,9 @@ def run(
 ) -> int:
     """Draw what is not there yet, then gather the annotations of all images."""
     if seed < 0:
-        raise WrongUse(f"--seed is {seed}: give 0 or more")
+        raise UsageError(f"--seed is {seed}: give 0 or more")
     if not 0.0 <= actors <= 1.0:
-        raise WrongUse(f"--actors is {actors:g}: give a share of the images, 0 to 1")
+        raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     life = Life(actors) if actors > 0.0 else None
     plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check(renderer))
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()

@@ -25,18 +25,19 @@ def run(
 ) -> int:  # fmt: skip
     """Walk, reach for a bunch, hold it and pull at it, let go; until told to stop. Then write report.json."""
     from vinesim.avatar.scripted_human import Walker
-    from vinesim.cli.robot_client import SWITCH, WrongUse, save_report, speak, tick_until
+    from vinesim.cli.robot_client import SWITCH, save_report, speak, tick_until
     from vinesim.client.client import Client
-    from vinesim.client.rate_loop import Pace
+    from vinesim.client.rate_loop import RateLoop
     from vinesim.client.recording.trace import Trace
     from vinesim.client.status import Status
     from vinesim.client.tasks.start_poses import bunch_centres, checked_bunch, placed, start_pose
+    from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load, reseeded
 
     if status not in ("text", "json", "none"):
-        raise WrongUse(f"--status {status!r}: give text, json or none")
+        raise UsageError(f"--status {status!r}: give text, json or none")
     sys.setswitchinterval(SWITCH)
     plan = reseeded(load(scene), seed)
     if place is not None:
@@ -55,7 +56,7 @@ def run(
 
             bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
         client = Client(
-            plan, model, None, bus, name=name, pose=start, source=walker, height=height, near=near,
+            plan, model, None, bus, name=name, pose=start, source=walker, height=height, interest_radius=near,
             jitter_buffer=1e-3 * jitter_buffer, device=device, threads=threads,
             executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
@@ -68,7 +69,7 @@ def run(
             if walk is None:
                 walker.do(walker.walk(before(bunch_centres(model)[reach], start)))
             walker.do(pull(walker, trace.centre))
-        pace = Pace(client.physics.dt)
+        pace = RateLoop(client.physics.dt)
         reporter = Status(client, pace)
         speaker = threading.Thread(target=speak, args=(reporter, lambda _: None, status, stop), name="status")
         speaker.start()

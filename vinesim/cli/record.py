@@ -12,15 +12,12 @@ import threading
 import time
 
 from vinesim.client.recording.recorder import FAMILIES, Recorder, Stand, grid
+from vinesim.errors import UsageError
 from vinesim.net.recording.mcap_file import Recording, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 POLL = 0.004
 """Between two looks at what arrived [s]."""
-
-
-class WrongUse(ValueError):
-    """Options that cannot be meant; the text says which."""
 
 
 def run(
@@ -31,7 +28,7 @@ def run(
     """Record until told to stop; 0 if the file is complete."""
     families = FAMILIES if only is None else tuple(filter(None, only.split(",")))
     if unknown := [family for family in families if family not in FAMILIES] or ([] if families else [only]):
-        raise WrongUse(f"--only {','.join(map(str, unknown))}: give some of {','.join(FAMILIES)}")
+        raise UsageError(f"--only {','.join(map(str, unknown))}: give some of {','.join(FAMILIES)}")
     stands = grid(area) if area is not None else []
     about = {"world": world, "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
     about["asked"] = "what is sent anyway" if area is None else "area " + " ".join(f"{edge:g}" for edge in area)
@@ -79,7 +76,7 @@ def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
     """What a scene file says of the only vineyard that is to be recorded."""
     if scene is None:
         if seed is not None:
-            raise WrongUse(f"--seed {seed}: a seed is of a scene, give --scene too")
+            raise UsageError(f"--seed {seed}: a seed is of a scene, give --scene too")
         return {}
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load, reseeded

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from vinesim.errors import UsageError
+
 if TYPE_CHECKING:
     from vinesim.client.composition.composer import Stage
 
@@ -30,7 +32,6 @@ def run(
     renderer: str = "warp",
 ) -> int:
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
-    from vinesim.cli.robot_client import WrongUse
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
     from vinesim.scene.spec import load, reseeded
@@ -46,9 +47,9 @@ def run(
     renderers.check(renderer)
     eye, target = point("--at", at), point("--look", look)
     if np.linalg.norm(target - eye) < 1e-6:
-        raise WrongUse(f"--look {look} is where the camera stands; look at another point")
+        raise UsageError(f"--look {look} is where the camera stands; look at another point")
     if eye[2] <= 0.0:
-        raise WrongUse(f"--at {at} lies in the ground; give a height above 0")
+        raise UsageError(f"--at {at} lies in the ground; give a height above 0")
     spec = CameraSpec.load(camera)
     info = sized(spec, None if size is None else pixels(size))
     plan, staged = reseeded(load(scene), seed), stage(robots, people, crates)
@@ -60,7 +61,7 @@ def run(
     inside = enclosing(primitives, eye)
     if inside >= 0:
         organ, index = unlabel(int(primitives.label[inside]))
-        raise WrongUse(f"--at {at} lies inside {organ.name.lower()} {index}; move the camera out of it")
+        raise UsageError(f"--at {at} lies inside {organ.name.lower()} {index}; move the camera out of it")
     pose = picture.looking(eye, target)
     seen = truth.look(primitives, info, pose)
     truths = truth.of_bunches(primitives, view, seen)
@@ -81,7 +82,7 @@ def run(
         formats.write_json(out / "camera.json", formats.camera(spec.model, info, pose))
         formats.write_json(out / "truth.json", {**described, "bunches": formats.record(truths, info)})
     except OSError as bad:
-        raise WrongUse(f"--out {out} cannot be written: {bad.strerror or bad}") from None
+        raise UsageError(f"--out {out} cannot be written: {bad.strerror or bad}") from None
     in_sight = [one for one in truths if one.pixels]
     print(
         f"{out}: {len(in_sight)} bunches, {sum(t.berries_seen for t in in_sight)} of "
@@ -92,7 +93,6 @@ def run(
 
 def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> Stage:
     """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
-    from vinesim.cli.robot_client import WrongUse
     from vinesim.client.composition.composer import CrateAt, PersonAt, RobotAt, Stage
     from vinesim.robot.description import description
     from vinesim.scene import appearance
@@ -101,56 +101,50 @@ def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -
     for text in robots:
         name, mark, where = text.rpartition("@")
         if not (mark and name):
-            raise WrongUse(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
+            raise UsageError(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
         description.load(name)  # says what is wrong with it
         placed_robots.append(RobotAt(name, *_place("--robot", where, 3)))
     for text in people:
         parts = text.split(",")
         posture = parts.pop() if len(parts) > 1 and parts[-1].strip().isidentifier() else "stand"
         if posture not in appearance.postures():
-            raise WrongUse(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.postures())}")
+            raise UsageError(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.postures())}")
         x, y, yaw = (*_place("--person", ",".join(parts), 3), 0.0)[:3]
         placed_people.append(PersonAt(x, y, yaw, posture))
     for text in crates:
         crate = CrateAt(*_place("--crate", text, 4))
         if not 0.0 <= crate.fill <= 1.0:
-            raise WrongUse(f"--crate {text}: the fill is {crate.fill:g}; give 0 (empty) to 1 (full)")
+            raise UsageError(f"--crate {text}: the fill is {crate.fill:g}; give 0 (empty) to 1 (full)")
         placed_crates.append(crate)
     return Stage(tuple(placed_robots), tuple(placed_people), tuple(placed_crates))
 
 
 def _place(option: str, text: str, most: int) -> list[float]:
     """``X,Y[,YAW[,...]]`` as two to ``most`` numbers."""
-    from vinesim.cli.robot_client import WrongUse
-
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
     if not 2 <= len(values) <= most or not np.isfinite(values).all() or max(map(abs, values)) > 1e4:
         fields = ",".join(("X", "Y", "YAW", "FILL")[:most])
-        raise WrongUse(f"{option} is at {text!r}; give {fields} in metres and radians, such as 1.5,0.8,3.14")
+        raise UsageError(f"{option} is at {text!r}; give {fields} in metres and radians, such as 1.5,0.8,3.14")
     return values
 
 
 def point(option: str, text: str) -> np.ndarray:
     """``X,Y,Z`` as a point [3] m."""
-    from vinesim.cli.robot_client import WrongUse
-
     try:
         value = np.array([float(part) for part in text.split(",")])
     except ValueError:
         value = np.zeros(0)
     if value.shape != (3,) or not np.isfinite(value).all() or np.abs(value).max() > 1e4:
-        raise WrongUse(f"{option} is {text!r}; give X,Y,Z in metres, such as 1.2,0.8,1.4")
+        raise UsageError(f"{option} is {text!r}; give X,Y,Z in metres, such as 1.2,0.8,1.4")
     return value
 
 
 def pixels(text: str) -> tuple[int, int]:
     """``WxH`` as width and height [px]."""
-    from vinesim.cli.robot_client import WrongUse
-
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if match is None:
-        raise WrongUse(f"--size is {text!r}; give WxH in pixels, such as 640x480")
+        raise UsageError(f"--size is {text!r}; give WxH in pixels, such as 640x480")
     return int(match[1]), int(match[2])

@@ -12,16 +12,13 @@ import time
 
 import numpy as np
 
+from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.recording.mcap_file import NotARecording, Tape, read, sender_of
 
 POLL = 0.004
 """Between two looks at what is due [s]."""
-
-
-class WrongUse(ValueError):
-    """Options that cannot be meant; the text says which."""
 
 
 def run(
@@ -31,14 +28,14 @@ def run(
 ) -> int:  # fmt: skip
     """Play a file; 0 when its end is reached, or on Ctrl-C."""
     if sum(way is not None for way in (connect, listen, out)) != 1:
-        raise WrongUse("give one of --connect (play to a server), --listen (be one) and --out (look at it)")
+        raise UsageError("give one of --connect (play to a server), --listen (be one) and --out (look at it)")
     tape = read(file)
     if tape.damage:
         print(tape.damage, file=sys.stderr, flush=True)
     if not tape.entries:
         raise NotARecording(f"{file} holds no message: nothing can be replayed")
     if start >= tape.length or (end is not None and end <= start):
-        raise WrongUse(f"--from {start:g}{'' if end is None else f' --to {end:g}'}: {file} lasts {tape.length:.1f} s")
+        raise UsageError(f"--from {start:g}{'' if end is None else f' --to {end:g}'}: {file} lasts {tape.length:.1f} s")
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -86,12 +83,12 @@ def _look(
 ) -> int:  # fmt: skip
     """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
     from vinesim.client.recording.replay import ReplayBus
-    from vinesim.client.spectator import Pictures, Spectator, looking_at, viewpoint
+    from vinesim.client.spectator import PictureWriter, Spectator, follow_view, standing_view
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import SceneError, load, reseeded
 
     if scene is None and "scene" not in tape.about:
-        raise WrongUse(f"{tape.path} does not say which scene it is of: give --scene")
+        raise UsageError(f"{tape.path} does not say which scene it is of: give --scene")
     if seed is None and "seed" in tape.about:
         seed = int(tape.about["seed"])
     try:
@@ -105,15 +102,15 @@ def _look(
             f"{tape.path} is of scene {tape.about.get('scene', '?')!r} with digest {digest}, "
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
-    eyes = viewpoint(*place) if place is not None else looking_at(_first_pose(tape))
+    eyes = standing_view(*place) if place is not None else follow_view(_first_pose(tape))
     out.mkdir(parents=True, exist_ok=True)
     bus = ReplayBus(tape, "spectator", start=start, end=end)
     spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
-    pictures = Pictures(spectator, out, 1.0)
+    pictures = PictureWriter(spectator, out, 1.0)
     while not (bus.ended or stop.is_set()):
         bus.play(spectator.physics.dt * speed)
         if place is None and spectator.physics.rigid.robots:
-            spectator.pose = looking_at(spectator.physics.rigid.base(min(spectator.physics.rigid.robots))[0])
+            spectator.pose = follow_view(spectator.physics.rigid.base(min(spectator.physics.rigid.robots))[0])
         spectator.tick()
     pictures.save(spectator)
     print(f"{pictures.count} pictures are in {out}/", file=sys.stderr)
@@ -131,4 +128,4 @@ def _first_pose(tape: Tape) -> np.ndarray:
         for entry in tape.entries:
             if entry.key.startswith("a/") and sender_of(entry.key) in such:
                 return decode_pose(entry.payload, "").base_q
-    raise WrongUse(f"{tape.path} has no pose of anybody to look at: give --place X Y YAW")
+    raise UsageError(f"{tape.path} has no pose of anybody to look at: give --place X Y YAW")

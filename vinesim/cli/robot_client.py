@@ -16,8 +16,10 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+from vinesim.errors import UsageError
+
 if TYPE_CHECKING:
-    from vinesim.client.rate_loop import Pace
+    from vinesim.client.rate_loop import RateLoop
 
 log = logging.getLogger(__name__)
 
@@ -25,10 +27,6 @@ SWITCH = 2e-4
 """How long another thread may hold the interpreter lock when the tick wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
-
-
-class WrongUse(ValueError):
-    """Options that cannot be meant; the text says which."""
 
 
 def run(
@@ -42,11 +40,11 @@ def run(
 ) -> int:  # fmt: skip
     """Build the client from its options, tick until told to stop, then write what was asked for."""
     if role != "robot":
-        raise WrongUse(f"role {role!r} is none of robot, human, spectator; give one of them")
+        raise UsageError(f"role {role!r} is none of robot, human, spectator; give one of them")
     if status not in ("text", "json", "none"):
-        raise WrongUse(f"--status {status!r}: give text, json or none")
+        raise UsageError(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
-        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
+        raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
     from vinesim.physics.plants.device_buffers import device_of
     from vinesim.sensors.camera import renderers
@@ -54,16 +52,16 @@ def run(
     device_of(device)  # refused before anything is built
     renderers.check(renderer)
     if threads > 1 and device != "cpu":
-        raise WrongUse(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
+        raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
     # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
     sys.setswitchinterval(SWITCH)
     stop = threading.Event()
 
     from vinesim.client.client import Client
-    from vinesim.client.rate_loop import Pace
+    from vinesim.client.rate_loop import RateLoop
     from vinesim.client.recording.trace import Trace
-    from vinesim.client.sensing.sensor_process import Senses
+    from vinesim.client.sensing.sensor_process import SensorProcess
     from vinesim.client.status import Status
     from vinesim.client.tasks.start_poses import checked_bunch, placed, start_pose
     from vinesim.client.tasks.tasks import DriveTo, LookAt, checked_job, plan_job
@@ -104,7 +102,7 @@ def run(
 
         perceptions = [
             stack.enter_context(
-                Senses(
+                SensorProcess(
                     one, plan, model, description,
                     namespace=namespace if len(names) == 1 else "/".join(filter(None, (namespace, ros_name(one)))),
                     ros=ros, keep_pictures=out is not None and i == 0, sensor_hz=sensor_hz,
@@ -115,7 +113,7 @@ def run(
         ]  # fmt: skip
         senses = perceptions[0]
         client = Client(
-            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, near=near,
+            plan, model, descriptions[0], bus(names[0]), name=names[0], pose=start, interest_radius=near,
             jitter_buffer=1e-3 * jitter_buffer, device=device,
             threads=threads, executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
@@ -124,28 +122,30 @@ def run(
         stack.callback(client.leave)
         for one, perception in zip(names, perceptions, strict=True):
             perception.attach(client, client.robots[one])
-        pace = Pace(client.physics.dt)
+        pace = RateLoop(client.physics.dt)
         watched = watch if watch is not None else push
         if watched is not None:
             body = int(model.bunch_body[watched])
             client.trace = Trace(model, watched, client.physics.state.body_q[body].copy(), 1 << 17)
         if back > 0.0:
-            client.jobs += [
+            client.pre_step += [
                 DriveTo(mine, start_pose(plan, spawn, queue=i)) for i, mine in enumerate(client.robots.values())
             ]
         if push is not None and client.trace is not None:
             reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
-            client.jobs.append(reach.control)
+            client.pre_step.append(reach.control)
         script = None
         if job is not None:
             script = begin(client.physics, client.robot)
-            client.jobs.append(script.control)
-            client.worth = script.worth
-            client.jobs.append(LookAt(client.robot, script.focus))
+            client.pre_step.append(script.control)
+            client.frame_score = script.worth
+            client.pre_step.append(LookAt(client.robot, script.focus))
         elif client.trace is not None:
-            client.jobs.append(LookAt(client.robot, client.trace.centre))
-        reporter = Status(client, pace, senses.sent, script)
-        speaker = threading.Thread(target=speak, args=(reporter, senses.diagnose, status, stop), name="status")
+            client.pre_step.append(LookAt(client.robot, client.trace.centre))
+        reporter = Status(client, pace, senses.sent_messages, script)
+        speaker = threading.Thread(
+            target=speak, args=(reporter, senses.publish_diagnostics, status, stop), name="status"
+        )
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
@@ -155,7 +155,7 @@ def run(
             report = reporter.report() | senses.report()
             if script is not None:
                 report["job"] = script.report()
-            senses.save(out)
+            senses.save_picture(out)
             if client.trace is not None:
                 client.trace.rows().save(out / "trace.npz")
             save_report(out, report)
@@ -163,7 +163,7 @@ def run(
 
 
 def tick_until(
-    stop: threading.Event, tick: Callable[[], None], pace: Pace, seconds: float | None, dt: float,
+    stop: threading.Event, tick: Callable[[], None], pace: RateLoop, seconds: float | None, dt: float,
     done: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
     """Tick in time until told to ``stop`` (Ctrl-C and SIGTERM do), for so many ``seconds``, or until it is ``done``."""

@@ -8,6 +8,7 @@ import signal
 import threading
 from typing import Any
 
+from vinesim.errors import UsageError
 from vinesim.net.server.admission import Plan
 from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import Server
@@ -17,21 +18,17 @@ STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
 
 
-class WrongUse(ValueError):
-    """Options that cannot be meant; the text says which."""
-
-
 def run(
     *, listen: list[str] | None, connect: list[str] | None, keep: pathlib.Path | None, scene: str | None,
     seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, status: str,
 ) -> int:  # fmt: skip
     """Carry messages until SIGINT or SIGTERM."""
     if status not in ("text", "json", "none"):
-        raise WrongUse(f"--status {status!r}: give text, json or none")
+        raise UsageError(f"--status {status!r}: give text, json or none")
     if min(quota) <= 0.0:
-        raise WrongUse(f"--quota {quota[0]:g} {quota[1]:g}: both must be above zero, or nothing is ever kept")
+        raise UsageError(f"--quota {quota[0]:g} {quota[1]:g}: both must be above zero, or nothing is ever kept")
     if seed is not None and scene is None:
-        raise WrongUse(f"--seed {seed} without a scene: give --scene as well")
+        raise UsageError(f"--seed {seed} without a scene: give --scene as well")
     plan = None if scene is None else _plan(scene, seed)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -19,11 +19,12 @@ def run(
     renderer: str, **_: Any,
 ) -> int:  # fmt: skip
     """Look until told to stop; pictures go to ``out``."""
-    from vinesim.cli.robot_client import WrongUse, speak, tick_until
-    from vinesim.client.rate_loop import Pace
-    from vinesim.client.spectator import Pictures, Spectator, viewpoint
+    from vinesim.cli.robot_client import speak, tick_until
+    from vinesim.client.rate_loop import RateLoop
+    from vinesim.client.spectator import PictureWriter, Spectator, standing_view
     from vinesim.client.status import Status
     from vinesim.client.tasks.start_poses import spawn_pose
+    from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.net.transport.zenoh_bus import ZenohBus
     from vinesim.scene.generation.vineyard import generate
@@ -31,9 +32,9 @@ def run(
     from vinesim.sensors.camera import renderers
 
     if status not in ("text", "json", "none"):
-        raise WrongUse(f"--status {status!r}: give text, json or none")
+        raise UsageError(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
-        raise WrongUse(f"--tls {tls} without a server: give --connect tls/HOST:7447")
+        raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
     renderers.check(renderer)
     plan = reseeded(load(scene), seed)
     if place is None:
@@ -48,12 +49,12 @@ def run(
         if connect is not None:
             bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=tls))
         spectator = Spectator(
-            plan, model, None, bus, name=name, pose=viewpoint(*place), near=near, device=device, threads=threads,
+            plan, model, None, bus, name=name, pose=standing_view(*place), interest_radius=near, device=device, threads=threads,
             executor=stack.enter_context(ThreadPoolExecutor(1, "arrivals")),
         )  # fmt: skip
-        pictures = None if out is None else Pictures(spectator, out, 1.0 / (sensor_hz or 1.0), renderer)
+        pictures = None if out is None else PictureWriter(spectator, out, 1.0 / (sensor_hz or 1.0), renderer)
         stop = threading.Event()
-        pace = Pace(spectator.physics.dt)
+        pace = RateLoop(spectator.physics.dt)
         reporter = Status(spectator, pace)
         speaker = threading.Thread(target=speak, args=(reporter, lambda _: None, status, stop), name="status")
         speaker.start()

@@ -23,8 +23,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.humans import Person, RemotePerson
 from vinesim.client.recording.trace import Trace
-from vinesim.client.remote.objects import PULL, Things
-from vinesim.client.remote.spawner import Arrivals
+from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
+from vinesim.client.remote.spawner import RemoteSpawner
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.exchange import Exchange, Inbox
@@ -64,7 +64,7 @@ class Client:
         pose: np.ndarray,
         source: Callable[[float], HumanPose] | None = None,
         height: float = 1.75,
-        near: float = interest.NEAR,
+        interest_radius: float = interest.NEAR,
         jitter_buffer: float = 0.0,
         device: str = "cpu",
         threads: int = 1,
@@ -76,35 +76,35 @@ class Client:
         ``executor`` prepares others who join, so that no tick has to; without one they are there at once.
         """
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, device=device, threads=threads, picking=self.picking)
+        self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, picking=self.picking)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robots: dict[str, Robot] = {}
         """All robots that this client moves, by name; the first is :attr:`robot`."""
-        self.people: dict[str, Person] = {}
+        self.humans: dict[str, Person] = {}
         """All people that this client moves, by name."""
-        self.exchanges: dict[str, Exchange] = {}
+        self.replicators: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
-        self.things = Things(self.physics, self.exchanges)
-        self._near, self._jitter_buffer = near, jitter_buffer
-        self._enter(description, pose, source, height, bus)
-        self.exchange = self.exchanges[name]
-        self.others: dict[str, RemoteRobot | RemotePerson] = {}
-        self.jobs: list[Callable[[float], None]] = []
+        self.objects = ObjectSync(self.physics, self.replicators)
+        self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
+        self._add_own_actor(description, pose, source, height, bus)
+        self.replicator = self.replicators[name]
+        self.remote_actors: dict[str, RemoteRobot | RemotePerson] = {}
+        self.pre_step: list[Callable[[float], None]] = []
         """Called every tick with the simulation time, before the drives: what the robot is to do."""
-        self.senses: list[Callable[[Client], None]] = []
+        self.post_step: list[Callable[[Client], None]] = []
         """Called every tick after the step: ROS, cameras, whoever wants to know."""
-        self.worth: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
+        self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
         """How much there is to see now: of the pictures, that of the greatest moment is kept."""
         self.trace: Trace | None = None
         """If set, what happens to one bunch is noted in it."""
-        self.far = Faraway()
+        self.interest_audit = InterestAudit()
         self._clock = clock
-        self._copies: dict[int, TreeUpdate] = {}
-        self.arrivals = Arrivals(self.physics.rigid, description, executor)
+        self._remote_trees: dict[int, TreeUpdate] = {}
+        self.spawner = RemoteSpawner(self.physics.rigid, description, executor)
 
-    def _enter(
+    def _add_own_actor(
         self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
         height: float, bus: Bus,
     ) -> None:  # fmt: skip
@@ -122,10 +122,10 @@ class Client:
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
             seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
+        exchange = Exchange(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
-        self._share(name, exchange)
+        self._add_replicator(name, exchange)
         return robot
 
     def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> Person:
@@ -134,15 +134,15 @@ class Client:
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
-        self.people[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
-        self._share(spec.name, exchange)
+        exchange = Exchange(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
+        self.humans[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
+        self._add_replicator(spec.name, exchange)
         return person
 
-    def _share(self, name: str, exchange: Exchange) -> None:
-        self.exchanges[name] = exchange
-        for own, share in self.exchanges.items():
-            share.kin = self.exchanges.keys() - {own}
+    def _add_replicator(self, name: str, exchange: Exchange) -> None:
+        self.replicators[name] = exchange
+        for own, share in self.replicators.items():
+            share.kin = self.replicators.keys() - {own}
 
     def tick(self) -> None:
         """Ten milliseconds of the vineyard."""
@@ -157,32 +157,32 @@ class Client:
 
     def receive(self, now: float) -> None:
         """Let others come and go, move their copies, and hear of the trees they touch."""
-        inbox = self._inbox(now)
+        inbox = self._receive_all(now)
         for hello in inbox.joined:
             log.info("%s joined as %s", hello.name, hello.kind)
             if hello.kind in ("robot", "human"):
-                self.arrivals.expect(hello)
+                self.spawner.enqueue(hello)
         for name in inbox.left:
-            self.arrivals.forget(name)
-            if (other := self.others.pop(name, None)) is not None:
+            self.spawner.cancel(name)
+            if (other := self.remote_actors.pop(name, None)) is not None:
                 other.leave()
-                self.physics.touching.copies.discard(name)
+                self.physics.contact_solver.remote_actors.discard(name)
                 log.info("%s left", name)
         for name, update in (*inbox.robots.items(), *inbox.people.items()):
-            if name in self.arrivals and (other := self.arrivals.embody(name, update)) is not None:
-                self.others[name] = other
-                self.physics.touching.copies.add(name)
-            if name in self.others:
-                self.others[name].follow(update)
-        self._pull(inbox)
+            if name in self.spawner and (other := self.spawner.spawn(name, update)) is not None:
+                self.remote_actors[name] = other
+                self.physics.contact_solver.remote_actors.add(name)
+            if name in self.remote_actors:
+                self.remote_actors[name].follow(update)
+        self._apply_remote_trees(inbox)
 
     def control(self) -> None:
         """Do the jobs, then hand set-points to the drives; people go where they are told."""
-        for job in self.jobs:
+        for job in self.pre_step:
             job(self.physics.time)
         for robot in self.robots.values():
             robot.control(self.physics.time)
-        for person in self.people.values():
+        for person in self.humans.values():
             person.control(self.physics.time)
 
     def sense(self) -> None:
@@ -194,42 +194,42 @@ class Client:
             for contact in self.physics.contacts:
                 if contact.body in self.trace.bodies:
                     force -= contact.force
-            told = int(self.model.body_tree[body]) in self._copies
+            told = int(self.model.body_tree[body]) in self._remote_trees
             self.trace.add(self.physics.time, self.physics.state.body_q[body], force, told)
-        for sense in self.senses:
+        for sense in self.post_step:
             sense(self)
 
     def send(self, now: float) -> None:
         """Say where robots and people are, and what they touch to those who are near."""
-        things = self.things
-        things.look()
+        things = self.objects
+        things.collect()
         moving, touching = things.moving, False
-        for name, actor in (*self.robots.items(), *self.people.items()):
-            exchange, pose = self.exchanges[name], actor.update(now)
+        for name, actor in (*self.robots.items(), *self.humans.items()):
+            exchange, pose = self.replicators[name], actor.update(now)
             mine = exchange.mine
-            parted = things.parted(name, all_others=name == self.name)
-            touched = things.touched(name, mine)
+            parted = things.detached_by(name, all_others=name == self.name)
+            touched = things.touched_by(name, mine)
             touching |= bool(touched)
             settled = exchange.send(
-                now, pose, touched=touched, moving=moving, read=things.read,
-                grabbed=things.grabbed(parted), parted=parted, cut=things.cuts, changed=things.changed,
-                lies=self.physics.riding.lies, pushed=actor.pushed(self.others) if isinstance(actor, Person) else None,
+                now, pose, touched=touched, moving=moving, read=things.read_state,
+                grabbed=things.with_trees(parted), parted=parted, cut=things.cut_roots, changed=things.is_changed,
+                lies=self.physics.riding.lies, pushed=actor.pushed(self.remote_actors) if isinstance(actor, Person) else None,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too
-                things.pull_tree(update, 1.0)
+                things.blend_tree(update, 1.0)
             for number in mine - exchange.mine:
-                things.rested(exchange.fact(number))
-        self.far.note(self, touching)
+                things.mark_resting(exchange.fact(number))
+        self.interest_audit.update(self, touching)
 
     def leave(self) -> None:
         """Before the buses close: say of what rides on our robots where it is, for with them its parent goes."""
         now = self._clock()
         for name, robot in self.robots.items():
-            riders = self.things.riders(name)
+            riders = self.objects.supported_by(name)
             if riders:
-                self.exchanges[name].send(
-                    now, robot.update(now), read=self.things.read, grabbed=riders, parted=riders,
+                self.replicators[name].send(
+                    now, robot.update(now), read=self.objects.read_state, grabbed=riders, parted=riders,
                     lies=self.physics.riding.lies,
                 )  # fmt: skip
 
@@ -241,11 +241,11 @@ class Client:
 
     # ------------------------------------------------------------------ others
 
-    def _inbox(self, now: float) -> Inbox:
+    def _receive_all(self, now: float) -> Inbox:
         """What all exchanges brought: of another actor, what is heard where it is nearest."""
-        inboxes = {name: exchange.receive(now) for name, exchange in self.exchanges.items()}
+        inboxes = {name: exchange.receive(now) for name, exchange in self.replicators.items()}
         for name in self.robots:
-            self._bear(name, inboxes[name].pushes)
+            self._apply_remote_wrenches(name, inboxes[name].pushes)
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
@@ -266,42 +266,42 @@ class Client:
         inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
         inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
         inbox.trees = [trees[tree] for tree in sorted(trees)]
-        inbox.things = [loose[number] for number in sorted(loose) if self._told_by_others(number)]
+        inbox.things = [loose[number] for number in sorted(loose) if self._is_owned_remotely(number)]
         return inbox
 
-    def _told_by_others(self, thing: int) -> bool:
+    def _is_owned_remotely(self, thing: int) -> bool:
         """Whether another client owns a thing: nobody of one's own does, and somebody is known to."""
-        owners = {exchange.owner(thing) for exchange in self.exchanges.values()} - {None}
-        return bool(owners) and not owners & self.exchanges.keys()
+        owners = {exchange.owner(thing) for exchange in self.replicators.values()} - {None}
+        return bool(owners) and not owners & self.replicators.keys()
 
-    def _bear(self, name: str, pushes: dict[str, np.ndarray]) -> None:
+    def _apply_remote_wrenches(self, name: str, pushes: dict[str, np.ndarray]) -> None:
         """Let a robot feel what other clients' people do to it."""
         try:
             self.physics.rigid.bear(name, pushes)
         except RobotError as error:
             log.debug("a push on nothing: %s", error)
 
-    def _pull(self, inbox: Inbox) -> None:
+    def _apply_remote_trees(self, inbox: Inbox) -> None:
         """Draw the copies of others' trees towards their owners' states, every tick; their own physics goes on."""
-        things, told = self.things, self.physics.touching.told
+        things, told = self.objects, self.physics.contact_solver.remote_trees
         for update in inbox.trees:
-            if update.tree not in self._copies:
+            if update.tree not in self._remote_trees:
                 self.physics.plants.wake(update.tree)
-                things.pull_tree(update, 1.0)
+                things.blend_tree(update, 1.0)
                 told[update.tree] = True
-            self._copies[update.tree] = update
-        for tree in [tree for tree in self._copies if not self._told_by_others(tree)]:
-            update = self._copies.pop(tree)
+            self._remote_trees[update.tree] = update
+        for tree in [tree for tree in self._remote_trees if not self._is_owned_remotely(tree)]:
+            update = self._remote_trees.pop(tree)
             told[tree] = False
             if update.resting:
-                things.pull_tree(update, 1.0)
-        for tree, update in self._copies.items():
+                things.blend_tree(update, 1.0)
+        for tree, update in self._remote_trees.items():
             self.physics.plants.wake(tree)
-            things.pull_tree(update, PULL)
+            things.blend_tree(update, BLEND_PER_STEP)
         things.receive(inbox)
 
 
-class Faraway:
+class InterestAudit:
     """Counts what this client sends of touched plants while nobody is near: nothing, if all is well."""
 
     MARGIN = 3.0
@@ -314,14 +314,14 @@ class Faraway:
         """Ticks in which this client touched plants with nobody near."""
         self._seen = 0
 
-    def note(self, client: Client, touching: bool) -> None:
+    def update(self, client: Client, touching: bool) -> None:
         """Judge one tick by where the others' copies stand."""
-        sent = sum(exchange.counters.environment.bytes_out for exchange in client.exchanges.values())
+        sent = sum(exchange.counters.environment.bytes_out for exchange in client.replicators.values())
         rigid = client.physics.rigid
-        here = [rigid.stands(name)[:2] for name in client.exchanges]
-        there = [rigid.stands(name)[:2] for name in client.others]
+        here = [rigid.stands(name)[:2] for name in client.replicators]
+        there = [rigid.stands(name)[:2] for name in client.remote_actors]
         distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
-        if distance > client.exchange.near + self.MARGIN:
+        if distance > client.replicator.near + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching
         self._seen = sent

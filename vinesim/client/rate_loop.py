@@ -7,14 +7,14 @@ import time
 import numpy as np
 
 
-class Pace:
+class RateLoop:
     """Waits for the next of a row of deadlines ``dt`` apart, and measures.
 
     Deadlines are absolute, so a late tick does not delay the ones after it. A process that fell far behind
     (it was stopped, or the machine slept) does not race to catch up: it takes up the beat again where it is.
     """
 
-    SLACK = 25
+    MAX_BACKLOG = 25
     """Ticks of backlog that are caught up; a longer backlog is dropped and counted."""
 
     def __init__(self, dt: float, capacity: int = 1 << 16) -> None:
@@ -35,7 +35,7 @@ class Pace:
         else:
             self._deadline += self.dt
             late = now - self._deadline
-            if late > self.SLACK * self.dt:
+            if late > self.MAX_BACKLOG * self.dt:
                 skipped = int(late / self.dt)
                 self.dropped += skipped
                 self._deadline += skipped * self.dt

@@ -19,30 +19,30 @@ from vinesim.sensors.export import images
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scheduler import load_kernels
 
-EYES = 1.6
+EYE_HEIGHT = 1.6
 """Height of a standing person's eyes above the ground [m]."""
 
-ASIDE = 2.6
+FOLLOW_DISTANCE = 2.6
 """Whoever is looked at is seen from this far [m], ..."""
 
-TURN = 0.7
+FOLLOW_YAW = 0.7
 """... from this far [rad] beside straight behind it, ..."""
 
 MIDDLE = 1.2
 """... and at this height [m]."""
 
 
-def viewpoint(x: float, y: float, heading: float) -> np.ndarray:
+def standing_view(x: float, y: float, heading: float) -> np.ndarray:
     """Pose [7] of the eyes of somebody who stands at (x, y) [m] and looks along ``heading`` [rad]."""
-    return frames.pose([x, y, EYES], frames.yaw(heading))
+    return frames.pose([x, y, EYE_HEIGHT], frames.yaw(heading))
 
 
-def looking_at(base: np.ndarray) -> np.ndarray:
+def follow_view(base: np.ndarray) -> np.ndarray:
     """Pose [7] of the eyes of somebody who looks over the shoulder of a robot whose base is at ``base`` [7]."""
     ahead = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
-    heading = float(np.arctan2(ahead[1], ahead[0])) + TURN
-    eye = base[:2] - ASIDE * np.array([np.cos(heading), np.sin(heading)])
-    return viewpoint(float(eye[0]), float(eye[1]), heading)
+    heading = float(np.arctan2(ahead[1], ahead[0])) + FOLLOW_YAW
+    eye = base[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)])
+    return standing_view(float(eye[0]), float(eye[1]), heading)
 
 
 class Spectator(Client):
@@ -59,21 +59,23 @@ class Spectator(Client):
             name=self.name, kind=ONLOOKER, scene=self.scene.name, digest=self.model.digest(),
             index=label_index(self.name), joints=0, seed=self.scene.seed,
         )  # fmt: skip
-        self.exchanges[self.name] = Exchange(bus, hello, self.model, near=self._near, jitter_buffer=self._jitter_buffer)
+        self.replicators[self.name] = Exchange(
+            bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer
+        )
 
     def sense(self) -> None:
         """Show the world to whoever wants to see it."""
-        for sense in self.senses:
+        for sense in self.post_step:
             sense(self)
 
     def send(self, now: float) -> None:
         """Say where the eyes are, and no more."""
         here = RobotUpdate(self.name, now, self.pose, np.zeros(6), np.zeros(0), np.zeros(0))
-        self.things.look()
-        self.exchange.send(now, here, read=self.things.read)
+        self.objects.collect()
+        self.replicator.send(now, here, read=self.objects.read_state)
 
 
-class Pictures:
+class PictureWriter:
     """What a spectator sees, as files ``view_SECONDS.png``; the last one also with depth and labels.
 
     Drawn in the tick, so each shows exactly the state it names, and a replay draws the same ones every time; a
@@ -97,9 +99,9 @@ class Pictures:
         self._primitives = Primitives(spectator.model, renderer=renderer)
         self._moved = np.zeros(len(spectator.model.tree_first), bool)
         self._every = max(round(period / spectator.physics.dt), 1)
-        spectator.senses.append(self._see)
+        spectator.post_step.append(self._after_step)
 
-    def _see(self, client: Client) -> None:
+    def _after_step(self, client: Client) -> None:
         assert isinstance(client, Spectator)
         physics = client.physics
         self._moved[physics.plants.awake] = True

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vinesim.client.client import Client
-from vinesim.client.rate_loop import Pace
+from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import touch_to_motion
 from vinesim.robot.tasks.task import Script
 
@@ -16,21 +16,21 @@ from vinesim.robot.tasks.task import Script
 class Status:
     """Figures of a running client. Reads what the tick leaves behind; may be asked from another thread."""
 
-    def __init__(self, client: Client, pace: Pace, sent: Any = None, script: Script | None = None) -> None:
+    def __init__(self, client: Client, rate_loop: RateLoop, sent: Any = None, task: Script | None = None) -> None:
         """``sent`` gives the number of messages sent so far by ROS topic, if there is a node; ``script``: the job."""
-        self.client, self.pace, self._script = client, pace, script
+        self.client, self.rate_loop, self._task = client, rate_loop, task
         self._sent = sent or (dict)
         self._before: dict[str, int] = {}
         self._before_time = 0.0
 
-    def now(self) -> dict[str, Any]:
+    def current(self) -> dict[str, Any]:
         """The state of affairs; topic rates are since the last call."""
-        client, pace = self.client, self.pace
+        client, pace = self.client, self.rate_loop
         sent, time = dict(self._sent()), pace.elapsed
         span = max(time - self._before_time, 1e-9)
         rates = {topic: (count - self._before.get(topic, 0)) / span for topic, count in sent.items() if count}
         self._before, self._before_time = sent, time
-        traffic = self.client.exchange.counters
+        traffic = self.client.replicator.counters
         families = (traffic.actor, traffic.environment, traffic.event)
         p50, p99 = pace.work_ms(50, 99)
         force = np.sum([np.linalg.norm(c.force) for c in client.physics.contacts if c.actor == client.name] or [0.0])
@@ -49,23 +49,23 @@ class Status:
             "bytes_out": sum(family.bytes_out for family in families),
             "environment_bytes_in": traffic.environment.bytes_in,
             "environment_bytes_out": traffic.environment.bytes_out,
-            "phase": "" if self._script is None else self._script.phase,
-            "others": sorted(client.others),
+            "phase": "" if self._task is None else self._task.phase,
+            "others": sorted(client.remote_actors),
             "topics": rates,
         }
 
     def report(self) -> dict[str, Any]:
         """The same at the end of a run, with what the trace shows."""
         client = self.client
-        figures = self.now()
+        figures = self.current()
         figures["topics"] = dict(self._sent())
         figures |= {
-            "environment_bytes_when_far": client.far.bytes,
-            "ticks_touching_when_far": client.far.ticks_touching,
+            "environment_bytes_when_far": client.interest_audit.bytes,
+            "ticks_touching_when_far": client.interest_audit.ticks_touching,
             "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
-            "malformed": client.exchange.counters.malformed,
-            "network": dataclasses.asdict(client.exchange.counters),
-            "deadlines_dropped": self.pace.dropped,
+            "malformed": client.replicator.counters.malformed,
+            "network": dataclasses.asdict(client.replicator.counters),
+            "deadlines_dropped": self.rate_loop.dropped,
         }
         if client.trace is not None:
             rows = client.trace.rows()

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.contact.contact_solver import ContactSolver
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.plants.detachment import Blade, Partings
 from vinesim.physics.plants.fault_guard import Guard
@@ -22,9 +23,6 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
 
-STIRRED = 4.0
-"""[m] With robots or people about, wind moves only the trees whose foot is so near to one of them."""
-
 
 class Physics:
     """A vineyard that moves: plants, rigid bodies, and what passes between them.
@@ -33,22 +31,37 @@ class Physics:
     """
 
     def __init__(
-        self, model: Model, *, dt: float = 0.01, device: str = "cpu", threads: int = 1, picking: bool = True
+        self,
+        model: Model,
+        *,
+        parameters: PhysicsParameters = PhysicsParameters(),
+        device: str = "cpu",
+        threads: int = 1,
+        picking: bool = True,
     ) -> None:
-        """``dt`` [s]; ``device``, ``threads``: see :class:`Plants`; ``picking``: bunches part when pulled too hard."""
-        self.model, self.dt = model, dt
+        """``device``, ``threads``: see :class:`Plants`; ``picking``: whether bunches detach when pulled too hard."""
+        p = parameters
+        self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
-        self.plants = Plants(model, self.state, dt=dt, device=device, threads=threads)
-        self.rigid = Rigid(model, dt=dt)
-        self.touching = Touching(model, self.plants, self.rigid)
-        self.parting = Partings(self.plants, self.rigid, self.touching)
-        self.holding = Holding(self.plants, self.rigid, self.touching)
+        self.plants = Plants(
+            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, brisk=p.fast_joint_rate,
+            limit=p.max_joint_rate, bound=p.fault_joint_rate,
+        )  # fmt: skip
+        self.rigid = Rigid(model, parameters=p)
+        self.contact_solver = ContactSolver(
+            model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
+        )
+        self.parting = Partings(self.plants, self.rigid, self.contact_solver)
+        self.holding = Holding(self.plants, self.rigid, self.contact_solver)
         self.riding = Riding(self.rigid)
-        self.lying = Lying(self.plants, self.rigid, self.touching, self.riding)
+        self.lying = Lying(self.plants, self.rigid, self.contact_solver, self.riding)
         self._links: tuple[tuple[Link, ...], tuple[Link, ...], tuple[Link, ...]] = ((), (), ())
         self._picking = picking
-        self.detail = Detail(self.plants)
-        self.sleep = Sleep(self.plants)
+        self.detail = Detail(
+            self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
+            patience=p.steps(p.detail_rest_duration),
+        )  # fmt: skip
+        self.sleep = Sleep(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
         self.guard = Guard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
@@ -63,10 +76,10 @@ class Physics:
             ("wind: blow on what somebody may see", self._blow),
             ("holding: close and open hands, pull at plants", self.holding.begin),
             ("rigid: predict without plants", self.rigid.prep),
-            ("touching: wake what is near", self.touching.find),
+            ("contacts: wake the trees that moving bodies are near to", self.contact_solver.wake_near_trees),
             ("detail: berries move where somebody is near", self._refine),
             ("plants: predict without contacts", self.plants.free),
-            ("touching: solve the contacts of both", self.touching.solve),
+            ("contacts: solve those of plants and rigid bodies", self.contact_solver.solve),
             ("plants: move, pushed by them", self._commit),
             ("rigid: move, pushed by them", self._finish),
             ("guard: stop what went wrong", self._guard),
@@ -91,15 +104,15 @@ class Physics:
     @property
     def contacts(self) -> tuple[Contact, ...]:
         """Who pressed on which plant in the last tick, sorted by (tree, body, shape, geom); then who held one."""
-        return self.touching.contacts + self.holding.contacts
+        return self.contact_solver.contacts + self.holding.contacts
 
     @property
     def touched(self) -> tuple[tuple[int, str], ...]:
         """(tree, actor) for every tree pressed on or held in the last tick, sorted."""
         if not self.holding.contacts:
-            return self.touching.touched
+            return self.contact_solver.touched_trees
         held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.holding.contacts)
-        return tuple(sorted({*self.touching.touched, *held}))
+        return tuple(sorted({*self.contact_solver.touched_trees, *held}))
 
     @property
     def haptics(self) -> tuple[Haptic, ...]:
@@ -154,13 +167,13 @@ class Physics:
         """See :meth:`Rigid.add_human`; a copy touches only trees of which its own client tells."""
         self.rigid.add_human(spec, copy=copy)
         if copy:
-            self.touching.copies.add(spec.name)
+            self.contact_solver.remote_actors.add(spec.name)
 
     def remove_human(self, name: str) -> None:
         """See :meth:`Rigid.remove_human`; what the hands held is let go."""
         self.rigid.remove_human(name)
         self.holding.forget(name)
-        self.touching.copies.discard(name)
+        self.contact_solver.remote_actors.discard(name)
 
     def move_human(self, name: str, pose: HumanPose) -> None:
         """Tell where a person's tracked points are at the end of the coming tick, and which hands are closed."""
@@ -195,7 +208,7 @@ class Physics:
         for tree, turned in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(turned, np.float32))
         self.plants.rest(np.array(trees, np.int32))
-        self.touching.moved(np.array(trees, np.int32))
+        self.contact_solver.update_tree_bounds(np.array(trees, np.int32))
         self.stirred = np.union1d(self.stirred, trees).astype(np.int32)
         self._body_q = None
 
@@ -218,18 +231,20 @@ class Physics:
     def _blow(self) -> None:
         if self.wind is not None:
             actors = [self.rigid.stands(name) for name in self.rigid.actors]
-            self.wind.update(self.plants, self.time, (np.array(actors), STIRRED) if actors else None)
+            self.wind.update(
+                self.plants, self.time, (np.array(actors), self.parameters.wind_radius) if actors else None
+            )
 
     def _refine(self) -> None:
-        self.detail.update(self.touching.near)
+        self.detail.update(self.contact_solver.near_trees)
 
     def _commit(self) -> None:
-        self.plants.commit(self.touching.bodies, self.touching.wrenches)
+        self.plants.commit(self.contact_solver.bodies, self.contact_solver.wrenches)
         if len(self.plants.awake):
             self._body_q, self._fresh = None, False
 
     def _finish(self) -> None:
-        self.rigid.finish(self.touching.force)
+        self.rigid.finish(self.contact_solver.rigid_force)
 
     def _guard(self) -> None:
         self.guard.check()
@@ -244,5 +259,9 @@ class Physics:
         self.parting.held = self.holding.contacts
 
     def _sleep(self) -> None:
+        if not self.parameters.sleep:
+            return
         held = self.holding.trees
-        self.sleep.update(np.union1d(self.touching.near, held) if len(held) else self.touching.near)
+        self.sleep.update(
+            np.union1d(self.contact_solver.near_trees, held) if len(held) else self.contact_solver.near_trees
+        )

@@ -15,6 +15,7 @@ import msgspec
 from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.data_files import NotFoundInData, find
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.toml_loader import DataError, read
 
 MOST_ROBOTS = 10
@@ -146,6 +147,8 @@ class Scene(_Part, frozen=True, kw_only=True):
     sun: Sun = Sun()
     wind: Wind = Wind()
     spawns: tuple[Spawn, ...] = ()
+    physics: PhysicsParameters = PhysicsParameters()
+    """Parameters that differ from their defaults; they are not part of the vineyard's digest."""
 
 
 def load(path_or_name: str | pathlib.Path) -> Scene:

@@ -75,6 +75,8 @@ def _explain(message: str, data: Any, kind: Any) -> str:
         return f"{named}{quoted[0]} is not a field; {hint} (known: {', '.join(known)})"
     if "missing required field" in what:
         return f"{named}{quoted[0]} is missing; add it: {quoted[0]} = ..."
+    if place and what.startswith(f"{place}."):  # a check of the struct itself, which names the field
+        return what
     place = place or "the file"
     if what.startswith("Invalid enum value"):
         return f"{place} is {found!r}; give one of: {', '.join(_choices(kind, steps))}"

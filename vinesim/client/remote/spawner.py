@@ -22,7 +22,7 @@ Prepared = tuple[Description | None, Draft]
 """A robot's description, or None for a person, and the world with it."""
 
 
-class Arrivals:
+class RemoteSpawner:
     """Who is expected, and how far that is."""
 
     def __init__(
@@ -37,16 +37,16 @@ class Arrivals:
     def __contains__(self, name: str) -> bool:
         return name in self._expected
 
-    def expect(self, hello: Hello) -> None:
+    def enqueue(self, hello: Hello) -> None:
         """Somebody has introduced itself; where it is will be known with its first pose."""
         self._expected[hello.name] = hello
 
-    def forget(self, name: str) -> None:
+    def cancel(self, name: str) -> None:
         """It has gone again."""
         self._expected.pop(name, None)
         self._coming.pop(name, None)
 
-    def embody(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemotePerson | None:
+    def spawn(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemotePerson | None:
         """The copy of whoever is expected, standing where ``update`` says; None as long as it is not ready.
 
         Who cannot be shown is named in the log and no more expected.
@@ -60,11 +60,11 @@ class Arrivals:
             description, draft = self._coming.pop(name).result()
         except ValueError as error:
             log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
-            self.forget(name)
+            self.cancel(name)
             return None
         if not self.rigid.admit(draft):
             return None  # somebody else came or went meanwhile: once more, from the next tick on
-        self.forget(name)
+        self.cancel(name)
         if description is None or not isinstance(update, RobotUpdate):
             return RemotePerson(self.rigid, name)
         other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, here=True)
@@ -84,13 +84,13 @@ class Arrivals:
     def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
         if isinstance(update, HumanUpdate):
             return None, self.rigid.prepare(spec_of(hello, update), copy=True)
-        description = described(hello, self.own)
+        description = resolve_description(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
         return description, self.rigid.prepare(description.spec(hello.name, hello.index, update.base_q))
 
 
-def described(hello: Hello, own: Description | None) -> Description:
+def resolve_description(hello: Hello, own: Description | None) -> Description:
     """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
     if own is not None and hello.urdf == own.urdf:
         return own

@@ -13,13 +13,13 @@ from multiprocessing.shared_memory import SharedMemory
 _HEAD = struct.Struct("<QQ")
 
 
-class Mailbox:
+class LatestValue:
     """One writer, one reader. Make it in the writer's process and hand it to the reader's when that is spawned."""
 
     def __init__(self, capacity: int, context: multiprocessing.context.BaseContext) -> None:
         """``capacity``: the largest letter [bytes]."""
         self.capacity = capacity
-        self.missed = 0
+        self.missed_writes = 0
         """Letters that were not written because the reader was just taking one."""
         self._memory = SharedMemory(create=True, size=_HEAD.size + capacity)
         self._memory.buf[: _HEAD.size] = bytes(_HEAD.size)
@@ -28,18 +28,18 @@ class Mailbox:
         self._number = 0
         self._owner = True
 
-    def put(self, letter: bytes) -> bool:
+    def put(self, value: bytes) -> bool:
         """Leave a letter in the place of the last one. False if the reader has its hand in the box: try again."""
-        if len(letter) > self.capacity:
-            raise ValueError(f"letter of {len(letter)} bytes for a mailbox of {self.capacity}")
+        if len(value) > self.capacity:
+            raise ValueError(f"letter of {len(value)} bytes for a mailbox of {self.capacity}")
         if not self._lock.acquire(block=False):
-            self.missed += 1
+            self.missed_writes += 1
             return False
         try:
             self._number += 1
-            end = _HEAD.size + len(letter)
-            self._memory.buf[_HEAD.size : end] = letter
-            self._memory.buf[: _HEAD.size] = _HEAD.pack(self._number, len(letter))
+            end = _HEAD.size + len(value)
+            self._memory.buf[_HEAD.size : end] = value
+            self._memory.buf[: _HEAD.size] = _HEAD.pack(self._number, len(value))
         finally:
             self._lock.release()
         self._news.release()

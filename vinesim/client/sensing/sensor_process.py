@@ -18,8 +18,8 @@ from typing import Any, Self
 import numpy as np
 
 from vinesim.client.client import Client
-from vinesim.client.sensing.latest_value import Mailbox, poller
-from vinesim.client.sensing.sensor_worker import Letter, Setup, perceive
+from vinesim.client.sensing.latest_value import LatestValue, poller
+from vinesim.client.sensing.sensor_worker import SensorConfig, StepSnapshot, run_sensor_worker
 from vinesim.client.tasks.tasks import Obey
 from vinesim.robot.description.description import Description
 from vinesim.robot.drives import Robot
@@ -30,23 +30,23 @@ from vinesim.scene.spec import Scene
 
 log = logging.getLogger(__name__)
 
-VIEW_TICKS = 2
+SNAPSHOT_PERIOD = 2
 """Ticks between two views for the eyes: 50 Hz, faster than any camera here."""
-START = 300.0
+START_TIMEOUT = 300.0
 """How long the process may take to start; a first run compiles kernels [s]."""
-ANSWER = 10.0
+SAVE_TIMEOUT = 10.0
 """How long the process may take to write its pictures [s]."""
-PATIENCE = 1.2
+EXIT_TIMEOUT = 1.2
 """How long it may take to end [s]."""
 
 
-class SensesError(RuntimeError):
+class SensorProcessError(RuntimeError):
     """The process of the senses failed; the text says how."""
 
     exit_code = 3
 
 
-class Senses:
+class SensorProcess:
     """Cameras, lidars and the ROS node of the client's robot. A context: the process ends with it."""
 
     def __init__(
@@ -83,13 +83,13 @@ class Senses:
         self._acknowledged, self._letters = 0, 0
         self._asked: list[tuple[int, np.ndarray]] = []
         context = multiprocessing.get_context("spawn")
-        self._mailbox = Mailbox(40 * len(model.body_mass) + (4 << 20), context)
+        self._mailbox = LatestValue(40 * len(model.body_mass) + (4 << 20), context)
         self._pipe, theirs = context.Pipe()
         sun = scene.sun.direction
         clock = not namespace if clock is None else clock
-        setup = Setup(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz, clock, renderer)
+        setup = SensorConfig(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz, clock, renderer)
         self._process = context.Process(
-            target=perceive, args=(setup, self._mailbox, theirs), name=f"senses of {name}", daemon=True
+            target=run_sensor_worker, args=(setup, self._mailbox, theirs), name=f"senses of {name}", daemon=True
         )
         self._process.start()
         theirs.close()
@@ -99,11 +99,11 @@ class Senses:
         """Perceive this client's world from now on, as its first robot unless told; waits for the process."""
         self.client = client
         self.robot = robot or client.robot
-        self._wait_for("ready", START)
+        self._wait_for("ready", START_TIMEOUT)
         self._attached = True
-        client.senses.append(self._every_tick)
+        client.post_step.append(self._every_tick)
         if self._ros:
-            client.jobs.insert(0, Obey(self.robot, self._take_commands))
+            client.pre_step.insert(0, Obey(self.robot, self._take_commands))
 
     # ------------------------------------------------------------------ the tick
 
@@ -111,7 +111,7 @@ class Senses:
         self._listen()
         physics = client.physics
         self._moved[physics.plants.awake] = self._moved[physics.stirred] = True
-        looks = self._figures["eyes"] and physics.tick % VIEW_TICKS == 0
+        looks = self._figures["eyes"] and physics.tick % SNAPSHOT_PERIOD == 0
         truth = self._figures.get("truth", False) and physics.tick % 10 == 0
         trees = bodies = body_q = link_q = poses = links = None
         if looks or truth:
@@ -124,11 +124,11 @@ class Senses:
             poses = {name: self.robot.frame_pose(frame) for name, frame in self._sensors.items()}
             if physics.links() is not self._links:
                 links = physics.links()
-        letter = Letter(
+        letter = StepSnapshot(
             number=self._letters + 1, tick=physics.tick, time=physics.time,
             sample=self.robot.sample(physics.time, physics.contacts),
             bodies=bodies, body_q=body_q, trees=trees, attached=np.packbits(physics.state.bunch_attached),
-            links=links, link_q=link_q, poses=poses, worth=client.worth(),
+            links=links, link_q=link_q, poses=poses, frame_score=client.frame_score(),
         )  # fmt: skip
         if self._mailbox.put(pickle.dumps(letter, pickle.HIGHEST_PROTOCOL)):
             self._letters += 1
@@ -141,9 +141,9 @@ class Senses:
             try:
                 kind, value = self._pipe.recv()
             except EOFError:
-                self._process.join(PATIENCE)
+                self._process.join(EXIT_TIMEOUT)
                 code = self._process.exitcode
-                raise SensesError(f"the senses of {self.name} ended with exit code {code}") from None
+                raise SensorProcessError(f"the senses of {self.name} ended with exit code {code}") from None
             if kind == "commands":
                 self._commands += value
             elif kind == "figures":
@@ -151,7 +151,7 @@ class Senses:
             elif kind == "read":
                 self._read(*value)
             elif kind == "failed":
-                raise SensesError(f"the senses of {self.name} failed: {value}")
+                raise SensorProcessError(f"the senses of {self.name} failed: {value}")
 
     def _read(self, number: int, links_seen: bool) -> None:
         """A letter with a view was read: what moved until then, and rests since, needs no telling again."""
@@ -172,11 +172,11 @@ class Senses:
 
     # ------------------------------------------------------------------ questions
 
-    def sent(self) -> dict[str, int]:
+    def sent_messages(self) -> dict[str, int]:
         """Messages sent so far, by topic."""
         return self._figures["sent"]
 
-    def diagnose(self, figures: dict[str, Any]) -> None:
+    def publish_diagnostics(self, figures: dict[str, Any]) -> None:
         """Pass the client's figures on to /diagnostics."""
         keys = ("time", "tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "bytes_in", "bytes_out")
         with contextlib.suppress(OSError):
@@ -186,10 +186,10 @@ class Senses:
         """What was rendered, sent and dropped."""
         return {key: self._figures[key] for key in ("frames", "frames_dropped", "ros_dropped") if key in self._figures}
 
-    def save(self, folder: pathlib.Path) -> None:
+    def save_picture(self, folder: pathlib.Path) -> None:
         """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs."""
         self._pipe.send(("save", folder))
-        self._wait_for("saved", ANSWER)
+        self._wait_for("saved", SAVE_TIMEOUT)
 
     def _wait_for(self, answer: str, timeout: float) -> None:
         while self._pipe.poll(timeout):
@@ -198,19 +198,19 @@ class Senses:
             except EOFError:
                 break
             if kind == "failed":
-                raise SensesError(f"the senses of {self.name} failed: {value}")
+                raise SensorProcessError(f"the senses of {self.name} failed: {value}")
             if kind == "figures":
                 self._figures = value
             if kind == answer:
                 return
-        raise SensesError(f"the senses of {self.name} did not get {answer} within {timeout:.0f} s")
+        raise SensorProcessError(f"the senses of {self.name} did not get {answer} within {timeout:.0f} s")
 
     def close(self) -> None:
         """End the process."""
         with contextlib.suppress(OSError):
             self._pipe.send(("stop", None))
         if self._attached:
-            self._process.join(PATIENCE)
+            self._process.join(EXIT_TIMEOUT)
         if self._process.is_alive():
             if self._attached:
                 log.warning("the senses of %s did not end by themselves", self.name)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.sensing.latest_value import Mailbox, poller
+from vinesim.client.sensing.latest_value import LatestValue, poller
 from vinesim.robot.description.description import Description
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -28,16 +28,16 @@ from vinesim.sensors.camera.sunlight import SunPath
 
 log = logging.getLogger(__name__)
 
-FIGURES_PERIOD = 0.1
+STATISTICS_PERIOD = 0.1
 """Simulated time between two reports to the tick: what is wanted, what was sent [s]."""
-SWITCH = 5e-4
+SWITCH_INTERVAL = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
-NICE, EYES_NICE = 10, 15
+PROCESS_NICE, RENDER_NICE = 10, 15
 """Where cores are scarce, the tick goes first, then what ROS is told, then the pictures."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
+class SensorConfig:
     """All that the process must know beforehand."""
 
     name: str
@@ -53,7 +53,7 @@ class Setup:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Letter:
+class StepSnapshot:
     """What the tick hands over. Poses are given only when the eyes want them, and of plants only those that moved."""
 
     number: int
@@ -67,22 +67,22 @@ class Letter:
     links: tuple[Link, ...] | None
     link_q: np.ndarray | None
     poses: dict[str, np.ndarray] | None
-    worth: float
+    frame_score: float
     """How much there is to see: see ``Client.worth``."""
 
 
-def perceive(setup: Setup, mailbox: Mailbox, pipe: Connection) -> None:
+def run_sensor_worker(setup: SensorConfig, mailbox: LatestValue, pipe: Connection) -> None:
     """Entry of the process: perceive until told to stop, or until whoever started it is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then says stop
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     if hasattr(os, "nice"):
-        os.nice(NICE)
+        os.nice(PROCESS_NICE)
     code = 0
     try:
         with contextlib.ExitStack() as stack:
             stack.callback(mailbox.close)
-            _Perception(setup, pipe, stack).run(mailbox)
+            SensorWorker(setup, pipe, stack).run(mailbox)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the client is gone
     except Exception as error:
@@ -95,8 +95,8 @@ def perceive(setup: Setup, mailbox: Mailbox, pipe: Connection) -> None:
     os._exit(code)
 
 
-class _Perception:
-    def __init__(self, setup: Setup, pipe: Connection, stack: contextlib.ExitStack) -> None:
+class SensorWorker:
+    def __init__(self, setup: SensorConfig, pipe: Connection, stack: contextlib.ExitStack) -> None:
         self.setup, self.pipe = setup, pipe
         self._state = State.at_rest(setup.model)
         self._links: tuple[Link, ...] = ()
@@ -150,14 +150,14 @@ class _Perception:
             lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame, seed=seed)
             mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name), rate=setup.sensor_hz))
         primitives = Primitives(setup.model, renderer=setup.renderer)
-        return stack.enter_context(Eyes(setup.model, mounts, primitives=primitives, nice=EYES_NICE))
+        return stack.enter_context(Eyes(setup.model, mounts, primitives=primitives, nice=RENDER_NICE))
 
     def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:
         return lambda: always or (self.node is not None and self.node.wanted(name))
 
     # ------------------------------------------------------------------ running
 
-    def run(self, mailbox: Mailbox) -> None:
+    def run(self, mailbox: LatestValue) -> None:
         """Until somebody says stop."""
         has_news = poller(self.pipe)
         while True:
@@ -174,8 +174,8 @@ class _Perception:
                     time = value.pop("time")
                     self.node.publish_diagnostics(time, value, healthy=value["real_time_factor"] > 0.99)
 
-    def _read(self, letter: Letter) -> None:
-        self._worth = letter.worth
+    def _read(self, letter: StepSnapshot) -> None:
+        self._worth = letter.frame_score
         if letter.bodies is not None:
             self._state.body_q[letter.bodies] = letter.body_q
         if letter.links is not None:
@@ -196,7 +196,7 @@ class _Perception:
             if commands := self.node.commands():
                 self.pipe.send(("commands", commands))
         if letter.time >= self._next_figures:
-            self._next_figures = letter.time + FIGURES_PERIOD
+            self._next_figures = letter.time + STATISTICS_PERIOD
             self.pipe.send(("figures", self._figures()))
 
     def _publish_truth(self, time: float) -> None:

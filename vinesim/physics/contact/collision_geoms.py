@@ -7,12 +7,12 @@ import dataclasses
 import mujoco
 import numpy as np
 
-WIDE = 1e6
+PLANE_HALF_SIZE = 1e6
 """[m] The ground reaches so far from the middle."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Geoms:
+class RigidGeoms:
     """Rigid shapes that plants can touch, sorted by MuJoCo geom."""
 
     id: np.ndarray
@@ -24,7 +24,7 @@ class Geoms:
     size: np.ndarray
     """[geom, 3] as MuJoCo writes it for the kind."""
     half: np.ndarray
-    """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`WIDE` and no height."""
+    """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`PLANE_HALF_SIZE` and no height."""
     center: np.ndarray
     """[geom, 3] middle of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
@@ -38,19 +38,19 @@ class Geoms:
     link: tuple[str, ...]
 
 
-def listed(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> Geoms:
+def movable_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> RigidGeoms:
     """What touches anything of the MuJoCo bodies in ``owner``, which tells actor and link of each."""
     ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)) & (m.geom_contype != 0))
     return _of(m, ids, [owner[body] for body in m.geom_bodyid[ids].tolist()])
 
 
-def standing(m: mujoco.MjModel) -> Geoms:
+def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
     """Ground, poles and trunks: MuJoCo's first geoms, whoever comes and goes."""
     ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
     return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 
 
-def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Geoms:
+def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> RigidGeoms:
     """What there is to know of some geoms; ``names``: actor and link of each."""
     last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1).tolist()
     for body, parent in enumerate(m.body_parentid.tolist()):  # parents come first
@@ -67,8 +67,8 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Geo
     cylinder = kind == mujoco.mjtGeom.mjGEOM_CYLINDER
     half[cylinder] = size[cylinder][:, [0, 0, 1]]
     plane = kind == mujoco.mjtGeom.mjGEOM_PLANE
-    half[plane], radius[plane] = (WIDE, WIDE, 0.0), np.inf
-    return Geoms(
+    half[plane], radius[plane] = (PLANE_HALF_SIZE, PLANE_HALF_SIZE, 0.0), np.inf
+    return RigidGeoms(
         id=ids.astype(np.int32),
         body=body.astype(np.int32),
         kind=kind.astype(np.int32),

@@ -17,47 +17,47 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels.contact import solver as kernels
 from vinesim.kernels.launch import bind
-from vinesim.physics.contact.collision_geoms import WIDE, Geoms
+from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE, RigidGeoms
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene.model import Model
 from vinesim.scene.values import Contact
 
-STIFFNESS = 2e4
+CONTACT_STIFFNESS = 2e4
 """[N/m] of every contact, normal and (as the anchor of friction) tangential; its damping is 2 dt times this."""
-SWEEPS = 100
+MAX_SWEEPS = 100
 """Gauss-Seidel sweeps at most; warm-started and with leaps, up to six are usual."""
-LEAPS = 6
+MAX_NEWTON_STEPS = 6
 """So many times an island is solved directly, as if its contacts stayed as they are, before sweeps go on alone."""
-LARGEST_LEAP = 16
+MAX_NEWTON_CONTACTS = 16
 """Islands of more contacts do not leap: it takes the cube of their number, sweeps take the square."""
-TOLERANCE = 1e-6
+IMPULSE_TOLERANCE = 1e-6
 """Of the largest impulse: a smaller change in a sweep ends them."""
-SLOTS = 64
+MAX_CONTACTS_PER_TREE = 64
 """Contacts that one tree can have at once."""
-CLOSE = 256
+MAX_STATIC_GEOMS_PER_TREE = 256
 """Standing things that can be close to one tree at once."""
-NOBODY = np.iinfo(np.int32).max
+REMOVED_GEOM = np.iinfo(np.int32).max
 """In place of a geom that is gone."""
 BLOCK = int(kernels.BLOCK)
-FEW = 16
+MIN_TREES_PER_THREAD = 16
 """Awake trees for each thread: fewer are not worth handing over."""
-STIR = 1e-3
+MIN_WAKING_SPEED = 1e-3
 """[m/s] A box or a loose bunch slower than this wakes nobody."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Shapes:
+class PlantCapsules:
     """What of the plants can be touched: segments with a radius, sorted by body."""
 
-    tree: np.ndarray
+    tree_start: np.ndarray
     """[tree + 1] first shape of each tree, then their number."""
     body: np.ndarray
     """[shape]"""
     bunch: np.ndarray
     """[shape] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left is in nobody's way."""
-    when: np.ndarray
+    level: np.ndarray
     """[shape] 0: always there; 1: while its tree is coarse; 2: while it is fine (see ``State.tree_fine``)."""
     start: np.ndarray
     """[shape, 3] m, in the body's frame; equal to ``end`` for a sphere."""
@@ -66,7 +66,7 @@ class Shapes:
     """[shape] m"""
 
 
-def shapes_of(model: Model) -> Shapes:
+def plant_capsules(model: Model) -> PlantCapsules:
     """A capsule for each piece of wood, a few spheres for each bunch, a capsule or sphere for each of its clusters.
 
     The spheres are the largest that fit a spheroid of the bunch's length and radius: a ball of radius
@@ -100,29 +100,29 @@ def shapes_of(model: Model) -> Shapes:
             parts.append((b, stalk_of[b], 0, 0.0, length, thick))
     body, bunch, when, start, end, radius = (np.array(column) for column in zip(*parts, strict=True))
     along = np.array([1.0, 0.0, 0.0], np.float32)
-    return Shapes(
-        tree=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),
+    return PlantCapsules(
+        tree_start=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),
         body=body.astype(np.int32),
         bunch=bunch.astype(np.int32),
-        when=when.astype(np.int32),
+        level=when.astype(np.int32),
         start=start.astype(np.float32)[:, None] * along,
         end=end.astype(np.float32)[:, None] * along,
         radius=radius.astype(np.float32),
     )
 
 
-class Touching:
+class ContactSolver:
     """Contacts between the plants and the rigid world of one tick.
 
-    ``find()`` (before ``plants.free()``) wakes whatever a rigid body comes near; ``solve()`` (after it) leaves
-    ``bodies`` and ``wrenches`` for ``plants.commit()`` and ``force`` for ``rigid.finish()``.
+    ``wake_near_trees()`` (before ``plants.free()``) wakes whatever a rigid body comes near; ``solve()`` (after it) leaves
+    ``bodies`` and ``wrenches`` for ``plants.commit()`` and ``rigid_force`` for ``rigid.finish()``.
 
     Robots, boxes and loose bunches wake the trees that they come near. What stands (ground, poles, trunks) and other
     branches only hold back what moves already; what overlaps in the shape as drawn does so only beyond that.
 
     Args:
-        capacity: contacts solved in one tick; of more, the deepest are kept, and ``dropped`` and ``complaint`` say so.
-        stiffness: [N/m] see :data:`STIFFNESS`.
+        capacity: contacts solved in one tick; of more, the deepest are kept, and ``dropped_contacts`` and ``overflow_message`` report it.
+        stiffness: [N/m] see :data:`CONTACT_STIFFNESS`.
         branches: whether branches and bunches of awake trees touch each other too.
     """
 
@@ -133,35 +133,35 @@ class Touching:
         rigid: Rigid,
         *,
         capacity: int = 128,
-        stiffness: float = STIFFNESS,
-        branches: bool = True,
+        stiffness: float = CONTACT_STIFFNESS,
+        plant_plant_contacts: bool = True,
     ) -> None:
         self.model, self.plants, self.rigid = model, plants, rigid
         self.dt, self.capacity = rigid.dt, capacity
         self.stiffness, self.damping = stiffness, 2.0 * stiffness * rigid.dt
-        self.branches = branches
-        self.shapes = shapes_of(model)
+        self.plant_plant_contacts = plant_plant_contacts
+        self.capsules = plant_capsules(model)
         self.count = 0
         """Contacts of the last tick, those that do not press included."""
         self.bodies = np.zeros(0, np.int32)
         """Plant bodies in contact [n], sorted."""
         self.wrenches = np.zeros((0, 6))
         """[n, 6] N, N m on them, at their origins, world axes."""
-        self.force: np.ndarray | None = None
+        self.rigid_force: np.ndarray | None = None
         """[dof] generalised force of the same contacts on the rigid world; None without contact."""
         self.sweeps = self.islands = 0
         """Of the last solve: sweeps that its slowest island took; islands, which do not feel each other."""
-        self.dropped = 0
+        self.dropped_contacts = 0
         """Contacts left out since the start, for want of room."""
-        self.complaint = ""
+        self.overflow_message = ""
         """When contacts were last left out and how many: empty if never."""
-        self.near = np.zeros(0, np.int32)
+        self.near_trees = np.zeros(0, np.int32)
         """Trees [k] whose box a robot or a moving box reaches into: these must not fall asleep."""
-        self.copies: set[str] = set()
+        self.remote_actors: set[str] = set()
         """Robots that another client controls. What they touch is that client's to compute: here they touch only trees
         of whose state it tells, so that a touch counts once and a copy in the distance disturbs nothing.
         """
-        self.told = np.zeros(len(model.tree_first), np.bool_)
+        self.remote_trees = np.zeros(len(model.tree_first), np.bool_)
         """[tree] whose state another client tells."""
         self._generation = 0
         self._dof_names: list[tuple[str, int]] = []
@@ -169,15 +169,15 @@ class Touching:
         self._awake = np.zeros(0, np.int32)
         self._allocate()
         self._renew()
-        drawn = model.forward(model.joint_settled)[self.shapes.body]
-        for kept, end in ((self._start_drawn, self.shapes.start), (self._end_drawn, self.shapes.end)):
+        drawn = model.forward(model.joint_settled)[self.capsules.body]
+        for kept, end in ((self._start_drawn, self.capsules.start), (self._end_drawn, self.capsules.end)):
             kept[:] = drawn[:, :3] + frames.rotate(drawn[:, 3:], end.astype(float))
         self._bound(np.arange(len(model.tree_first), dtype=np.int32))
         self._bound_tree_blocks(np.arange(len(self._block_low), dtype=np.int32))
 
     # ------------------------------------------------------------------ the two halves of a tick
 
-    def find(self) -> None:
+    def wake_near_trees(self) -> None:
         """Wake the trees that a robot or a moving box is about to reach; the rest cost one comparison each."""
         if self._generation != self.rigid.generation:
             self._renew()
@@ -196,14 +196,14 @@ class Touching:
         self._bound_actors(len(self._actor_lies))
         self._near[:] = False
         self._reach(len(self._block_low))
-        self.near = np.flatnonzero(self._near)
-        if len(self.near) and not self.plants.state.tree_awake[self.near].all():
-            self.plants.wake(self.near)
+        self.near_trees = np.flatnonzero(self._near)
+        if len(self.near_trees) and not self.plants.state.tree_awake[self.near_trees].all():
+            self.plants.wake(self.near_trees)
 
     def solve(self) -> None:
         """Find the contacts of all awake trees and the forces that go with them."""
         self._awake = awake = self.plants.awake
-        self.count, self.bodies, self.wrenches, self.force = 0, self.bodies[:0], self.wrenches[:0], None
+        self.count, self.bodies, self.wrenches, self.rigid_force = 0, self.bodies[:0], self.wrenches[:0], None
         self._values: tuple[Contact, ...] | None = ()
         if len(awake) and len(self._geoms.id):
             self._meet(awake)
@@ -227,7 +227,7 @@ class Touching:
             force, push = self._force[:n], self._impulse[0 : 3 * n : 3]
             self._values = tuple(
                 Contact(
-                    *self._name(other), int(self._contact_body[c]), self._point[c].copy(), -force[c],
+                    *self._actor_and_link(other), int(self._contact_body[c]), self._point[c].copy(), -force[c],
                     float(self._gap[c]),
                 )
                 for c, other in enumerate(self._other[:n].tolist())
@@ -236,11 +236,11 @@ class Touching:
         return self._values
 
     @property
-    def touched(self) -> tuple[tuple[int, str], ...]:
+    def touched_trees(self) -> tuple[tuple[int, str], ...]:
         """(tree, actor) for every tree that somebody presses on in the last tick, sorted."""
         return tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
 
-    def nearest(self, points: np.ndarray, reach: float) -> tuple[float, int] | None:
+    def nearest_body(self, points: np.ndarray, reach: float) -> tuple[float, int] | None:
         """What of the plants is nearest to one of some ``points`` [k, 3]: distance [m] to its surface, and its body.
 
         Of a bunch the bunch's own body, whether or not its clusters move. None if nothing is below ``reach``.
@@ -250,10 +250,10 @@ class Touching:
         if len(trees) == 0:
             return None
         self.plants.kinematics(trees)
-        s, state, model = self.shapes, self.plants.state, self.model
-        at = np.concatenate([np.arange(s.tree[tree], s.tree[tree + 1]) for tree in trees])
+        s, state, model = self.capsules, self.plants.state, self.model
+        at = np.concatenate([np.arange(s.tree_start[tree], s.tree_start[tree + 1]) for tree in trees])
         fine = state.tree_fine[model.body_tree[s.body[at]]]
-        at = at[(s.when[at] == 0) | (s.when[at] == 1 + fine)]
+        at = at[(s.level[at] == 0) | (s.level[at] == 1 + fine)]
         there = s.bunch[at] < 0
         there[~there] = state.bunch_attached[s.bunch[at[~there]]]
         at = at[there]
@@ -272,15 +272,15 @@ class Touching:
         clustered = body - model.tree_first[tree] >= model.tree_core[tree]
         return float(gap[best]), int(model.bunch_body[bunch]) if clustered else body
 
-    def _name(self, other: int) -> tuple[str, str]:
+    def _actor_and_link(self, other: int) -> tuple[str, str]:
         """Actor and link of what a plant touches."""
         if other < 0:
-            return "plants", f"body/{self.shapes.body[-1 - other]}"
+            return "plants", f"body/{self.capsules.body[-1 - other]}"
         return self._actor[other], self._link[other]
 
     # ------------------------------------------------------------------ who is close
 
-    def moved(self, trees: np.ndarray) -> None:
+    def update_tree_bounds(self, trees: np.ndarray) -> None:
         """Trees [k] were put elsewhere while they slept."""
         self._bound(trees)
         self._bound_tree_blocks(np.unique(trees // BLOCK))
@@ -293,7 +293,7 @@ class Touching:
     def _deal(self, count: int, *launches: Callable[..., None]) -> None:
         """Launch over so many trees of the list, for each one launch after the other; threads take turns in it."""
         crew = self.plants.crew
-        threads = 1 if crew is None or count < FEW * crew.size else crew.size
+        threads = 1 if crew is None or count < MIN_TREES_PER_THREAD * crew.size else crew.size
         if self._dealt != (count, threads):
             self._dealt = (count, threads)
             self._every[:count] = np.concatenate([np.arange(i, count, threads) for i in range(threads)])
@@ -314,7 +314,7 @@ class Touching:
         """Boxes around blocks of what stands; the ground goes down for ever."""
         first = self._movable
         deep = np.flatnonzero(self._geoms.kind[first:] == 0) + first
-        self._geom_low[deep, 2] = -WIDE
+        self._geom_low[deep, 2] = -PLANE_HALF_SIZE
         for block in range(len(self._standing_low)):
             of = slice(first + BLOCK * block, first + BLOCK * (block + 1))
             self._standing_low[block], self._standing_high[block] = (
@@ -331,7 +331,7 @@ class Touching:
         self._trees[:trees] = awake
         self._tally[kernels.TREES] = trees
         self._deal(trees, self._bound_trees, self._meeting)
-        if self.branches:
+        if self.plant_plant_contacts:
             low = self._tree_low[awake]
             axis = self._tally[kernels.AXIS] = int(np.argmax(low.max(0) - low.min(0)))
             self._order[:trees] = np.argsort(low[:, axis], kind="stable")
@@ -345,10 +345,10 @@ class Touching:
             self._hits[:] = np.sort(hits[deepest])
             self._tally[kernels.HITS] = count = self.capacity
         if missed:
-            self.dropped += missed
-            self.complaint = (
+            self.dropped_contacts += missed
+            self.overflow_message = (
                 f"{missed} of {count + missed} contacts of one tick were left out, the shallowest; there is room "
-                f"for {self.capacity}, and for {SLOTS} at one tree: raise Touching's capacity or touch less at once"
+                f"for {self.capacity}, and for {MAX_CONTACTS_PER_TREE} at one tree: raise ContactSolver's capacity or touch less at once"
             )
         self.count = count
 
@@ -392,14 +392,14 @@ class Touching:
         self._remembering(n)
         self._adding(touched)
         self.wrenches = self._wrench[:touched].copy()
-        self.force = self._impulse[:rows] @ rigid_rows / -self.dt
+        self.rigid_force = self._impulse[:rows] @ rigid_rows / -self.dt
         self._values = None
 
     # ------------------------------------------------------------------ memory and launches
 
     def _allocate(self) -> None:
         """Everything whose size does not depend on who is here."""
-        n, trees, shapes = self.capacity, len(self.model.tree_first), len(self.shapes.body)
+        n, trees, shapes = self.capacity, len(self.model.tree_first), len(self.capsules.body)
         self._trees = np.zeros(trees, np.int32)
         self._tree_low, self._tree_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
         self._every, self._dealt = np.zeros(trees, np.int32), (0, 0)
@@ -407,10 +407,10 @@ class Touching:
         for name in ("start", "end", "shape_low", "shape_high"):
             setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
         self._wood_low, self._wood_high = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
-        ends = np.maximum(np.linalg.norm(self.shapes.start, axis=1), np.linalg.norm(self.shapes.end, axis=1))
-        self._reach_of_shape = (ends + self.shapes.radius).astype(np.float32)
+        ends = np.maximum(np.linalg.norm(self.capsules.start, axis=1), np.linalg.norm(self.capsules.end, axis=1))
+        self._reach_of_shape = (ends + self.capsules.radius).astype(np.float32)
         self._last_bunch = np.full(trees, -1, np.int32)
-        np.maximum.at(self._last_bunch, self.model.body_tree[self.shapes.body], self.shapes.bunch)
+        np.maximum.at(self._last_bunch, self.model.body_tree[self.capsules.body], self.capsules.bunch)
         self._shape_speed = np.zeros(shapes, np.float32)
         for name in ("start_drawn", "end_drawn"):
             setattr(self, "_" + name, np.zeros((shapes, 3), np.float32))
@@ -441,12 +441,21 @@ class Touching:
     def _make_room(self, trees: int) -> None:
         """Room for the contacts of so many awake trees."""
         self._room = trees
-        self._close = np.zeros((trees, min(len(self._geoms.id), self._movable + CLOSE)), np.int32)
-        self._found, self._slot = np.zeros(trees, np.int32), np.arange(SLOTS)
-        self._hit_shape, self._hit_other = np.zeros((trees, SLOTS), np.int32), np.zeros((trees, SLOTS), np.int32)
+        self._close = np.zeros((trees, min(len(self._geoms.id), self._movable + MAX_STATIC_GEOMS_PER_TREE)), np.int32)
+        self._found, self._slot = np.zeros(trees, np.int32), np.arange(MAX_CONTACTS_PER_TREE)
+        self._hit_shape, self._hit_other = (
+            np.zeros((trees, MAX_CONTACTS_PER_TREE), np.int32),
+            np.zeros((trees, MAX_CONTACTS_PER_TREE), np.int32),
+        )
         self._onset = np.zeros(trees, np.bool_)
-        self._hit_gap, self._hit_room = np.zeros((trees, SLOTS)), np.zeros((trees, SLOTS))
-        self._hit_normal, self._hit_point = np.zeros((trees, SLOTS, 3)), np.zeros((trees, SLOTS, 3))
+        self._hit_gap, self._hit_room = (
+            np.zeros((trees, MAX_CONTACTS_PER_TREE)),
+            np.zeros((trees, MAX_CONTACTS_PER_TREE)),
+        )
+        self._hit_normal, self._hit_point = (
+            np.zeros((trees, MAX_CONTACTS_PER_TREE, 3)),
+            np.zeros((trees, MAX_CONTACTS_PER_TREE, 3)),
+        )
         self._record()
 
     def _renew(self) -> None:
@@ -454,7 +463,7 @@ class Touching:
         old = None if self._geoms is None else self._names
         move, stand, d = self.rigid.geoms, self.rigid.standing, self.rigid.data
         both = {f.name: (getattr(move, f.name), getattr(stand, f.name)) for f in dataclasses.fields(move)}
-        g = self._geoms = Geoms(
+        g = self._geoms = RigidGeoms(
             **{k: a + b if isinstance(a, tuple) else np.concatenate([a, b]) for k, (a, b) in both.items()}
         )
         self._actor, self._link = g.actor, g.link
@@ -467,7 +476,7 @@ class Touching:
             at = {name: i for i, name in enumerate(self._names)}
             for k, other in enumerate(self._known_other[: self._known_count[0]].tolist()):
                 if other >= 0:
-                    self._known_other[k] = at.get(old[other], NOBODY)
+                    self._known_other[k] = at.get(old[other], REMOVED_GEOM)
         count = len(g.id)
         self._geom_middle, self._geom_velocity = np.zeros((count, 3)), np.zeros((count, 3))
         self._geom_spin, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
@@ -492,15 +501,15 @@ class Touching:
         self._mujoco["factors"] = (d.qH, d.qHDiagInv, d.qLD, d.qLDiagInv)
         first = [i for i in range(self._movable) if i == 0 or g.actor[i] != g.actor[i - 1]]
         self._actor_first = np.array([*first, self._movable], np.int32)
-        self._actor_copy = np.array([g.actor[i] in self.copies for i in first], np.bool_)
-        self._geom_copy = np.array([actor in self.copies for actor in g.actor], np.bool_)
+        self._actor_copy = np.array([g.actor[i] in self.remote_actors for i in first], np.bool_)
+        self._geom_copy = np.array([actor in self.remote_actors for actor in g.actor], np.bool_)
         self._actor_lies = np.array([g.actor[i] not in self.rigid.actors for i in first], np.bool_)
         self._actor_low, self._actor_high = np.zeros((len(first), 3), np.float32), np.zeros((len(first), 3), np.float32)
         self._make_room(max(self._room, 64))
 
     def _record(self) -> None:
         """Bind every kernel to its arrays once: a recorded launch costs a fifth of a plain one."""
-        s, g, state, mj = self.shapes, self._geoms, self.plants.state, self._mujoco
+        s, g, state, mj = self.capsules, self._geoms, self.plants.state, self._mujoco
 
         def shared(data: np.ndarray, dtype: type) -> wp.array:
             array = wp.array(data, dtype=dtype, device="cpu", copy=False)
@@ -525,7 +534,7 @@ class Touching:
         t_box = [shared(x, wp.vec3) for x in (self._tree_low, self._tree_high)]
         a_box = [shared(x, wp.vec3) for x in (self._actor_low, self._actor_high)]
         a_first, a_lies = shared(self._actor_first, wp.int32), shared(self._actor_lies, wp.bool)
-        s_tree, s_body, s_bunch, s_when = (shared(x, wp.int32) for x in (s.tree, s.body, s.bunch, s.when))
+        s_tree, s_body, s_bunch, s_when = (shared(x, wp.int32) for x in (s.tree_start, s.body, s.bunch, s.level))
         s_drawn = [shared(x, wp.vec3) for x in (self._start_drawn, self._end_drawn)]
         fine, cut = shared(state.tree_fine, wp.bool), shared(state.body_cut, wp.bool)
         blocks = [shared(x, wp.vec3) for x in (self._block_low, self._block_high)]
@@ -553,7 +562,7 @@ class Touching:
              *doubles("dof_free", "dof_held", "dof_held_before"), com],
             [*moving, speed, *g_box],
         )  # fmt: skip
-        self._bound_actors = bind(kernels.bound_actors, [STIR, a_first, a_lies, speed, *g_box], a_box)
+        self._bound_actors = bind(kernels.bound_actors, [MIN_WAKING_SPEED, a_first, a_lies, speed, *g_box], a_box)
         self._bound_trees = bind(
             kernels.bound_trees,
             [dt, s_tree, s_body, s_bunch, s_when, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius,
@@ -561,7 +570,7 @@ class Touching:
             [*s_at, s_speed, *s_box, *w_box, *t_box],
             **dealt,
         )  # fmt: skip
-        told = shared(self.told, wp.bool)
+        told = shared(self.remote_trees, wp.bool)
         a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
         self._reach = bind(
             kernels.reach, [a_first, a_copy, told, *blocks, *t_box, *a_box, *g_box], [shared(self._near, wp.bool)]
@@ -577,7 +586,7 @@ class Touching:
         onset, now = shared(self._onset, wp.bool), [body_q, body_qd, body_qd_free, *s_at, cut, s_speed, *s_box]
         self._meeting = bind(
             kernels.meet,
-            [dt, SLOTS, self._movable, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, g_id, g_kind,
+            [dt, MAX_CONTACTS_PER_TREE, self._movable, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, g_id, g_kind,
              g_size, g_radius, g_copy, *ints("every"), told, fine, attached, *ints("trees"), *t_box, *now, xmat,
              *moving, speed, *g_box, *standing],
             [*ints("close", "found"), *hit, onset],
@@ -585,7 +594,7 @@ class Touching:
         )  # fmt: skip
         self._meeting_branches = bind(
             kernels.meet_branches,
-            [dt, SLOTS, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, *ints("last_bunch", "every"),
+            [dt, MAX_CONTACTS_PER_TREE, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, *ints("last_bunch", "every"),
              fine, attached, *ints("order", "tally", "trees"), *t_box, *w_box, *now],
             [*ints("found"), *hit, onset],
             **dealt,
@@ -593,7 +602,7 @@ class Touching:
         flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_other"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
         axes, sparse = shared(self._axes, wp.mat33d), [shared(x, wp.int32) for x in mj["sparse"]]
-        self._gathering = bind(kernels.gather, [SLOTS, *ints("found"), onset], ints("hits", "tally"))
+        self._gathering = bind(kernels.gather, [MAX_CONTACTS_PER_TREE, *ints("found"), onset], ints("hits", "tally"))
         self._indexing = bind(
             kernels.index,
             [s_body, m_tree, g_dof, sparse[0], *ints("hits"), *flat[:2], *ints("group")],
@@ -623,7 +632,7 @@ class Touching:
         )
         self._relaxing = bind(
             kernels.relax,
-            [softness, SWEEPS, LEAPS, LARGEST_LEAP, TOLERANCE, *blocks[1:],
+            [softness, MAX_SWEEPS, MAX_NEWTON_STEPS, MAX_NEWTON_CONTACTS, IMPULSE_TOLERANCE, *blocks[1:],
              *doubles("friction", "A", "free", "offset")],
             [*doubles("rows", "impulse"), *ints("sweeps")],
         )  # fmt: skip

@@ -9,7 +9,7 @@ _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
 
 
-class Metric:
+class EffectiveMass:
     """H = M^ + Jc^T D Jc: implicit servos, and the stiffness of the native constraints that are active now.
 
     These are limits, mimics, a robot against a pole. Only the kinematic trees concerned are factored.
@@ -20,7 +20,7 @@ class Metric:
         self._blocks: dict[bytes, _Block] = {}
         self._each = np.arange(world.ntree, dtype=np.int32)
 
-    def inverse(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
+    def impulse_response(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
         """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T."""
         dofs = self._coupled(d, J)
         block = self._blocks.get(dofs.tobytes())
@@ -30,14 +30,14 @@ class Metric:
         change[dofs] = np.linalg.solve(block.hessian(d), J[:, dofs].T)
         return change
 
-    def group(self, d: mujoco.MjData) -> np.ndarray:
+    def island_labels(self, d: mujoco.MjData) -> np.ndarray:
         """[MuJoCo kinematic tree] a label that two share if a force on one may move the other in this tick."""
         m = self._world
         if d.nefc == 0:
             return self._each
         return np.where(d.tree_island >= 0, m.ntree + d.tree_island, self._each) if d.nisland else 0 * self._each
 
-    def bound(self, d: mujoco.MjData, bodies: np.ndarray) -> bool:
+    def is_constrained(self, d: mujoco.MjData, bodies: np.ndarray) -> bool:
         """Whether native constraints that are active now bind one of these MuJoCo bodies [k].
 
         If not, the metric of the tick is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.

@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.rigid_world import Rigid
@@ -45,8 +45,8 @@ class Blade:
 class Partings:
     """Watches the peduncles of awake trees and the blades that close, and takes off what parts."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching) -> None:
-        self.plants, self.rigid, self.touching = plants, rigid, touching
+    def __init__(self, plants: Plants, rigid: Rigid, contact_solver: ContactSolver) -> None:
+        self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.blades: list[Blade] = []
         self.held: tuple[Contact, ...] = ()
         """Hands that hold plants, as contacts; who holds a bunch may be the one who pulled it off."""
@@ -77,8 +77,8 @@ class Partings:
         """Part the bunches whose peduncles have been strained for long enough, where that is ours to judge."""
         model = self.plants.model
         bunches = self._hanging()
-        if self.touching.told.any():
-            bunches = bunches[~self.touching.told[model.body_tree[model.bunch_body[bunches]]]]
+        if self.contact_solver.remote_trees.any():
+            bunches = bunches[~self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunches]]]]
         if len(bunches) == 0:
             return
         carried = self.plants.joint_wrench(model.bunch_body[bunches])
@@ -166,9 +166,9 @@ class Partings:
         tree = int(model.body_tree[body])
         plants.wake(tree)
         plants.kinematics(np.array([tree]))
-        shapes, state = self.touching.shapes, plants.state
+        shapes, state = self.contact_solver.capsules, plants.state
         # as touched so far, its clusters where they are: what holds it must not feel the difference
-        here = (shapes.bunch == bunch) & (shapes.when != (1 if state.tree_fine[tree] else 2))
+        here = (shapes.bunch == bunch) & (shapes.level != (1 if state.tree_fine[tree] else 2))
         of = np.flatnonzero(here & (model.body_organ[shapes.body] == int(Organ.BUNCH)))
         plants.coarsen(tree)
         local = frames.compose(frames.inverse(state.body_q[body].astype(float)), state.body_q[shapes.body[of]])
@@ -227,7 +227,7 @@ class Partings:
     def _toucher(self, bunch: int) -> str:
         """Who presses hardest on a bunch, nobody if none does."""
         pushes: dict[str, float] = {}
-        for contact in self.touching.contacts + self.held:
+        for contact in self.contact_solver.contacts + self.held:
             if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.plants.detachment import STUB
 from vinesim.physics.rigid.free_bunch import Loose
@@ -25,15 +25,15 @@ NEAR = 2.5
 class Lying:
     """Picked bunches without bodies, each at a pose in the frame of its parent."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching, riding: Riding) -> None:
-        self.plants, self.rigid, self.touching, self.riding = plants, rigid, touching, riding
+    def __init__(self, plants: Plants, rigid: Rigid, contact_solver: ContactSolver, riding: Riding) -> None:
+        self.plants, self.rigid, self.contact_solver, self.riding = plants, rigid, contact_solver, riding
         self._loose: dict[int, Loose] = {}
         self._parent: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
         self._links: tuple[Link, ...] | None = ()
         self._groups: list[tuple[str, np.ndarray, np.ndarray]] = []
-        shapes = touching.shapes
-        fruit = np.flatnonzero((plants.model.body_organ[shapes.body] == int(Organ.BUNCH)) & (shapes.when != 2))
+        shapes = contact_solver.capsules
+        fruit = np.flatnonzero((plants.model.body_organ[shapes.body] == int(Organ.BUNCH)) & (shapes.level != 2))
         self._shape = fruit[np.argsort(shapes.bunch[fruit], kind="stable")]
         self._first = np.searchsorted(shapes.bunch[self._shape], np.arange(len(plants.model.bunch_body) + 1))
 
@@ -54,7 +54,7 @@ class Lying:
             plants.coarsen(np.unique(model.body_tree[bodies]))
             columns = (plants.body_mass, plants.body_com, plants.body_inertia, plants.body_product)
             rows = zip(new, *(column[bodies].astype(float) for column in columns), strict=True)
-            shapes = self.touching.shapes
+            shapes = self.contact_solver.capsules
             for bunch, mass, com, inertia, product in rows:
                 of = self._shape[self._first[bunch] : self._first[bunch + 1]]
                 start, end, radius = (column[of].astype(float) for column in (shapes.start, shapes.end, shapes.radius))

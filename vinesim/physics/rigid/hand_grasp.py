@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import Touching
+from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import Plants
 from vinesim.physics.rigid.human_body import FINGERS, THICK, Hand, Person
 from vinesim.physics.rigid.rigid_world import Rigid
@@ -47,8 +47,8 @@ class _Grip:
 class Holding:
     """What the hands of all people hold, and what their controllers feel of it."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, touching: Touching) -> None:
-        self.plants, self.rigid, self.touching = plants, rigid, touching
+    def __init__(self, plants: Plants, rigid: Rigid, contact_solver: ContactSolver) -> None:
+        self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the last tick, by person and hand."""
         self.contacts: tuple[Contact, ...] = ()
@@ -125,7 +125,7 @@ class Holding:
         key = person.spec.name, hand.side
         palm = self.rigid.hand(*key).pose
         rigid = self.rigid.near_hand(*key, GRASP)
-        plant = self.touching.nearest(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
+        plant = self.contact_solver.nearest_body(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
         if plant is not None and (rigid is None or plant[0] - THICK < rigid[0]):
             body = plant[1]
             self.plants.wake(self.plants.model.body_tree[body])

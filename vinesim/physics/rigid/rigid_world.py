@@ -19,7 +19,8 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact import collision_geoms
-from vinesim.physics.contact.effective_mass import Metric
+from vinesim.physics.contact.effective_mass import EffectiveMass
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, hand_wrenches, recompile, static_world
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.human_body import HAND, LIMBS, PARTS, Hand, HumanError, Person, rouse
@@ -47,15 +48,15 @@ class Draft:
 class Rigid:
     """Robots, boxes and what stands, in one MuJoCo world that is compiled anew when an actor comes or goes."""
 
-    def __init__(self, model: Model, *, dt: float = 0.01) -> None:
-        self.model = model
-        self.dt = dt
+    def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        self.model, self.parameters = model, parameters
+        self.dt = parameters.dt
         self._robots: dict[str, RobotBody] = {}
         self._people: dict[str, Person] = {}
         self._bunches: dict[int, Loose] = {}
         self._waiting = 0
         self._slot: dict[int, int] = {}
-        self._scene = static_world.furnished(model, dt)
+        self._scene = static_world.furnished(model, parameters)
         self._drafting = threading.Lock()
         self.world: mujoco.MjModel
         self.data: mujoco.MjData
@@ -65,7 +66,7 @@ class Rigid:
         self.generation = 0
         """Counts compilations: whoever keeps views of MuJoCo's arrays renews them when this changes."""
         self.owners: dict[int, tuple[str, str]] = {}
-        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`geoms.Geoms` names them."""
+        """Actor and link of every MuJoCo body that can come, go or be moved, as :class:`RigidGeoms` names them."""
         self._compile()
 
     # ------------------------------------------------------------------ who is here
@@ -179,7 +180,7 @@ class Rigid:
         return person.sample(person.hand(side), self.data)
 
     def hold(self, name: str, side: str, actor: str, link: str) -> None:
-        """Let a hand hold a link of an actor, a box or a bunch where it is now; names are those of ``geoms.Geoms``."""
+        """Let a hand hold a link of an actor, a box or a bunch where it is now; names are those of ``RigidGeoms``."""
         person, body = self.person(name), self._body_of(actor, link)
         hand = person.hand(side)
         self.refresh()
@@ -479,16 +480,16 @@ class Rigid:
 
     @property
     def group(self) -> np.ndarray:
-        """See :meth:`Metric.group`."""
-        return self._metric.group(self.data)
+        """See :meth:`EffectiveMass.island_labels`."""
+        return self._metric.island_labels(self.data)
 
     def bound(self, bodies: np.ndarray) -> bool:
-        """See :meth:`Metric.bound`."""
-        return self._metric.bound(self.data, bodies)
+        """See :meth:`EffectiveMass.is_constrained`."""
+        return self._metric.is_constrained(self.data, bodies)
 
     def inverse(self, J: np.ndarray) -> np.ndarray:
-        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see :class:`Metric`."""
-        return self._metric.inverse(self.data, J)
+        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see :class:`EffectiveMass`."""
+        return self._metric.impulse_response(self.data, J)
 
     def finish(self, force: np.ndarray | None = None) -> None:
         """Second half: integrate with generalised contact forces of plants, ``force`` [dof]."""
@@ -638,7 +639,7 @@ class Rigid:
         else:
             parked = {free_bunch.name_of(slot) for slot in set(range(self._waiting)) - set(self._slot.values())}
             self.data, self._contact = recompile.carried(*before, world, parked)
-        self._metric = Metric(world)
+        self._metric = EffectiveMass(world)
         self._sound = self.data.qpos.copy()
         self._fresh = False
         for robot in self._robots.values():
@@ -649,7 +650,7 @@ class Rigid:
             for hand in person.hands:
                 self._regrasp(person, hand)
         if before is None:
-            self.standing = collision_geoms.standing(world)
+            self.standing = collision_geoms.static_geoms(world)
         self._list()
 
     def _regrasp(self, person: Person, hand: Hand) -> None:
@@ -671,7 +672,7 @@ class Rigid:
         own = self._link_body > 0
         self._link_row[self._link_body[own]] = np.flatnonzero(own)
         self.owners = self._owners()
-        self.geoms = collision_geoms.listed(self.world, self.owners)
+        self.geoms = collision_geoms.movable_geoms(self.world, self.owners)
 
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import Shape
@@ -30,11 +31,12 @@ FIRST_ACTOR, LAST_ACTOR = 6, 30
 ALL = (1 << (LAST_ACTOR + 1)) - 1
 
 
-def furnished(model: Model, dt: float) -> mujoco.MjSpec:
+def furnished(model: Model, parameters: PhysicsParameters) -> mujoco.MjSpec:
     """Ground, poles, trunks and boxes."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    spec.option.timestep = dt
+    spec.option.timestep = parameters.dt
+    spec.option.gravity = [0.0, 0.0, -parameters.gravity]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE

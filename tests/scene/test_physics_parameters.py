@@ -1,0 +1,91 @@
+"""Parameters of the physics: each documented, each in its range, read from a scene file and used."""
+
+import inspect
+import re
+
+import msgspec
+import numpy as np
+import pytest
+
+from tests.physics.test_contact_solver import rows_of_canes
+from vinesim.physics.parameters import ParameterError, PhysicsParameters
+from vinesim.physics.step import Physics
+from vinesim.scene import physics_parameters
+from vinesim.scene.data_files import data_dir
+from vinesim.scene.spec import SceneError, load
+
+FIELDS = [field.name for field in msgspec.structs.fields(PhysicsParameters)]
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_parameter_has_a_unit_and_a_source(name):
+    text = inspect.getsource(physics_parameters)
+    ((annotation, description),) = re.findall(rf'^    {name}: (.*) = .*\n    """((?:.|\n)*?)"""', text, re.MULTILINE)
+    if annotation.startswith("Count") or "int" in annotation or annotation == "bool":
+        return
+    assert re.match(r"\[[^]]+\] ", description), f"{name}: give its unit first"
+    assert re.search(r"\b(READ|DERIVED|TUNED|GUESSED)\b", description), f"{name}: give its source"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"dt": -0.01}, "physics.dt is -0.01; give a number above 0"),
+        ({"gravity": float("nan")}, "physics.gravity is nan; give a finite number"),
+        ({"phi": 1.2}, "physics.phi is 1.2; give a number of 1 or less"),
+        ({"sleep": 1}, "physics.sleep is 1; give True or False"),
+        ({"contact_capacity": 0}, "physics.contact_capacity is 0; give a number of 1 or more"),
+        ({"bunch_pool_size": 2.5}, "physics.bunch_pool_size is 2.5; give a whole number"),
+        ({"fast_joint_rate": 80.0}, "physics.fast_joint_rate is 80.0, max_joint_rate 50.0, .* in increasing order"),
+    ],
+)
+def test_a_parameter_out_of_range_is_refused(given, message):
+    with pytest.raises(ParameterError, match=f"^{message}$"):
+        PhysicsParameters(**given)
+
+
+def scene_with(tmp_path, table):
+    path = tmp_path / "other.toml"
+    path.write_text((data_dir() / "scenes" / "demo.toml").read_text() + f"\n[physics]\n{table}\n")
+    return load(path)
+
+
+def test_a_scene_file_overrides_parameters(tmp_path):
+    assert load("demo").physics == PhysicsParameters()
+    changed = scene_with(tmp_path, "friction = 0.5\nsleep_duration = 2\nsleep = false")
+    assert changed.physics == PhysicsParameters(friction=0.5, sleep_duration=2.0, sleep=False)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("frictoin = 0.5", "physics.frictoin is not a field; did you mean 'friction'?"),
+        ("friction = 0", "physics.friction is 0; give a number > 0"),
+        ("friction = inf", "physics.friction is inf; give a finite number"),
+        ("max_joint_rate = 1", "physics.fast_joint_rate is 5.0, max_joint_rate 1.0"),
+    ],
+)
+def test_a_scene_file_with_a_bad_parameter_is_refused_in_one_line(tmp_path, table, message):
+    with pytest.raises(SceneError, match=message.replace("?", r"\?")) as refused:
+        scene_with(tmp_path, table)
+    assert "\n" not in str(refused.value)
+    assert "other.toml" in str(refused.value)
+
+
+def ticks_until_asleep(**given):
+    physics = Physics(rows_of_canes(1), parameters=PhysicsParameters(**given))
+    physics.plants.wake(np.array([0]))
+    for tick in range(1000):
+        physics.step()
+        if not len(physics.plants.awake):
+            return tick + 1
+    return 0
+
+
+def test_durations_are_in_seconds_whatever_the_step():
+    assert [ticks_until_asleep(dt=dt) * dt for dt in (0.005, 0.01)] == pytest.approx([0.5, 0.5])
+    assert ticks_until_asleep(sleep_duration=1.0) == 100
+
+
+def test_sleep_can_be_switched_off():
+    assert ticks_until_asleep(sleep=False) == 0
