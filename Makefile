@@ -4,7 +4,7 @@ SECONDS = 20
 SEED = 7
 OUT = out
 JOBS = 2
-PYTEST = .venv/bin/python -m pytest -n $(JOBS) --dist loadfile
+PYTEST = .venv/bin/python -m pytest -n $(JOBS) --dist loadgroup
 
 .PHONY: demo test check lint validation setup clean
 demo:
