@@ -17,7 +17,7 @@ SKIPS_FAIL = bool(os.environ.get("CI"))
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     from vinesim.ros import ros_setup
 
-    reason = ros_setup.available()
+    reason = ros_setup.unavailable_reason()
     if reason:
         skip = pytest.mark.skip(reason=f"ROS 2 is not usable here: {reason}")
         for item in items:
