@@ -125,6 +125,12 @@ class Physics:
             self.plants.forward_kinematics()
             self._fresh = True
 
+    def wake(self, trees: np.ndarray) -> None:
+        """Wake trees [k] whose joints were written from outside, between steps, and bring their poses up to date."""
+        self.sleep.wake(trees)
+        self.plants.forward_kinematics(trees)
+        self._body_q = None
+
     def view(self) -> View:
         """The world after the last tick. While no tree is awake, views share one array of plant poses."""
         if self._body_q is None:
