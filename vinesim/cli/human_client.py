@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from vinesim.avatar.scripted_human import Walker
+from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
@@ -21,7 +21,7 @@ def run(options: ClientOptions) -> int:
     with ClientSession(options) as session:
         validate_bunch(session.model, options.reach)
         start = start_pose(session.scene, session.spawn)
-        human = Walker(start, options.height)
+        human = ScriptedHuman(start, options.height)
         client = Client(
             session.scene, session.model, None, session.bus(session.name), pose=start, source=human,
             height=options.height, **session.client_options(),
@@ -43,7 +43,7 @@ def run(options: ClientOptions) -> int:
     return 0
 
 
-def pull_repeatedly(human: Walker, point: Callable[[], np.ndarray]) -> Iterator[None]:
+def pull_repeatedly(human: ScriptedHuman, point: Callable[[], np.ndarray]) -> Iterator[None]:
     """Hold what is at a point [3] in the world, pull at it, let it go; without end."""
     while True:
         yield from human.reach("right", point)
