@@ -12,8 +12,9 @@ from vinesim import frames
 from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.camera import point_cloud
-from vinesim.sensors.camera.camera import Camera, CameraSpec, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import SensorError
 from vinesim.sensors.truth import truth

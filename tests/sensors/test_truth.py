@@ -14,7 +14,7 @@ from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitive_batches import SPHEROID
+from vinesim.sensors.raster.primitive_arrays import SPHEROID
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.truth import truth
 

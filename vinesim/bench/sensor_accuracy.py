@@ -21,10 +21,11 @@ from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Link, Measurement, Shape, View
-from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
-from vinesim.sensors.camera.renderers import RendererUnavailable
+from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import depth_colours, look_at, write_png
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.renderers import RendererUnavailable
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 from vinesim.sensors.truth import truth

@@ -12,8 +12,9 @@ from vinesim.scene import leaves
 from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.sensors.raster.primitive_arrays import CONE, LEAF, SPHEROID
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID, Batch, make_batch, stack_columns
+from vinesim.sensors.scene.primitive_batches import Batch, make_batch, stack_columns
 
 _BROWN = (0.30, 0.17, 0.08)
 _STEM = (0.19, 0.22, 0.075)

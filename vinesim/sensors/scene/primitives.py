@@ -18,10 +18,11 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Link, View
-from vinesim.sensors.camera import renderers
+from vinesim.sensors.raster import renderers
+from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches, bunch_bodies, cane_batch, leaf_batches
-from vinesim.sensors.scene.primitive_batches import CONE, KINDS, LEAF, placeholder_batch
+from vinesim.sensors.scene.primitive_batches import placeholder_batch
 from vinesim.sensors.scene.rigid_primitives import rigid_batches
 from vinesim.sensors.scene.static_primitives import grass_batch, litter_batch, row_layout, trellis_batch
 
@@ -44,11 +45,11 @@ class Primitives:
         renderer: str = "warp",
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
-        the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.camera.renderers`).
+        the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.raster.renderers`).
         """
         self.model, self.device, self._ripeness = model, device, ripeness
         self.rasterizer = renderers.create_rasterizer(renderer, device)
-        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.camera.CameraRasterizer` does so itself."""
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer` does so itself."""
         bodies = len(model.body_mass)
         self._static_carrier = bodies
         """Carrier of what stands still; links follow it."""

@@ -18,8 +18,8 @@ from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraInfo, View
 from vinesim.sensors.camera import point_cloud
-from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
-from vinesim.sensors.scene.primitive_batches import CONE, SPHEROID
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.ray_caster import RayCaster
 
