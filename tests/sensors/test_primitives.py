@@ -11,7 +11,7 @@ from vinesim import frames
 from vinesim.scene.berries import lay_out_berries
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.raster.primitive_arrays import SPHEROID
-from vinesim.sensors.scene.plant_primitives import Ripeness
+from vinesim.sensors.scene.bunch_primitives import Ripeness
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 

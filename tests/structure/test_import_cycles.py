@@ -13,9 +13,7 @@ def imports_of(path: pathlib.Path, modules: set[str]) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found |= {
-                full if (full := f"{node.module}.{name.name}") in modules else node.module for name in node.names
-            }
+            found |= {full if (full := f"{node.module}.{name.name}") in modules else node.module for name in node.names}
     return found & modules
 
 

@@ -27,7 +27,7 @@ from vinesim.scene.values import CameraInfo, View
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
-from vinesim.sensors.scene.plant_primitives import Ripeness
+from vinesim.sensors.scene.bunch_primitives import Ripeness
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.spec_file import SensorError

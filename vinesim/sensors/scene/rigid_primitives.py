@@ -14,7 +14,7 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import Link, Mesh, Shape
 from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE
-from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches
+from vinesim.sensors.scene.bunch_primitives import Ripeness, bunch_batches
 from vinesim.sensors.scene.primitive_batches import Batch, make_batch
 
 _MAX_MESH_FACES = 4000
