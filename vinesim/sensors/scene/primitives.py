@@ -18,7 +18,7 @@ from vinesim.kernels.shading import materials
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import Link, View
+from vinesim.scene.values import RigidVisual, Snapshot
 from vinesim.sensors.raster import renderers
 from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.sensors.scene import textures
@@ -71,7 +71,7 @@ class Primitives:
         batches += [b for b in around if b is not None]
         self._fixed_batches = [b for b in batches if len(b)] or [placeholder_batch(bodies)]
         self._tree_count = trees
-        self._links: tuple[Link, ...] = ()
+        self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
         self._moved = np.zeros(0, np.int64)
@@ -109,10 +109,10 @@ class Primitives:
 
     # -- building
 
-    def _build(self, links: tuple[Link, ...]) -> None:
+    def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
         moving = rigid_batches(
-            self.model, links, self._static_carrier + 1, 0, self._picked_bunch_shapes(links), self._ripeness
+            self.model, visuals, self._static_carrier + 1, 0, self._picked_bunch_shapes(visuals), self._ripeness
         )
         layout = lay_out(self._fixed_batches, moving, self._static_carrier)
         if self.layout_version:
@@ -127,12 +127,12 @@ class Primitives:
         self._owner_start = np.searchsorted(self._owner[self._by_owner], np.arange(self._tree_count + 1))
         self._upload(layout)
         self._upload_materials(layout)
-        poses = np.zeros((self._static_carrier + 1 + len(links), 7), np.float32)
+        poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
         poses[:, 6] = 1.0
         poses[: self._static_carrier] = self._poses[: self._static_carrier] if len(self._poses) else self._rest
         self._poses = poses
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
-        self._links = links
+        self._visuals = visuals
         self.plant_count = len(layout.label) - sum(len(b) for b in moving)
         self.layout_version += 1
 
@@ -191,10 +191,10 @@ class Primitives:
                 setattr(self.materials, name, getattr(baked, name))
         self.materials.sky = self._array(sky, float)
 
-    def _picked_bunch_shapes(self, links: tuple[Link, ...]) -> dict[int, np.ndarray]:
+    def _picked_bunch_shapes(self, visuals: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
         """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
         picked = {}
-        for bunch in (link.index for link in links if link.organ == Organ.BUNCH):
+        for bunch in (visual.index for visual in visuals if visual.organ == Organ.BUNCH):
             q = np.asarray(self._body_q[bunch_bodies(self.model, bunch)], float)
             picked[bunch] = self._picked_shapes.get(bunch, frames.compose(frames.inverse(q[0]), q))
         self._picked_shapes = picked
@@ -230,19 +230,19 @@ class Primitives:
 
     # -- following the world
 
-    def update(self, view: View, moved: np.ndarray | None = None) -> np.ndarray:
+    def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
         """Take over the poses of ``view``; returns the clusters that moved.
 
         ``moved`` are the trees that may have moved since the last call (default: those of the view and of the view
         before). Whoever skips views must gather it from all of them.
         """
-        if view.links is not self._links:
-            self._body_q = view.body_q
-            self._build(view.links)
+        if snapshot.visuals is not self._visuals:
+            self._body_q = snapshot.body_q
+            self._build(snapshot.visuals)
             everything = True
         else:
             everything = False
-        attached = np.asarray(view.bunch_attached, bool)
+        attached = np.asarray(snapshot.bunch_attached, bool)
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):
             self._attached = attached.copy()
@@ -250,20 +250,20 @@ class Primitives:
             shown[:] = self._cluster_shown()
             if self.device != "cpu":
                 self.clusters.shown.assign(shown)
-        trees = np.union1d(view.moved if moved is None else moved, self._moved).astype(np.int64)
-        self._moved = np.asarray(view.moved, np.int64)
+        trees = np.union1d(snapshot.moved_trees if moved is None else moved, self._moved).astype(np.int64)
+        self._moved = np.asarray(snapshot.moved_trees, np.int64)
         if everything:
             dirty = np.arange(len(self.cluster_first))
         else:
             dirty = self._tree_clusters(trees)
             if len(changed):
                 dirty = np.union1d(dirty, np.flatnonzero(np.isin(self._cluster_bunch, changed)))
-            link_q = np.asarray(view.link_q, np.float32).reshape(-1, 7)
-            if len(self.rigid_clusters) and not np.array_equal(self._poses[self._static_carrier + 1 :], link_q):
+            visual_q = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
+            if len(self.rigid_clusters) and not np.array_equal(self._poses[self._static_carrier + 1 :], visual_q):
                 dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
-            self._poses[: self._static_carrier] = view.body_q
-            self._poses[self._static_carrier + 1 :] = np.asarray(view.link_q, np.float32).reshape(-1, 7)
+            self._poses[: self._static_carrier] = snapshot.body_q
+            self._poses[self._static_carrier + 1 :] = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
             self._pose(dirty)
         return dirty
 
@@ -292,14 +292,14 @@ class Primitives:
         self.cluster_version[dirty] = self.pose_version
 
 
-def rest_snapshot(model: Model, links: tuple[Link, ...] = (), link_q: np.ndarray | None = None) -> View:
+def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:
     """A view of the vineyard at rest, for pictures and tests without physics."""
-    return View(
+    return Snapshot(
         time=0.0,
         tick=0,
         body_q=State.at_rest(model).body_q,
         bunch_attached=np.ones(len(model.bunch_body), bool),
-        links=links,
-        link_q=np.zeros((0, 7)) if link_q is None else np.asarray(link_q, float),
-        moved=np.zeros(0, np.int64),
+        visuals=visuals,
+        visual_q=np.zeros((0, 7)) if visual_q is None else np.asarray(visual_q, float),
+        moved_trees=np.zeros(0, np.int64),
     )
