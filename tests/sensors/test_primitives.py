@@ -176,7 +176,9 @@ def test_a_picked_bunch_keeps_the_shape_it_had(model, primitives) -> None:
     assert np.abs(after - before).max() < 2e-6
     # someone comes, everything is laid out anew while the stub's clusters are elsewhere: the loose one keeps its shape
     others = (link, sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1)))
-    still = dataclasses.replace(rest_snapshot(model), bunch_attached=attached, visuals=others, moved_trees=np.array([tree]))
+    still = dataclasses.replace(
+        rest_snapshot(model), bunch_attached=attached, visuals=others, moved_trees=np.array([tree])
+    )
     primitives.update(dataclasses.replace(still, visual_q=np.concatenate([loose, loose])))
     after = primitives.shapes.a.numpy()[_berries(primitives, bunch)]
     assert np.abs(after - before).max() < 2e-6
