@@ -91,7 +91,7 @@ def check_options(options: ClientOptions) -> None:
     if options.tls is not None and options.connect is None:
         raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")
     from vinesim.physics.plants.device_buffers import find_device
-    from vinesim.sensors.camera import renderers
+    from vinesim.sensors.raster import renderers
 
     find_device(options.device)
     renderers.check_renderer(options.renderer)
