@@ -20,8 +20,8 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -30,12 +30,12 @@ TICKS = 100
 PER_TREE = 17
 
 
-def cane(side: float) -> Tree:
+def cane(side: float) -> TreeBuilder:
     """A horizontal cane with a bunch on its tip."""
-    tree = Tree(frames.pose(np.array([0.0, side, 2.0])))
-    last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
-    tree.add(
-        last, offset=(1 / 16, 0, 0), rest=frames.aligned(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH), mass=0.5,
+    tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
+    last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
+    tree.add_body(
+        last, offset=(1 / 16, 0, 0), rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH), mass=0.5,
         com=(0.1, 0, 0), inertia=(5e-4, 5e-4, 5e-4), length=0.15, radius=(0.05, 0.05), damping=(0.002, 0.002, 0.002),
     )  # fmt: skip
     return tree
@@ -46,7 +46,7 @@ def forest(count: int) -> Model:
     one = assemble([cane(0.0)])
     counts = one.counts()
     model = Model.allocate(**{axis: n * count if axis in ("tree", "body") else n for axis, n in counts.items()})
-    for name, dim in Model.dims().items():
+    for name, dim in Model.array_fields().items():
         if dim.shape[0] in ("tree", "body"):
             value = getattr(one, name)
             getattr(model, name)[:] = np.tile(value, (count,) + (1,) * (value.ndim - 1))
@@ -67,9 +67,9 @@ def stirred(model: Model, seed: int = 3) -> State:
     return state
 
 
-def plants_on(device: str, count: int) -> Plants:
+def plants_on(device: str, count: int) -> ArticulationSolver:
     model = forest(count)
-    plants = Plants(model, stirred(model), device=device)
+    plants = ArticulationSolver(model, stirred(model), device=device)
     plants.wake(np.arange(count))
     return plants
 
@@ -80,12 +80,12 @@ def trajectory(device: str) -> dict[str, np.ndarray]:
     pushed = np.arange(0, 256, 2) * PER_TREE + 9
     wrench = np.tile([0.3, -0.2, 0.5, 0.01, 0.0, 0.02], (len(pushed), 1))
     for tick in range(200):
-        plants.free()
-        response = plants.response(pushed[:4]) if tick == 20 else None
+        plants.predict()
+        response = plants.impulse_response(pushed[:4]) if tick == 20 else None
         if response is not None:
             kept = response
-        plants.commit(pushed if tick < 50 else None, wrench if tick < 50 else None)
-    plants.kinematics()
+        plants.integrate(pushed if tick < 50 else None, wrench if tick < 50 else None)
+    plants.forward_kinematics()
     state = plants.state
     return {"response": kept, "body_q": state.body_q.copy(), "joint_qd": state.joint_qd.copy()}
 
@@ -139,10 +139,10 @@ def main() -> None:
         say(about, f"{count} trees of {PER_TREE} bodies, resident", bodies / took / 1e9, "G body-steps/s")
         if count <= 16384:
 
-            def visible(plants: Plants = plants) -> None:
+            def visible(plants: ArticulationSolver = plants) -> None:
                 for _ in range(20):
-                    plants.free()
-                    plants.commit()
+                    plants.predict()
+                    plants.integrate()
 
             say(about, f"{count} trees of {PER_TREE} bodies, visible", 1e3 * seconds(visible) / 20, "ms/tick")
 

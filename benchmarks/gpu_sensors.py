@@ -25,12 +25,12 @@ from vinesim.kernels.raster import ray_cast
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Link, Shape, View
-from vinesim.sensors.camera.camera import REACH, Camera, CameraSpec, pinhole
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.camera.camera import MAX_DEPTH, Camera, CameraSpec, pinhole
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 
 VIEWS = {
@@ -52,7 +52,7 @@ def things() -> Link:
 def world(model: Model, device: str) -> tuple[Primitives, View]:
     """The vineyard with some solids in it."""
     primitives = Primitives(model, device=device)
-    view = still_view(model, (things(),), np.array([[1.6, 0.6, 1.2, *frames.yaw(0.5)]]))
+    view = rest_snapshot(model, (things(),), np.array([[1.6, 0.6, 1.2, *frames.from_yaw(0.5)]]))
     primitives.update(view)
     return primitives, view
 
@@ -80,12 +80,12 @@ def compare(say: Report, model: Model, device: str) -> None:
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
     for name, (eye, target) in VIEWS.items():
-        pose = looking(np.array(eye), np.array(target))
+        pose = look_at(np.array(eye), np.array(target))
         seen = []
         for primitives, where in ((ours, device), (theirs, "cpu")):
             camera = Camera(spec, info, device=where)
             frame = camera.render(primitives, pose)
-            seen.append((camera.visibility.primitive.numpy().reshape(frame.depth.shape), frame))
+            seen.append((camera.rasterizer.primitive.numpy().reshape(frame.depth.shape), frame))
         (a, mine), (b, other) = seen
         same = (a == b) & (a >= 0)
         say(f"{name}: pixels that see the primitive that the CPU sees", float((a == b).mean()), "1")
@@ -156,21 +156,21 @@ def measure(say: Report, model: Model, device: str) -> None:
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
     for name, (eye, target) in VIEWS.items():
-        pose = looking(np.array(eye), np.array(target))
+        pose = look_at(np.array(eye), np.array(target))
         lens = pinhole(info, pose)
         for quality in ("fast", "full"):
             camera = Camera(spec, info, quality=quality, device=device)
-            camera.expose(primitives, pose)
-            spent = milliseconds(lambda c=camera, p=pose: c.expose(primitives, p), device)
+            camera.render_on_device(primitives, pose)
+            spent = milliseconds(lambda c=camera, p=pose: c.render_on_device(primitives, p), device)
             say(f"{name}: {quality} frame, cached shadows, {about}", spent, "ms")
-        spent = milliseconds(lambda c=camera, at=lens: c.visibility.draw(primitives, at), device)
+        spent = milliseconds(lambda c=camera, at=lens: c.rasterizer.draw(primitives, at), device)
         say(f"{name}: visibility alone, {about}", spent, "ms")
         for reach, one in (("near", camera._sunlight._near), ("far", camera._sunlight._far)):
             say(f"{name}: {reach} shadows drawn anew", milliseconds(lambda m=one: m._draw(primitives), device), "ms")
-    poses = [looking(np.array([-0.6 + 1e-4 * n, 1.0, 1.45]), np.array([8.0, 1.35, 1.45])) for n in range(400)]
+    poses = [look_at(np.array([-0.6 + 1e-4 * n, 1.0, 1.45]), np.array([8.0, 1.35, 1.45])) for n in range(400)]
     for quality in ("fast", "full"):
         camera = Camera(spec, info, quality=quality, device=device)
-        often = rate(lambda n, c=camera: c.expose(primitives, poses[n]), device)
+        often = rate(lambda n, c=camera: c.render_on_device(primitives, poses[n]), device)
         say(f"{quality} frames left on the device, moving camera, {about}", often, "1/s")
         often = rate(lambda n, c=camera: c.render(primitives, poses[n]), device)
         say(f"{quality} frames handed to the host, moving camera, {about}", often, "1/s")
@@ -184,8 +184,8 @@ def measure(say: Report, model: Model, device: str) -> None:
         found = [wp.empty(len(d), dtype=t, device=device) for t in (float, wp.int32)]
 
         def cast(start: wp.array = start, direction: wp.array = direction, found: list[wp.array] = found) -> None:
-            inputs = [primitives.shapes, tree.hierarchies(), start, direction, REACH]
-            wp.launch(ray_cast.cast, len(start), inputs=inputs, outputs=found, device=device)
+            inputs = [primitives.shapes, tree.hierarchies(), start, direction, MAX_DEPTH]
+            wp.launch(ray_cast.cast_rays, len(start), inputs=inputs, outputs=found, device=device)
 
         say(f"{lasers} lasers, {len(d)} rays at once", len(d) / milliseconds(cast, device) / 1e6, "G rays/s")
     trees = np.unique(model.body_tree[model.bunch_body])[:20]
@@ -205,7 +205,7 @@ def main() -> None:
     ask.add_argument("--device", default="cuda")
     ask.add_argument("--scene", default="vsp")
     given = ask.parse_args()
-    say, model = Report(given.device), generate(load(given.scene))
+    say, model = Report(given.device), generate(load_scene(given.scene))
     compare(say, model, given.device)
     measure(say, model, given.device)
 

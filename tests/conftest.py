@@ -12,7 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 def pytest_collection_modifyitems(items):
     from vinesim.ros import ros_setup
 
-    reason = ros_setup.available()
+    reason = ros_setup.unavailable_reason()
     if reason:
         skip = pytest.mark.skip(reason=f"ROS 2 is not usable here: {reason}")
         for item in items:

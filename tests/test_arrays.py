@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vinesim.arrays import Arrays, array
+from vinesim.arrays import StructOfArrays, array
 
 
 @dataclasses.dataclass
-class Wires(Arrays):
+class Wires(StructOfArrays):
     start: np.ndarray = array("wire", 3, unit="m")
     radius: np.ndarray = array("wire", unit="m", fill=0.002)
     organ: np.ndarray = array("wire", unit="1", dtype=np.int32)
@@ -23,7 +23,7 @@ def test_allocation_fills_shapes_types_and_defaults():
     assert wires.organ.dtype == np.int32
     assert wires.counts() == {"wire": 4, "pole": 2}
     assert wires.check() is wires
-    assert str(Wires.dims()["start"]) == "[wire, 3] float32 [m]"
+    assert str(Wires.array_fields()["start"]) == "[wire, 3] float32 [m]"
 
 
 def test_defaults_are_not_shared():

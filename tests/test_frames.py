@@ -32,7 +32,7 @@ def test_rotation_vectors_there_and_back():
 
 
 def test_matrices_there_and_back():
-    assert np.allclose(frames.matrix(A.as_quat()), A.as_matrix(), atol=1e-12)
+    assert np.allclose(frames.to_matrix(A.as_quat()), A.as_matrix(), atol=1e-12)
     assert same(frames.from_matrix(A.as_matrix()), A)
     for half_turn in np.vstack([np.eye(3), [[0.6, 0.8, 0.0]]]):
         r = Rotation.from_rotvec(np.pi * half_turn)
@@ -40,11 +40,11 @@ def test_matrices_there_and_back():
 
 
 def test_aligned_points_x_and_leans_z():
-    q = frames.aligned(V)
+    q = frames.from_x_axis(V)
     assert np.allclose(frames.rotate(q, np.array([1.0, 0.0, 0.0])), frames.normalize(V), atol=1e-12)
     z = frames.rotate(q, np.array([0.0, 0.0, 1.0]))
     assert (z[:, 2] > 0.0).all()
-    up = frames.aligned(np.array([0.0, 0.0, 1.0]))
+    up = frames.from_x_axis(np.array([0.0, 0.0, 1.0]))
     assert np.allclose(frames.rotate(up, np.array([1.0, 0.0, 0.0])), [0.0, 0.0, 1.0])
 
 
@@ -66,12 +66,14 @@ def test_the_one_crossing_to_mujoco():
 
 def test_an_optical_frame_looks_along_the_links_x():
     """REP-103: optical z is the link's x, optical x its right (-y), optical y its down (-z)."""
-    axes = frames.matrix(frames.OPTICAL).T
+    axes = frames.to_matrix(frames.OPTICAL).T
     assert np.allclose(axes, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
 
 
 def test_yaw_turns_x_to_y():
-    assert frames.rotate(frames.yaw(np.pi / 2), np.array([1.0, 0.0, 0.0])) == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
+    assert frames.rotate(frames.from_yaw(np.pi / 2), np.array([1.0, 0.0, 0.0])) == pytest.approx(
+        [0.0, 1.0, 0.0], abs=1e-12
+    )
 
 
 def test_zero_stays_zero():

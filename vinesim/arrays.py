@@ -4,7 +4,7 @@ A struct of arrays declares its fields with :func:`array`; allocation, checks an
 derived from that one declaration, so a shape is never written twice.
 
     @dataclass
-    class Wires(Arrays):
+    class Wires(StructOfArrays):
         start: np.ndarray = array("wire", 3, unit="m")
         radius: np.ndarray = array("wire", unit="m", fill=0.002)
 
@@ -20,7 +20,7 @@ import numpy as np
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Dim:
+class ArraySpec:
     """Shape, unit and type of one array field. A named axis is a count shared by all fields of a struct."""
 
     shape: tuple[str | int, ...]
@@ -34,16 +34,16 @@ class Dim:
 
 
 def array(*shape: str | int, unit: str, dtype: Any = np.float32, fill: float | tuple[float, ...] = 0.0) -> Any:
-    """Declare an array field of an :class:`Arrays` struct. ``unit`` is SI, ``"1"`` for pure numbers."""
-    return dataclasses.field(metadata={"dim": Dim(shape, unit, np.dtype(dtype), fill)})
+    """Declare an array field of an :class:`StructOfArrays` struct. ``unit`` is SI, ``"1"`` for pure numbers."""
+    return dataclasses.field(metadata={"dim": ArraySpec(shape, unit, np.dtype(dtype), fill)})
 
 
-class Arrays:
+class StructOfArrays:
     """Base of the structs of arrays; subclasses are dataclasses with :func:`array` fields."""
 
     @classmethod
-    def dims(cls) -> dict[str, Dim]:
-        """Every array field with its :class:`Dim`, in order of declaration."""
+    def array_fields(cls) -> dict[str, ArraySpec]:
+        """Every array field with its :class:`ArraySpec`, in order of declaration."""
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
         return {field.name: field.metadata["dim"] for field in fields if "dim" in field.metadata}
 
@@ -51,7 +51,7 @@ class Arrays:
     def allocate(cls, **counts: int) -> Self:
         """All fields filled with their default, for the given count of each named axis."""
         fields = {}
-        for name, dim in cls.dims().items():
+        for name, dim in cls.array_fields().items():
             missing = [axis for axis in dim.shape if isinstance(axis, str) and axis not in counts]
             if missing:
                 raise ValueError(f"{cls.__name__}.{name} needs a count for {missing[0]!r}; give {missing[0]}=N")
@@ -64,7 +64,7 @@ class Arrays:
         counts: dict[str, int] = {}
         seen: dict[str, str] = {}
         owner = type(self).__name__
-        for name, dim in self.dims().items():
+        for name, dim in self.array_fields().items():
             value = getattr(self, name)
             if value.ndim != len(dim.shape):
                 raise ValueError(f"{owner}.{name} has {value.ndim} axes, expected {dim}")
@@ -80,7 +80,7 @@ class Arrays:
     def check(self) -> Self:
         """Raise :class:`ValueError` naming the first field of wrong type, shape or with a non-finite value."""
         self.counts()
-        for name, dim in self.dims().items():
+        for name, dim in self.array_fields().items():
             value = getattr(self, name)
             if value.dtype != dim.dtype:
                 raise ValueError(f"{type(self).__name__}.{name} is {value.dtype}, expected {dim}")
@@ -91,4 +91,4 @@ class Arrays:
 
     def copy(self) -> Self:
         """A deep copy of the arrays."""
-        return type(self)(**{name: getattr(self, name).copy() for name in self.dims()})
+        return type(self)(**{name: getattr(self, name).copy() for name in self.array_fields()})

@@ -86,7 +86,7 @@ def log(q: np.ndarray) -> np.ndarray:
     return q[..., :3] * np.where(sine > 1e-9, angle / np.where(sine > 1e-9, sine, 1.0), 2.0)
 
 
-def matrix(q: np.ndarray) -> np.ndarray:
+def to_matrix(q: np.ndarray) -> np.ndarray:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4]."""
     q = np.asarray(q)
     return np.swapaxes(rotate(q[..., None, :], np.eye(3, dtype=q.dtype)), -1, -2)
@@ -105,21 +105,24 @@ def from_matrix(r: np.ndarray) -> np.ndarray:
     return normalize(np.take_along_axis(rows, best[..., None, None], -2)[..., 0, :])
 
 
-def yaw(angle: float | np.ndarray) -> np.ndarray:
-    """Quaternion of a turn about z by ``angle`` [rad], counter-clockwise from above."""
+def from_yaw(angle: float | np.ndarray) -> np.ndarray:
+    """Quaternion [..., 4] of a rotation about z by ``angle`` [...] rad, counter-clockwise seen from above."""
     half = 0.5 * np.asarray(angle, float)
     zero = np.zeros_like(half)
     return np.stack([zero, zero, np.sin(half), np.cos(half)], -1)
 
 
-def heading(q: np.ndarray) -> float:
-    """Where the x axis of a rotation [4] points, seen from above [rad]: of :func:`yaw` the inverse."""
+def to_yaw(q: np.ndarray) -> float:
+    """Yaw angle [rad] of a rotation [4]: the direction of its x axis seen from above. Inverse of :func:`from_yaw`."""
     x, y, z, w = q
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def aligned(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np.ndarray:
-    """Quaternion whose x axis points along ``x`` and whose z axis leans to ``up`` (to y if they are parallel)."""
+def from_x_axis(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np.ndarray:
+    """Quaternion [..., 4] that turns the x axis to ``x`` [..., 3], with the z axis in the half plane of x and ``up``.
+
+    Where ``x`` and ``up`` are parallel, the z axis leans towards world y.
+    """
     ex = normalize(np.asarray(x, float))
     side = np.cross(np.broadcast_to(up, ex.shape), ex)
     degenerate = np.linalg.norm(side, axis=-1, keepdims=True) < 1e-6

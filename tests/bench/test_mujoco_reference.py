@@ -24,7 +24,7 @@ def test_the_peer_of_the_contact_bench_does_the_same_work() -> None:
     assert len(ours.contacts) == theirs.plant_contact_count() == 5
     place = np.array([theirs.data.body(f"plant/{b}").xpos for b in range(len(model.body_mass))])
     mine = ours.state.body_q[:, :3]  # both are those of the last tick's start
-    rest = model.forward(model.joint_settled)[:, :3]
+    rest = model.forward_kinematics(model.joint_settled)[:, :3]
     assert np.abs(place - rest).max() > 0.08
     np.testing.assert_allclose(mine, place, atol=0.01)  # MuJoCo's contacts give by millimetres
     assert ours.plants.awake.tolist() == [0, 1, 2, 3]
@@ -35,7 +35,7 @@ def test_a_row_rests_as_it_is_drawn() -> None:
     physics = scenes.keep_awake(Physics(model), np.arange(2))
     for _ in range(100):
         physics.step()
-    drawn = model.forward(model.joint_settled)
+    drawn = model.forward_kinematics(model.joint_settled)
     np.testing.assert_allclose(physics.view().body_q[:, :3], drawn[:, :3], atol=1e-4)
     np.testing.assert_allclose(
         drawn[model.bunch_body, :3] - [0, 0, 0.085], [scenes.bunch_center(0), scenes.bunch_center(1)], atol=1e-6

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from vinesim.bench import sensor_accuracy
-from vinesim.bench.sensor_accuracy import Depths, formula, plane, ranges
+from vinesim.bench.sensor_accuracy import DepthStatistics, depth_noise_formula, measure_plane, measure_ranges
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.sensors.camera.camera import CameraSpec
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
 def test_a_plane_is_measured_as_the_formula_says(monkeypatch) -> None:
     monkeypatch.setattr(sensor_accuracy, "RANGES", (0.5, 2.0))
     spec = CameraSpec.load("d435")
-    found = plane(spec)
+    found = measure_plane(spec)
     assert list(found.fill.values()) == [1.0, 1.0]
     for away, error in found.error.items():
-        assert error == pytest.approx(float(formula(spec, np.array(away))), rel=0.2)
+        assert error == pytest.approx(float(depth_noise_formula(spec, np.array(away))), rel=0.2)
 
 
 def test_depths_are_told_only_of_enough_pixels() -> None:
-    depths, exact = Depths(), np.full(1000, 2.0)
+    depths, exact = DepthStatistics(), np.full(1000, 2.0)
     measured = exact + 0.01 * np.random.default_rng(1).standard_normal(1000)
     measured[:100] = np.nan
     depths.add(2.0, exact, measured)
@@ -33,15 +33,15 @@ def test_depths_are_told_only_of_enough_pixels() -> None:
 
 
 def test_a_real_lidar_loses_some_returns_and_mixes_some() -> None:
-    scan = ranges("vlp16", Primitives(generate(load("demo"))))
+    scan = measure_ranges("vlp16", Primitives(generate(load_scene("demo"))))
     assert 0.7 < scan.returned < 1.2
     assert 0.02 < scan.mixed < 0.5
     assert len(scan.real) == pytest.approx(scan.returned * len(scan.exact))
 
 
 def test_renderers_see_what_rays_meet(tmp_path) -> None:
-    model = generate(load("demo"))
-    pictures = sensor_accuracy.backends(CameraSpec.load("d435"), model, still_view(model))
+    model = generate(load_scene("demo"))
+    pictures = sensor_accuracy.compare_renderers(CameraSpec.load("d435"), model, rest_snapshot(model))
     assert {"warp", "rays"} <= pictures.keys()
     cast = pictures["rays"]
     for name, look in pictures.items():
@@ -55,8 +55,8 @@ def test_renderers_see_what_rays_meet(tmp_path) -> None:
 
 def test_pictures_are_drawn(tmp_path) -> None:
     spec = CameraSpec.load("d435")
-    one = Depths({0.5: 0.001, 2.0: 0.02}, {0.5: 1.0, 2.0: 0.9})
-    some = sensor_accuracy.Ranges(np.array([1.0, 2.0]), np.array([1.0]), 0.5, 0.1)
+    one = DepthStatistics({0.5: 0.001, 2.0: 0.02}, {0.5: 1.0, 2.0: 0.9})
+    some = sensor_accuracy.RangeStatistics(np.array([1.0, 2.0]), np.array([1.0]), 0.5, 0.1)
     sensor_accuracy._draw(tmp_path / "new", spec, {"plane": one}, {"a": some, "b": some}, np.array([[0.1, 0.6]]))
     names = {"sensors-depth.png", "sensors-lidar.png", "sensors-berries.png"}
     assert {p.name for p in (tmp_path / "new").iterdir()} == names

@@ -7,18 +7,27 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.client.composition.composer import BULK, WALL, CrateAt, NoRoom, PersonAt, RobotAt, Stage, weights
+from vinesim.client.composition.composer import (
+    CRATE_WALL,
+    HEAP_DENSITY,
+    CratePlacement,
+    PersonPlacement,
+    PlacementError,
+    RobotPlacement,
+    SceneComposer,
+    bunch_masses,
+)
 from vinesim.physics.step import Physics
 from vinesim.scene.ids import Organ, label
 
-CRATE = CrateAt(1.3, 1.25, 0.4, 0.35)
+CRATE = CratePlacement(1.3, 1.25, 0.4, 0.35)
 
 
 @pytest.fixture(scope="module")
 def filled() -> Physics:
-    stage = Stage(crates=(CRATE,))
-    physics = Physics(stage.furnished(sensor_scenes.demo()))
-    stage.enter(physics)
+    stage = SceneComposer(crates=(CRATE,))
+    physics = Physics(stage.with_crates(sensor_scenes.demo()))
+    stage.populate(physics)
     return physics
 
 
@@ -28,9 +37,9 @@ def test_bunches_fill_a_crate(filled: Physics) -> None:
     picked = np.array(rigid.loose)
     assert not filled.state.bunch_attached[picked].any()
     assert filled.state.bunch_attached.sum() == len(model.bunch_body) - len(picked)
-    inside = np.array(CRATE.size) - [2 * WALL, 2 * WALL, WALL]
-    wanted = CRATE.fill * BULK * np.prod(inside)
-    heavy = weights(model)
+    inside = np.array(CRATE.size) - [2 * CRATE_WALL, 2 * CRATE_WALL, CRATE_WALL]
+    wanted = CRATE.fill * HEAP_DENSITY * np.prod(inside)
+    heavy = bunch_masses(model)
     assert wanted - heavy.max() < heavy[picked].sum() <= wanted
     crate = rigid.link_q()[[link.name for link in rigid.links()].index(f"box/{len(model.box_size) - 1}")]
     assert crate[:3] == pytest.approx(CRATE.pose[:3], abs=0.01)
@@ -44,27 +53,31 @@ def test_bunches_fill_a_crate(filled: Physics) -> None:
 
 
 def test_the_same_twice(filled: Physics) -> None:
-    again = Stage(crates=(CRATE,))
-    physics = Physics(again.furnished(sensor_scenes.demo()))
-    assert np.array_equal(again.enter(physics).link_q, filled.view().link_q)
+    again = SceneComposer(crates=(CRATE,))
+    physics = Physics(again.with_crates(sensor_scenes.demo()))
+    assert np.array_equal(again.populate(physics).link_q, filled.view().link_q)
 
 
 def test_crates_come_after_those_of_the_scene_and_change_no_plant() -> None:
     model = sensor_scenes.demo()
-    furnished = Stage(crates=(CrateAt(1.0, 1.2), CRATE)).furnished(model)
+    furnished = SceneComposer(crates=(CratePlacement(1.0, 1.2), CRATE)).with_crates(model)
     assert len(furnished.box_size) == len(model.box_size) + 2
     assert np.array_equal(furnished.box_pose[:-2], model.box_pose)
     assert furnished.box_size[-1] == pytest.approx(CRATE.size)
     for name in ("body_mass", "bunch_seed", "leaf_pose", "joint_settled"):
         assert np.array_equal(getattr(furnished, name), getattr(model, name))
-    assert Stage().set(model).bunch_attached.all()
+    assert SceneComposer().compose(model).bunch_attached.all()
 
 
 def test_whoever_is_told_of_has_the_label_of_the_links() -> None:
     model = sensor_scenes.demo()
-    stage = Stage((RobotAt("logistic", 1.3, 1.2),), (PersonAt(3.0, 1.2, 0.5, "wave", 1.6),), (CrateAt(4.0, 1.3),))
-    links = stage.set(model).links
-    told = {one["label"]: one for one in stage.told(model)}
+    stage = SceneComposer(
+        (RobotPlacement("logistic", 1.3, 1.2),),
+        (PersonPlacement(3.0, 1.2, 0.5, "wave", 1.6),),
+        (CratePlacement(4.0, 1.3),),
+    )
+    links = stage.compose(model).links
+    told = {one["label"]: one for one in stage.actor_records(model)}
     drawn = {label(link.organ, link.index) for link in links}
     assert drawn - {label(Organ.BOX, k) for k in range(len(model.box_size))} == set(told)
     assert told[label(Organ.HUMAN, 0)]["height"] == 1.6
@@ -73,12 +86,12 @@ def test_whoever_is_told_of_has_the_label_of_the_links() -> None:
 @pytest.mark.parametrize(
     ("stage", "words"),
     [
-        (Stage((RobotAt("vinebot", 0.0, 0.0),)), "robot_0 stands .* cm deep in (trunk|pole); move one"),
-        (Stage((RobotAt("vinebot", 1.2, 1.2),), (PersonAt(1.3, 1.2),)), "stands .* deep in"),
-        (Stage(crates=(CrateAt(1.0, 1.0, 0.0, 1.0, (6.0, 6.0, 1.0)),)), "more than the vineyard bears"),
+        (SceneComposer((RobotPlacement("vinebot", 0.0, 0.0),)), "robot_0 stands .* cm deep in (trunk|pole); move one"),
+        (SceneComposer((RobotPlacement("vinebot", 1.2, 1.2),), (PersonPlacement(1.3, 1.2),)), "stands .* deep in"),
+        (SceneComposer(crates=(CratePlacement(1.0, 1.0, 0.0, 1.0, (6.0, 6.0, 1.0)),)), "more than the vineyard bears"),
     ],
 )
-def test_where_there_is_no_room_is_said(stage: Stage, words: str) -> None:
-    with pytest.raises(NoRoom, match=words) as said:
-        stage.set(sensor_scenes.demo())
+def test_where_there_is_no_room_is_said(stage: SceneComposer, words: str) -> None:
+    with pytest.raises(PlacementError, match=words) as said:
+        stage.compose(sensor_scenes.demo())
     assert "\n" not in str(said.value)

@@ -11,33 +11,33 @@ from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.avatar.scripted_human import Legs, Walker
-from vinesim.cli.human_client import before
+from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
-from vinesim.client.tasks.start_poses import bunch_centres, bunch_in_reach, start_pose
+from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, start_pose
 from vinesim.net.codec import human as poses
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.human_body import PARTS, standing
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.values import HumanPose
 from vinesim.sensors.camera.camera import Camera, CameraSpec
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import Primitives
 
 DT = 0.01
 FOREARM = np.array([0.2, 0.36, 0.885])
 """A point of the vinebot's left forearm, when it stands at the origin with its arms at home."""
-SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.yaw(-0.5 * np.pi))
+SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.from_yaw(-0.5 * np.pi))
 """Beside that arm, facing it."""
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
 class World:
@@ -49,7 +49,7 @@ class World:
         self.scene, self.model = load_scene("demo"), assemble([cane((0.0, 30.0, 2.0), bunch=0.5)])
         self.clients: list[Client] = []
 
-    def join(self, name: str, description: Description | None, pose: np.ndarray, source=None, **options) -> Client:
+    def join(self, name: str, description: RobotDescription | None, pose: np.ndarray, source=None, **options) -> Client:
         client = Client(
             self.scene, self.model, description, self.hub.bus(name), name=name, pose=pose, source=source,
             clock=lambda: self.now, **options,
@@ -185,18 +185,18 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     """F59, F62: points with the label of each lie where it is on its own client."""
     world = World()
     anna = world.join("anna", vinebot, frames.pose(np.zeros(3)))
-    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.yaw(2.0)))
-    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.yaw(1.0)))
+    eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.from_yaw(2.0)))
+    bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.from_yaw(1.0)))
     world.run(0.8)
     view = anna.physics.view()
     primitives = Primitives(world.model, grass=0.0)
     primitives.update(view)
     eye = np.array([0.0, 0.0, 1.3])
     scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, frames.pose(eye))
-    gaze = looking(eye, np.array([3.0, -0.4, 1.0]))
+    gaze = look_at(eye, np.array([3.0, -0.4, 1.0]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, gaze)
     d435 = CameraSpec.load("d435")
-    clear = looking(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both its imagers, of her own robot
+    clear = look_at(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both its imagers, of her own robot
     measured = Camera(d435, d435.info("optical", 0.5)).render(primitives, clear)
     seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
     for organ, name, at in (
@@ -227,7 +227,7 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
 class Shove:
     """A person beside a robot's arm who puts the right hand where a test says."""
 
-    def __init__(self, vinebot: Description, delay: float) -> None:
+    def __init__(self, vinebot: RobotDescription, delay: float) -> None:
         self.world = World(delay)
         self.stand = standing(SIDE)
         self.at = np.array([0.2, 0.75, 0.885])
@@ -352,10 +352,10 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     world.scene = load_scene("demo")
     world.model = generate(world.scene)
     stand = start_pose(world.scene, 0)
-    bunch = bunch_in_reach(world.model, stand)
+    bunch = find_reachable_bunch(world.model, stand)
     body = int(world.model.bunch_body[bunch])
     centre = bunch_centres(world.model)[bunch]
-    walker = Walker(frames.pose(np.array([*before(centre, stand), 0.0]), stand[3:]))
+    walker = Walker(frames.pose(np.array([*standing_place(centre, stand), 0.0]), stand[3:]))
     eva = world.join("eva", None, walker.root, walker)
     aside = frames.compose(stand, frames.pose(np.array([-1.5, 1.0, 0.0])))
     anna = world.join("anna", vinebot, aside)

@@ -11,11 +11,11 @@ import pytest
 from vinesim import frames
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import Box, Scene, load, reseeded
+from vinesim.scene.spec import Box, Scene, load_scene, with_seed
 
 
 def harvest(seed: int, **changes) -> Scene:
-    return msgspec.structs.replace(reseeded(load("harvest"), seed), **changes)
+    return msgspec.structs.replace(with_seed(load_scene("harvest"), seed), **changes)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -23,49 +23,53 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
     plan = harvest(seed)
     model = generate(plan)
     start = start_poses.spawn_pose(plan, 0)[:2]
-    for task in itertools.islice(pick_planning.tasks(model, start), 3):
+    for task in itertools.islice(pick_planning.plan_picks(model, start), 3):
         centre = start_poses.bunch_centres(model)[task.bunch]
-        local = frames.compose(frames.inverse(task.stand), frames.pose(centre))[:3]
-        assert local[0] == pytest.approx(pick_planning.AHEAD, abs=0.02)
-        assert local[1] == pytest.approx(pick_planning.ASIDE if task.side == "left" else -pick_planning.ASIDE, abs=0.02)
-        assert model.bunch_radius[task.bunch] <= pick_planning.WIDEST
+        local = frames.compose(frames.inverse(task.base_pose), frames.pose(centre))[:3]
+        assert local[0] == pytest.approx(pick_planning.BUNCH_AHEAD, abs=0.02)
+        assert local[1] == pytest.approx(
+            pick_planning.BUNCH_ASIDE if task.side == "left" else -pick_planning.BUNCH_ASIDE, abs=0.02
+        )
+        assert model.bunch_radius[task.bunch] <= pick_planning.MAX_BUNCH_RADIUS
         # the way keeps away from what stands, and ends with the box beside the base, on the arm's side
-        points = np.concatenate([task.stand[None, :2], task.way])
+        points = np.concatenate([task.base_pose[None, :2], task.path])
         for a, b in itertools.pairwise(points[:-1]):
             line = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
-            assert start_poses.free_room(model, line).min() > pick_planning.ROOM - pick_planning.GRID
-        end = frames.pose(np.append(points[-1], 0.0), frames.yaw(task.heading))
+            assert (
+                start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - pick_planning.GRID_SIZE
+            )
+        end = frames.pose(np.append(points[-1], 0.0), frames.from_yaw(task.final_heading))
         box = frames.compose(frames.inverse(end), model.box_pose[task.box].astype(float))[:3]
-        gap = abs(box[1]) - 0.5 * float(model.box_size[task.box, 1]) - pick_planning.WIDTH
-        assert gap == pytest.approx(pick_planning.GAP, abs=1e-6)
+        gap = abs(box[1]) - 0.5 * float(model.box_size[task.box, 1]) - pick_planning.BASE_HALF_WIDTH
+        assert gap == pytest.approx(pick_planning.BOX_GAP, abs=1e-6)
         assert (box[1] > 0.0) == (task.side == "left")
 
 
 def test_a_way_goes_round_what_stands_and_is_short():
     model = generate(harvest(7, boxes=()))
     start, goal = np.array([5.0, 1.4]), np.array([5.0, -1.4])  # a vine stands between
-    points = pick_planning.way(model, start, goal)
+    points = pick_planning.find_path(model, start, goal)
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     assert 2.8 < length < 5.0
     for a, b in itertools.pairwise(points):
         line = a + np.linspace(0.0, 1.0, 100)[:, None] * (b - a)
-        assert start_poses.free_room(model, line).min() > pick_planning.ROOM - pick_planning.GRID
+        assert start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - pick_planning.GRID_SIZE
 
 
 def test_no_way_through_a_vine():
     model = generate(harvest(7))
-    assert pick_planning.way(model, np.array([5.0, 1.4]), np.array([5.0, 0.1])) is None
+    assert pick_planning.find_path(model, np.array([5.0, 1.4]), np.array([5.0, 0.1])) is None
 
 
 def test_boxes_without_room_are_told():
     model = generate(harvest(7, boxes=()))
-    with pytest.raises(start_poses.NoPlace, match=r"no box of this scene has .* room beside it"):
-        next(pick_planning.tasks(model, np.zeros(2)))
+    with pytest.raises(start_poses.PlacementError, match=r"no box of this scene has .* room beside it"):
+        next(pick_planning.plan_picks(model, np.zeros(2)))
 
 
 def test_a_box_is_an_obstacle_as_large_as_it_is():
     model = generate(harvest(7, boxes=(Box(x=3.75, y=1.2, yaw=0.5),)))
-    corner = np.array([3.75, 1.2]) + frames.rotate(frames.yaw(0.5), np.array([0.3, 0.2, 0.0]))[:2]
-    away = frames.rotate(frames.yaw(0.5), np.array([0.3, 0.4, 0.0]))[:2]
-    assert start_poses.free_room(model, (corner + away)[None])[0] == pytest.approx(0.5, abs=1e-6)
-    assert start_poses.free_room(model, corner[None], without=0)[0] > 1.0
+    corner = np.array([3.75, 1.2]) + frames.rotate(frames.from_yaw(0.5), np.array([0.3, 0.2, 0.0]))[:2]
+    away = frames.rotate(frames.from_yaw(0.5), np.array([0.3, 0.4, 0.0]))[:2]
+    assert start_poses.ground_clearance(model, (corner + away)[None])[0] == pytest.approx(0.5, abs=1e-6)
+    assert start_poses.ground_clearance(model, corner[None], without=0)[0] > 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.support import sensor_scenes
-from vinesim.client.composition.randomizer import ROOM, Life, company
+from vinesim.client.composition.randomizer import FOOTPRINT_RADIUS, SceneRandomizer, random_composition
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
 
@@ -15,10 +15,10 @@ def test_everybody_has_room() -> None:
     model = sensor_scenes.demo()
     wood = np.isin(model.fixed_organ, [Organ.POLE, Organ.TRUNK])
     for seed in range(60):
-        stage = company(model, np.array([2.5, 1.2]), np.random.default_rng(seed))
-        discs = [((one.x, one.y), ROOM[one.robot]) for one in stage.robots]
-        discs += [((one.x, one.y), ROOM["person"]) for one in stage.people]
-        discs += [((one.x, one.y), ROOM["crate"]) for one in stage.crates]
+        stage = random_composition(model, np.array([2.5, 1.2]), np.random.default_rng(seed))
+        discs = [((one.x, one.y), FOOTPRINT_RADIUS[one.robot]) for one in stage.robots]
+        discs += [((one.x, one.y), FOOTPRINT_RADIUS["person"]) for one in stage.people]
+        discs += [((one.x, one.y), FOOTPRINT_RADIUS["crate"]) for one in stage.crates]
         for k, (spot, reach) in enumerate(discs):
             assert np.hypot(*(model.fixed_start[wood, :2] - spot).T).min() > reach
             assert all(np.hypot(*np.subtract(spot, other)) > reach + far for other, far in discs[:k])
@@ -27,7 +27,7 @@ def test_everybody_has_room() -> None:
 def test_the_same_numbers_give_the_same_life_and_others_another() -> None:
     model, seen = sensor_scenes.demo(), []
     for seed in (1, 1, 2):
-        happens = Life(1.0).view(model, np.random.default_rng(seed))
+        happens = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
         assert happens is not None
         view, near, told = happens
         seen.append((view.link_q.tobytes(), view.body_q.tobytes(), near.tobytes(), str(told)))
@@ -39,19 +39,19 @@ def test_wind_sways_the_plants() -> None:
     model = sensor_scenes.demo()
     rest, moved = State.at_rest(model).body_q[:, :3], {True: [], False: []}
     for seed in range(8):
-        happens = Life(1.0).view(model, np.random.default_rng(seed))
+        happens = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
         assert happens is not None
         view, _, told = happens
         hanging = np.ones(len(rest), bool)
-        hanging[model.bunch_of() >= 0] = False
+        hanging[model.bunch_of_body() >= 0] = False
         moved["wind" in told].append(np.linalg.norm(view.body_q[:, :3] - rest, axis=1)[hanging].max())
     assert max(moved[False]) < 0.02
     assert max(moved[True]) > 0.02
 
 
 def test_nothing_happens_in_the_other_images() -> None:
-    assert Life(0.0).view(sensor_scenes.demo(), np.random.default_rng(1)) is None
-    lively = [Life(0.3).view(sensor_scenes.empty(), _Fixed(share)) is None for share in (0.31, 0.9)]
+    assert SceneRandomizer(0.0).snapshot(sensor_scenes.demo(), np.random.default_rng(1)) is None
+    lively = [SceneRandomizer(0.3).snapshot(sensor_scenes.empty(), _Fixed(share)) is None for share in (0.31, 0.9)]
     assert lively == [True, True]
 
 

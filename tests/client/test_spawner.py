@@ -13,7 +13,7 @@ from vinesim import frames
 from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
@@ -39,24 +39,24 @@ class Later(concurrent.futures.Executor):
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
-def greeting(description: Description, name: str = "guest", **change) -> Hello:
+def greeting(description: RobotDescription, name: str = "guest", **change) -> Hello:
     usual = {"robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7}
     return Hello(name, **{**usual, **change})
 
 
-def standing(description: Description, x: float) -> RobotUpdate:
+def standing(description: RobotDescription, x: float) -> RobotUpdate:
     position = description.home.copy()
     position[0] += 0.05
     return RobotUpdate("guest", 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), position, np.zeros_like(position))
 
 
-def world(description: Description) -> Physics:
+def world(description: RobotDescription) -> Physics:
     physics = Physics(assemble([cane((5.0, 5.0, 1.0), radius=0.005)]))
-    physics.rigid.add_robot(description.spec("host", 1, frames.pose([0.0, 3.0, 0.0])))
+    physics.rigid.add_robot(description.to_spec("host", 1, frames.pose([0.0, 3.0, 0.0])))
     return physics
 
 
@@ -83,11 +83,11 @@ def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_c
     def run(prepared: bool) -> bytes:
         physics = world(vinebot)
         physics.rigid.command("host", vinebot.home + 0.2)
-        draft = physics.rigid.prepare(vinebot.spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
+        draft = physics.rigid.prepare(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
         for _ in range(20):
             physics.step()
         if draft is None:
-            physics.rigid.add_robot(vinebot.spec("guest", 7, frames.pose([1.0, 0.0, 0.0])))
+            physics.rigid.add_robot(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0])))
         else:
             assert physics.rigid.admit(draft)
         for _ in range(20):
@@ -104,7 +104,7 @@ def test_a_world_that_changed_meanwhile_is_prepared_anew(vinebot):
     update = standing(vinebot, 0.0)
     arrivals.spawn("guest", update)
     later.work()
-    physics.rigid.add_robot(vinebot.spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
+    physics.rigid.add_robot(vinebot.to_spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
     assert arrivals.spawn("guest", update) is None
     assert physics.rigid.robots == ("host", "other")
     assert arrivals.spawn("guest", update) is None

@@ -22,9 +22,9 @@ from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_file import NotARecording, Recording, Tape, read
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def watch(tape: Tape) -> tuple[list[bytes], dict[int, np.ndarray]]:
     """States of all plants of a spectator beside the tree, tick by tick; those of the tree by the tick's number."""
     bus = ReplayBus(tape, "viewer")
     pose = standing_view(1.5, 0.0, np.pi)
-    spectator = Spectator(load("demo"), vineyard(), None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
+    spectator = Spectator(load_scene("demo"), vineyard(), None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
     here = vineyard().bodies_of(0)
     states, tree = [], {}
     while not bus.ended:
@@ -104,7 +104,7 @@ def test_eyes():
     eyes = standing_view(2.0, 3.0, np.pi / 2)
     np.testing.assert_allclose(frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0])), [0.0, 1.0, 0.0], atol=1e-9)
     for yaw in (0.0, 2.5, -1.0):
-        robot = frames.pose([1.0, -2.0, 0.0], frames.yaw(yaw))
+        robot = frames.pose([1.0, -2.0, 0.0], frames.from_yaw(yaw))
         eyes = follow_view(robot)
         ahead = frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0]))
         assert eyes[2] == EYE_HEIGHT
@@ -118,7 +118,7 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
     hub = MemoryHub(delay=0.004)
     clock = hub.bus("server", live=False)
     clock.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e9 + hub.time))
-    scene = load("demo")
+    scene = load_scene("demo")
     model = generate(scene)
     start = spawn_pose(scene, 0)
     picker = Client(

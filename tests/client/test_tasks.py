@@ -7,24 +7,24 @@ import pytest
 
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
-from vinesim.client.tasks.tasks import LookAt, Obey, UnknownJob, plan_job
+from vinesim.client.tasks.tasks import LookAt, RosCommandHandler, UnknownTask, plan_task
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.robot.drives import Robot
-from vinesim.robot.tasks.pick import Pick
-from vinesim.robot.tasks.swap_boxes import Exchange
-from vinesim.robot.tasks.task import Script
+from vinesim.robot.tasks.pick import PickBunch
+from vinesim.robot.tasks.swap_boxes import SwapBoxes
+from vinesim.robot.tasks.task import Task
 from vinesim.ros.commands.types import Command, JointPositions, JointTrajectory
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 
-def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Script]:
-    scene = load("harvest")
+def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Task]:
+    scene = load_scene("harvest")
     model = generate(scene)
-    begin, start = plan_job(job, model, start_poses.spawn_pose(scene, spawn))
+    begin, start = plan_task(job, model, start_poses.spawn_pose(scene, spawn))
     now = iter(range(1_000_000))
     client = Client(
         scene, model, load_robot(robot), MemoryHub().bus("worker"), name="worker", pose=start,
@@ -37,18 +37,18 @@ def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Script]:
 
 def test_a_client_picks():
     client, script = client_with("pick", "vinebot", 0)
-    assert isinstance(script, Pick)
-    while not script.done and script.phase != "tuck":
+    assert isinstance(script, PickBunch)
+    while not script.is_done and script.phase != "tuck":
         client.tick()
     assert not script.reason
-    assert client.physics.rigid.loose == (script.task.bunch,)
+    assert client.physics.rigid.loose == (script.plan.bunch,)
     # the bunch is in its hand, and its trouble is its own: the client goes on
     assert script.report()["phases_s"]["cut"] < 0.1
 
 
 def test_a_client_exchanges():
     client, script = client_with("exchange", "logistic", 1)
-    assert isinstance(script, Exchange)
+    assert isinstance(script, SwapBoxes)
     for _ in range(200):
         client.tick()
     assert not script.reason
@@ -57,9 +57,9 @@ def test_a_client_exchanges():
 
 
 def test_an_unknown_job_is_told():
-    scene = load("harvest")
-    with pytest.raises(UnknownJob, match="no job 'dance'; give pick or exchange"):
-        plan_job("dance", generate(scene), start_poses.spawn_pose(scene, 0))
+    scene = load_scene("harvest")
+    with pytest.raises(UnknownTask, match="no job 'dance'; give pick or exchange"):
+        plan_task("dance", generate(scene), start_poses.spawn_pose(scene, 0))
 
 
 # ---------------------------------------------------------------------- what ROS asks
@@ -75,7 +75,7 @@ class Asked:
     def __init__(self) -> None:
         self.robot = Robot(Rigid(assemble([])), load_robot("vinebot"), "anna")
         self.queue: list[Command] = []
-        self.obey = Obey(self.robot, self._take)
+        self.obey = RosCommandHandler(self.robot, self._take)
         self.time = 0.0
         self.at = self.robot.joint_indices(JOINTS)
 
@@ -134,4 +134,4 @@ def test_what_makes_no_sense_is_counted_and_changes_nothing():
     late = JointTrajectory("arm_left_controller", 0.0, JOINTS, np.array([2.0, 1.0]), np.zeros((2, 2)), None)
     asked.queue = [way(start + 0.2, joints=("arm_left_1_joint", "no_joint")), late, way(start + np.nan)]
     np.testing.assert_allclose(asked.go(0.5), start, atol=1e-4)
-    assert asked.obey.refused == 3
+    assert asked.obey.rejected_count == 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from vinesim.kernels.launch import Crew, bind
+from vinesim.kernels.launch import ThreadPool, bind_launch
 
 
 def ints(*values: int) -> wp.array:
@@ -30,7 +30,7 @@ def test_a_share_takes_its_part_of_the_list(packed: bool, monkeypatch: pytest.Mo
     if not packed:
         monkeypatch.setattr("vinesim.kernels.launch.ctypes", None)
     seen = ints(0, 0, 0, 0, 0)
-    launch = bind(count, [ints(4, 0, 3)], [seen], over="trees", shares=2)
+    launch = bind_launch(count, [ints(4, 0, 3)], [seen], index_list="trees", partitions=2)
     launch(1, 1, 1)
     assert seen.numpy().tolist() == [1, 0, 0, 0, 0]
     launch(1, 2, 1)
@@ -41,7 +41,7 @@ def test_a_share_takes_its_part_of_the_list(packed: bool, monkeypatch: pytest.Mo
 
 
 def test_a_crew_works_at_once_and_all_is_done_when_it_returns() -> None:
-    crew = Crew(3)
+    crew = ThreadPool(3)
     meeting = threading.Barrier(3)
     try:
         for tick in range(200):
@@ -52,26 +52,26 @@ def test_a_crew_works_at_once_and_all_is_done_when_it_returns() -> None:
                     meeting.wait(10.0)  # only if all three are at work at the same time
                 seen[i] = tick + 1
 
-            crew.share([lambda i=i, work=work: work(i) for i in range(3)])
+            crew.run([lambda i=i, work=work: work(i) for i in range(3)])
             assert seen == [tick + 1] * 3
-        crew.share([lambda: None])
+        crew.run([lambda: None])
     finally:
         crew.close()
 
 
 def test_who_brings_the_work_hears_of_its_failure() -> None:
-    crew = Crew(2)
+    crew = ThreadPool(2)
 
     def fail() -> None:
         raise ValueError("this share is rotten")
 
     try:
         with pytest.raises(ValueError, match="rotten"):
-            crew.share([lambda: None, fail])
+            crew.run([lambda: None, fail])
         with pytest.raises(ValueError, match="rotten"):
-            crew.share([fail, lambda: None])
+            crew.run([fail, lambda: None])
         done = []
-        crew.share([lambda: done.append(0), lambda: done.append(1)])
+        crew.run([lambda: done.append(0), lambda: done.append(1)])
         assert sorted(done) == [0, 1]
     finally:
         crew.close()

@@ -15,7 +15,7 @@ from scipy.special import jv
 from tests.support import beam_theory
 from tests.support.beam_theory import Beam
 from vinesim import frames
-from vinesim.scene.builder import Tree, Wood
+from vinesim.scene.builder import RodMaterial, TreeBuilder
 
 
 @pytest.mark.parametrize("alpha", [0.1, 1.0, 5.0, 20.0])
@@ -106,7 +106,7 @@ def test_first_three_frequencies() -> None:
 def test_damping_seen_is_damping_asked() -> None:
     """100 Hz, shipping phi, first mode (joint damping beta K gives zeta = beta w / 2), zeta 0 to 0.2: 0.005.
 
-    Below its floor the solver shows the floor, and ``Plants.damping_floor`` says which it is.
+    Below its floor the solver shows the floor, and ``ArticulationSolver.damping_floor`` says which it is.
     """
     seen, frequency, floor = beam_theory.damping_sweep()
     asked = np.maximum(beam_theory.ZETAS, floor)
@@ -122,14 +122,14 @@ def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
     """A side load on the tip: P/3E1I (L^3 - l^3) + P l^3 / 3E2I, each joint with its own spring."""
     load, half = 0.002, 0.5
     tree = beam_theory.two_woods(stiff_first, density=8.0)  # too light for its weight to matter
-    tree.settle()
+    tree.solve_rest_pose()
     for body in tree.bodies:
         body["damping"] = 0.3 * np.asarray(body["stiffness"])
     plants = beam_theory.standing([tree], phi=1.0, dt=0.02)
     plants.body_load[15] = [0.0, load, 0.0, 0.0, 0.0, load / 16]
     before = plants.state.body_q[15].copy()
     beam_theory.run(plants, 1500)
-    plants.kinematics()
+    plants.forward_kinematics()
     tips = [
         frames.compose(pose.astype(float), frames.pose([1 / 16, 0, 0])) for pose in (before, plants.state.body_q[15])
     ]
@@ -142,11 +142,11 @@ def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
 @pytest.mark.parametrize("pieces", [2, 8])
 def test_a_cane_of_two_thicknesses_twists_as_two(pieces: int) -> None:
     """A small weight beside the tip: W a (l / GJ + l' / G'J'), exactly, since the moment is the same all along."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
-    thick = tree.rod(-1, 0.4, (0.005, 0.005), Wood(5e9, 8.0, 0.3), pieces)
-    thin = tree.rod(thick[-1], 0.6, (0.003, 0.003), Wood(2e9, 8.0, 0.3, shear=1e9), pieces)
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
+    thick = tree.add_rod(-1, 0.4, (0.005, 0.005), RodMaterial(5e9, 8.0, 0.3), pieces)
+    thin = tree.add_rod(thick[-1], 0.6, (0.003, 0.003), RodMaterial(2e9, 8.0, 0.3, shear_modulus=1e9), pieces)
     mass, beside, half = 0.002, 0.05, tree.bodies[thin[-1]]["far"]
-    tree.add(
+    tree.add_body(
         thin[-1], offset=(0.6 / pieces, 0, 0), mass=mass, com=(0, beside, 0), inertia=[mass * 1e-4] * 3, length=1e-3,
         stiffness=half, damping=0.3 * half,
     )  # fmt: skip
@@ -177,6 +177,6 @@ def test_greenhill(share: float, stands: bool) -> None:
     plants = beam_theory.standing([beam.tree()])
     plants.state.joint_qd[0, 1] = 0.02
     beam_theory.run(plants, 6000)
-    plants.kinematics()
+    plants.forward_kinematics()
     lean = np.hypot(*plants.state.body_q[beam.pieces, :2])
     assert lean < 0.02 if stands else lean > 0.2

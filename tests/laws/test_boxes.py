@@ -34,7 +34,7 @@ def robot(
 
 def pile(count: int) -> Physics:
     """Boxes on one another, each turned a little."""
-    at = [frames.pose([0.0, 0.0, 0.3 * i], frames.yaw(0.01 * (-1) ** i)) for i in range(count)]
+    at = [frames.pose([0.0, 0.0, 0.3 * i], frames.from_yaw(0.01 * (-1) ** i)) for i in range(count)]
     return Physics(assemble([cane((0.0, 50.0, 2.0))], box_pose=at, box_size=[SIZE] * count, box_mass=MASSES[:count]))
 
 
@@ -214,7 +214,7 @@ def test_a_cut_cane_takes_what_the_other_loses(other):
     rigid = physics.rigid
     middle = np.array([0.5, 60.0, HIGH])
     if other == "ram":
-        rigid.place("ram0", frames.pose([middle[0], 59.8, HIGH], frames.yaw(0.5 * np.pi)), np.zeros(1))
+        rigid.place("ram0", frames.pose([middle[0], 59.8, HIGH], frames.from_yaw(0.5 * np.pi)), np.zeros(1))
         rigid.data.qvel[rigid._robots["ram0"].v] = 1.0
     elif other == "box":
         joint = rigid.data.joint("box/0")

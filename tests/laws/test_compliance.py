@@ -13,7 +13,7 @@ import pytest
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
@@ -36,12 +36,12 @@ ROTOR = 0.3
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
 @pytest.fixture(scope="module")
-def gate(tmp_path_factory: pytest.TempPathFactory) -> Description:
+def gate(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     """A single hinge about the vertical."""
     folder = tmp_path_factory.mktemp("gate")
     (folder / "gate.urdf").write_text(GATE)
@@ -50,13 +50,13 @@ def gate(tmp_path_factory: pytest.TempPathFactory) -> Description:
         f'[groups.hinge]\njoints = ["hinge_joint"]\nstiffness = [2000.0]\ndamping = [100.0]\nrotor = [{ROTOR}]\n'
         "elastic = [150.0]\nelastic_damping = [3.0]\n"
     )
-    return load(folder / "gate.urdf")
+    return load_description(folder / "gate.urdf")
 
 
 class Stand:
     """A robot, and a clock."""
 
-    def __init__(self, description: Description, **scene: np.ndarray) -> None:
+    def __init__(self, description: RobotDescription, **scene: np.ndarray) -> None:
         self.rigid = Rigid(assemble([], **scene), parameters=PhysicsParameters(dt=DT))
         self.robot = Robot(self.rigid, description, "anna")
         self.time = 0.0
@@ -91,11 +91,11 @@ class Stand:
             for sign in (-1.0, 1.0):
                 moved = position.copy()
                 moved[joint] += sign * step
-                pose = robot.description.frame_poses(moved)[link]
+                pose = robot.description.link_poses(moved)[link]
                 there.append(pose[:3] + frames.rotate(pose[3:], centre))
             columns.append((there[1] - there[0]) / (2.0 * step))
         base = self.rigid.base("anna")[0]
-        return frames.matrix(base[3:])[:3, :3] @ np.array(columns).T
+        return frames.to_matrix(base[3:])[:3, :3] @ np.array(columns).T
 
 
 def weight_beyond(stand: Stand, joint: str) -> float:
@@ -106,7 +106,7 @@ def weight_beyond(stand: Stand, joint: str) -> float:
     for sign in (-1.0, 1.0):
         moved = position.copy()
         moved[i] += sign * 1e-6
-        poses, energy = description.frame_poses(moved), 0.0
+        poses, energy = description.link_poses(moved), 0.0
         for link in ElementTree.fromstring(description.urdf).iterfind("link"):
             if (mass := link.find("inertial/mass")) is not None:
                 origin = link.find("inertial/origin")
@@ -146,7 +146,7 @@ def expected(stiffness: float, damping: float, inertia: float) -> tuple[float, f
 
 @pytest.mark.parametrize("zeta", [0.02, 0.05, 0.1, 0.2, 0.3])
 @pytest.mark.parametrize("stiffness", [15.0, 60.0, 240.0])
-def test_log_decrement_is_that_of_the_damping_asked_for(gate: Description, stiffness: float, zeta: float) -> None:
+def test_log_decrement_is_that_of_the_damping_asked_for(gate: RobotDescription, stiffness: float, zeta: float) -> None:
     """2 %, from 0.5 to 2 Hz: the implicit servo alone would add dt K, at 2 Hz twice what zeta 0.05 asks for."""
     inertia = GATE_INERTIA + ROTOR
     damping = 2.0 * zeta * np.sqrt(stiffness * inertia)
@@ -159,7 +159,7 @@ def test_log_decrement_is_that_of_the_damping_asked_for(gate: Description, stiff
     assert found[1] == pytest.approx(wanted[1], rel=0.02)
 
 
-def test_an_undamped_joint_swings_on(gate: Description) -> None:
+def test_an_undamped_joint_swings_on(gate: RobotDescription) -> None:
     stand = Stand(gate)
     stand.robot.command_impedance([60.0], [0.0])
     stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
@@ -168,7 +168,7 @@ def test_an_undamped_joint_swings_on(gate: Description) -> None:
 
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5, 1e6, 1e8])
-def test_no_stiffness_blows_up(gate: Description, stiffness: float) -> None:
+def test_no_stiffness_blows_up(gate: RobotDescription, stiffness: float) -> None:
     """Whatever the gains, even without any damping, no energy comes from the scheme."""
     stand = Stand(gate)
     stand.robot.command_impedance([stiffness], [0.0])
@@ -183,7 +183,7 @@ def test_no_stiffness_blows_up(gate: Description, stiffness: float) -> None:
 
 
 @pytest.mark.parametrize("stiffness", [40.0, 400.0])
-def test_against_a_pole_it_presses_as_its_stiffness_says(gate: Description, stiffness: float) -> None:
+def test_against_a_pole_it_presses_as_its_stiffness_says(gate: RobotDescription, stiffness: float) -> None:
     """A set-point behind a pole: K times what is missing is the moment of the contact, quietly."""
     pole = {"fixed_start": [[0.9, 0.3, 0.0]], "fixed_end": [[0.9, 0.3, 2.0]], "fixed_radius": [[0.05, 0.05]]}
     stand = Stand(gate, fixed_organ=[int(Organ.POLE)], **pole)
@@ -200,7 +200,7 @@ def test_against_a_pole_it_presses_as_its_stiffness_says(gate: Description, stif
     assert np.ptp(moments) < 1e-3 * abs(moments[-1])
 
 
-def test_a_whole_arm_gives_way_by_f_over_k(vinebot: Description) -> None:
+def test_a_whole_arm_gives_way_by_f_over_k(vinebot: RobotDescription) -> None:
     """All seven joints compliant: K times deflection is J^T F at the place where the arm comes to rest."""
     stand = Stand(vinebot)
     joints = stand.robot.joint_indices(ARM)
@@ -216,10 +216,12 @@ def test_a_whole_arm_gives_way_by_f_over_k(vinebot: Description) -> None:
 
 
 @pytest.mark.parametrize(("joint", "stiffness", "zeta"), [(0, 80.0, 0.08), (3, 30.0, 0.15), (5, 40.0, 0.25)])
-def test_a_joint_of_an_arm_swings_as_asked(vinebot: Description, joint: int, stiffness: float, zeta: float) -> None:
+def test_a_joint_of_an_arm_swings_as_asked(
+    vinebot: RobotDescription, joint: int, stiffness: float, zeta: float
+) -> None:
     """The robot's own hinge friction (URDF) adds to the damping asked for; inertia from the URDF and the rotor."""
     stand, name = Stand(vinebot), ARM[joint]
-    inertia = inertia_about(vinebot, name) + next(d.rotor for d in vinebot.drives if d.joint == name)
+    inertia = inertia_about(vinebot, name) + next(d.armature for d in vinebot.drives if d.joint == name)
     friction = next(
         float(found.find("dynamics").get("damping"))
         for found in ElementTree.fromstring(vinebot.urdf).iterfind("joint")
@@ -236,9 +238,9 @@ def test_a_joint_of_an_arm_swings_as_asked(vinebot: Description, joint: int, sti
     assert found[1] == pytest.approx(wanted[1], rel=0.02)
 
 
-def inertia_about(description: Description, joint: str) -> float:
+def inertia_about(description: RobotDescription, joint: str) -> float:
     """[kg m2] of all that a joint carries at home, about its axis, from the URDF's text."""
-    root, poses = ElementTree.fromstring(description.urdf), description.frame_poses(description.home)
+    root, poses = ElementTree.fromstring(description.urdf), description.link_poses(description.home)
     joints = {found.get("name"): found for found in root.iterfind("joint")}
     carried = {joints[joint].find("child").get("link")}
     while (
@@ -269,9 +271,9 @@ def inertia_about(description: Description, joint: str) -> float:
 # ---------------------------------------------------------------------- F20: a series elastic element per joint
 
 
-def test_a_locked_motor_lets_the_gate_swing_on_its_spring(gate: Description) -> None:
+def test_a_locked_motor_lets_the_gate_swing_on_its_spring(gate: RobotDescription) -> None:
     stand, inertia = Stand(gate), GATE_INERTIA + ROTOR
-    stand.robot.command_elastic([0.0])
+    stand.robot.command_motor_position([0.0])
     stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.2]))
     swing = stand.run(3.0)[:, 0]
     found, wanted = decrement(swing), expected(150.0, 3.0, inertia)
@@ -279,12 +281,12 @@ def test_a_locked_motor_lets_the_gate_swing_on_its_spring(gate: Description) -> 
     assert found[1] == pytest.approx(wanted[1], rel=0.02)
 
 
-def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: Description) -> None:
+def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: RobotDescription) -> None:
     """Locked motors behind their springs: each joint carries its weight and a push, known from the URDF alone."""
     stand = Stand(vinebot)
     joints = stand.robot.joint_indices(ARM)
     motor = vinebot.home[joints]
-    stand.robot.command_elastic(motor, joints)
+    stand.robot.command_motor_position(motor, joints)
     force = np.array([0.0, 10.0, -15.0])
     stand.push("arm_left_7_link", force)
     stand.run(4.0)
@@ -294,16 +296,16 @@ def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: Descri
     assert np.abs(load).max() > 10.0
     np.testing.assert_allclose(elements.torque[joints], load, rtol=0.02, atol=0.02)
     position = stand.rigid.read("anna")[0][joints]
-    springs = np.array([d.elastic or d.stiffness for d in vinebot.drives])[joints]
+    springs = np.array([d.series_stiffness or d.stiffness for d in vinebot.drives])[joints]
     np.testing.assert_allclose(springs * (motor - position), load, rtol=0.02, atol=0.02)
     np.testing.assert_allclose(elements.motor[joints], motor, atol=1e-4)
     np.testing.assert_array_equal(elements.torque, elements.stiffness * elements.deflection)
     assert elements.names == vinebot.joints
 
 
-def test_motor_command_is_followed_by_the_link(gate: Description) -> None:
+def test_motor_command_is_followed_by_the_link(gate: RobotDescription) -> None:
     stand = Stand(gate)
-    stand.robot.command_elastic([0.4])
+    stand.robot.command_motor_position([0.4])
     stand.run(12.0)
     elements = stand.robot.sample(stand.time).elements
     assert stand.rigid.read("anna")[0][0] == pytest.approx(0.4, abs=1e-3)
@@ -318,7 +320,7 @@ def test_motor_command_is_followed_by_the_link(gate: Description) -> None:
 # ---------------------------------------------------------------------- F15, F17: effort and stiffness under a push
 
 
-def test_effort_is_weight_less_j_transposed_f(vinebot: Description) -> None:
+def test_effort_is_weight_less_j_transposed_f(vinebot: RobotDescription) -> None:
     stand = Stand(vinebot)
     force = np.array([-20.0, 30.0, 25.0])
     stand.push("arm_left_7_link", force)
@@ -331,7 +333,7 @@ def test_effort_is_weight_less_j_transposed_f(vinebot: Description) -> None:
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, -1)])
-def test_pose_is_held_against_50_newtons(vinebot: Description, direction: tuple[int, int, int]) -> None:
+def test_pose_is_held_against_50_newtons(vinebot: RobotDescription, direction: tuple[int, int, int]) -> None:
     """F17: no further than the servos' stiffness says, J K^-1 J^T F to first order, and back after it."""
     stand = Stand(vinebot)
     start = stand.run(0.2)[-1]

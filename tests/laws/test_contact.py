@@ -148,13 +148,13 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
         rigid.command("grip", grasp(0.01 * tick)[0])
         rigid.prep()
         touching.wake_near_trees()
-        physics.plants.free()
+        physics.plants.predict()
         start = physics.state.body_q.copy()
         touching.solve()
         free = rigid.velocity_free
         if touching.count:
             pressed += 1
-            response = physics.plants.response(touching.bodies)
+            response = physics.plants.impulse_response(touching.bodies)
             rows = slice(0, len(touching.bodies))
             pushed = np.einsum("uitj,tj->ui", response[rows], touching.wrenches) * physics.dt
             predicted = physics.plants.velocity_free[touching.bodies] + pushed
@@ -233,7 +233,7 @@ def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
     ours.remove_robot("bar")
     for _ in range(1500):
         ours.step()
-    assert np.abs(ours.view().body_q - ours.model.forward(ours.model.joint_settled))[:, :3].max() < 0.01
+    assert np.abs(ours.view().body_q - ours.model.forward_kinematics(ours.model.joint_settled))[:, :3].max() < 0.01
 
 
 def test_a_fast_sweep_agrees_with_hard_contacts_in_quarters_of_a_millisecond():
@@ -299,7 +299,7 @@ def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
     """Force: each finger closes against its servo (4000 N/m) and two contacts in a row of the fingers' compliance."""
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.006, beta=0.02)])
     body = 12
-    home = model.forward(model.joint_settled)
+    home = model.forward_kinematics(model.joint_settled)
     at = home[body, :3] + np.array([0.03, 0.0, 0.0])
     spec = gripper(at)
     ours = Physics(model)

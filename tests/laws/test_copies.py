@@ -9,8 +9,8 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import Description, load
-from vinesim.robot.drives import Embodied, RemoteRobot, Robot
+from vinesim.robot.description.description import RobotDescription, load_description
+from vinesim.robot.drives import RemoteRobot, Robot, RobotInstance
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
 
@@ -29,7 +29,7 @@ BEYOND = 0.08
 def ram(name: str, effort: float) -> RobotSpec:
     """A head of 20 cm that is pushed along x with at most ``effort`` [N]; *right* comes from the other side."""
     left = name == "left"
-    pose = frames.pose([-0.6, 0.0, 1.0]) if left else frames.pose([0.6, 0.0, 1.0], frames.yaw(np.pi))
+    pose = frames.pose([-0.6, 0.0, 1.0]) if left else frames.pose([0.6, 0.0, 1.0], frames.from_yaw(np.pi))
     drives = (Drive("push", STIFFNESS, DAMPING, effort, 1.0, -1.0, 1.0),)
     return RobotSpec(name, 0 if left else 1, RAM, "base_footprint", pose, drives, np.array([-0.05]), (1e5, 1e5))
 
@@ -98,8 +98,8 @@ def test_across_the_network_the_stronger_wins_too(left, right, delay):
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
 @pytest.mark.parametrize("latency", [0, 2, 5, 10, 20])
@@ -128,7 +128,7 @@ def test_a_copy_lags_by_speed_times_latency_and_no_more(vinebot, latency):
     assert base < 0.4 * 0.01 * latency + 5e-3
 
 
-def told(copy: Embodied, position: np.ndarray) -> RobotUpdate:
+def told(copy: RobotInstance, position: np.ndarray) -> RobotUpdate:
     return RobotUpdate(copy.name, 0.0, HERE, np.zeros(6), position, np.zeros(len(position)))
 
 

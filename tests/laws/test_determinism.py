@@ -13,7 +13,7 @@ import numpy as np
 from vinesim.bench import scenes as scenes
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 HERE = pathlib.Path(__file__)
 
@@ -21,7 +21,7 @@ HERE = pathlib.Path(__file__)
 def digest(physics: Physics, h: hashlib._Hash) -> None:
     """Everything that the next tick depends on, and what others are told."""
     state = physics.state
-    for name in state.dims():
+    for name in state.array_fields():
         h.update(np.ascontiguousarray(getattr(state, name)).tobytes())
     h.update(physics.rigid.data.qpos.tobytes() + physics.rigid.data.qvel.tobytes())
     for contact in physics.contacts:
@@ -63,7 +63,7 @@ def a_day() -> tuple[str, dict[str, int]]:
 
 def a_vineyard() -> str:
     """Hash of the demo's vineyard, kicked, for half a second."""
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     h = hashlib.blake2b(model.digest().encode(), digest_size=16)
     physics = Physics(model)
     physics.plants.wake(np.arange(0, len(model.tree_first), 3))

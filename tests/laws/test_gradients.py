@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.plants.rollout import Rollout, Track
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.rollout import Rollout, Trajectory
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 
 
 def forked() -> Model:
     """A cane that forks in space, a bunch on one arm; at the origin, where single precision is finest."""
-    wood = Wood(4e9, 800.0, 0.03)
-    tree = Tree(frames.pose(np.zeros(3)))
-    stem = tree.rod(-1, 0.5, (0.004, 0.0035), wood, 6)
-    arm = tree.rod(stem[-1], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.3, 0.0, 0.6])))
-    tree.rod(stem[2], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.0, 0.7, -0.5])))
-    tree.add(
+    wood = RodMaterial(4e9, 800.0, 0.03)
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    stem = tree.add_rod(-1, 0.5, (0.004, 0.0035), wood, 6)
+    arm = tree.add_rod(stem[-1], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.3, 0.0, 0.6])))
+    tree.add_rod(stem[2], 0.3, (0.003, 0.002), wood, 4, rest=frames.exp(np.array([0.0, 0.7, -0.5])))
+    tree.add_body(
         arm[-1], offset=(0.075, 0.0, 0.0), mass=0.1, com=(0.05, 0.01, 0.0), inertia=(2e-4, 3e-4, 3e-4), length=0.1,
         radius=(0.03, 0.03), stiffness=(0.05, 0.05, 0.05), damping=(0.002, 0.002, 0.002),
     )  # fmt: skip
@@ -34,7 +34,7 @@ def swinging(model: Model) -> np.ndarray:
     return np.random.default_rng(4).normal(size=(len(model.body_mass), 3)) * 0.5 + [0.0, 0.7, 0.7]
 
 
-def squares(track: Track) -> tuple[float, np.ndarray, np.ndarray]:
+def squares(track: Trajectory) -> tuple[float, np.ndarray, np.ndarray]:
     """A loss of poses and velocities of unlike weights, and its derivatives by both."""
     weight_q = np.array([3.0, 1.0, 2.0, 0.3, 0.2, 0.1, 0.0])
     weight_qd = np.array([0.1, 0.2, 0.05, 0.01, 0.0, 0.02])
@@ -58,7 +58,7 @@ def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
     """Within 1e-3 in every parameter: all together, and the springs, dampers and masses of single bodies."""
     model = forked()
     rates = swinging(model)
-    rollout = Rollout(model, ticks, watch=np.array([9, 13, 14]), checkpoint=checkpoint, brisk=1e9)
+    rollout = Rollout(model, ticks, watched=np.array([9, 13, 14]), checkpoint=checkpoint, fast_rate=1e9)
     _, *by = squares(rollout.run(joint_qd=rates))
     gradient = rollout.gradient(*by)
     everybody = np.arange(len(model.body_mass))
@@ -85,12 +85,12 @@ def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
     """phi = 1 while a joint turns fast is the same in the adjoint; a turn of the first pose; a steady wrench."""
     model = forked()
     rates = 3.0 * swinging(model)
-    rollout = Rollout(model, 15, watch=np.array([13, 14]), brisk=1.0)
+    rollout = Rollout(model, 15, watched=np.array([13, 14]), fast_rate=1.0)
     load = np.zeros((len(model.body_mass), 6))
     load[[5, 12]] = [0.1, 0.2, -0.1, 0.01, 0.02, 0.0]
     turn = 0.1 * np.random.default_rng(1).normal(size=(len(model.body_mass), 3))
 
-    def run(*, load: np.ndarray = load, angle: float = 0.0, **more: np.ndarray) -> Track:
+    def run(*, load: np.ndarray = load, angle: float = 0.0, **more: np.ndarray) -> Trajectory:
         joint_q = frames.multiply(frames.exp(angle * turn), model.joint_settled)
         return rollout.run(joint_qd=rates, joint_q=joint_q, load=load, **more)
 
@@ -100,7 +100,7 @@ def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
     assert float((gradient.load * load).sum()) == pytest.approx(
         slope(lambda s: squares(run(load=s * load))[0], 0.2), rel=1e-3
     )
-    assert float((gradient.turn * turn).sum()) == pytest.approx(
+    assert float((gradient.rotation * turn).sum()) == pytest.approx(
         slope(lambda s: squares(run(angle=s - 1.0))[0], 0.2), rel=1e-3
     )
     stiffness = model.joint_stiffness
@@ -111,7 +111,7 @@ def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
 
 def test_damping_below_what_the_scheme_adds_has_no_gradient() -> None:
     model = forked()
-    rollout = Rollout(model, 30, watch=np.array([14]))
+    rollout = Rollout(model, 30, watched=np.array([14]))
     _, *by = squares(rollout.run(damping=0.0005 * model.joint_stiffness, joint_qd=swinging(model)))
     assert not rollout.gradient(*by).damping.any()
 

@@ -30,7 +30,7 @@ def busy(*first: RobotSpec) -> Physics:
     trees = [cane((0.0, 0.0, 2.0), bunch=0.5), *(cane((0.0, 5.0 + i, 2.0), bunch=0.4) for i in range(4))]
     model = assemble(trees, **BOXES)
     physics = Physics(model, picking=False)
-    pose = model.forward(model.joint_settled)[model.bunch_body[0]]
+    pose = model.forward_kinematics(model.joint_settled)[model.bunch_body[0]]
     for spec in first:
         physics.add_robot(spec)
     physics.add_robot(gripper(pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))))

@@ -6,10 +6,10 @@ import numpy as np
 
 from tests.support import beam_theory
 from tests.support.beam_theory import Beam
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 
 CANE_MODULUS = 5.89e9
@@ -53,8 +53,8 @@ def test_a_branch_of_the_published_modal_mass_and_stiffness() -> None:
 
 def test_shoots_of_the_shipped_vineyard_damp_within_the_published_bands() -> None:
     """Energy of kicked shoots of the demo, leaves and bunches on: within the band of bare wood."""
-    model = generate(load("demo"))
-    plants = Plants(model, State.at_rest(model))
+    model = generate(load_scene("demo"))
+    plants = ArticulationSolver(model, State.at_rest(model))
     chosen = np.arange(0, len(model.tree_first), 4)
     plants.wake(chosen)
     tips = [int(np.flatnonzero((model.body_tree == t) & (model.body_organ == Organ.CANE))[-1]) for t in chosen]

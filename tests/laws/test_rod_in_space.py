@@ -11,27 +11,27 @@ from tests.support import beam_theory
 from tests.support.beam_theory import Rod
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
 PIECES = 32
 SECOND_MOMENT = np.pi * 0.004**4 / 4
 
 
-def rod(turn: float, weight: float, beside: float, *, modulus: float = 5e9, shear: float | None = None) -> Tree:
+def rod(turn: float, weight: float, beside: float, *, modulus: float = 5e9, shear: float | None = None) -> TreeBuilder:
     """A level rod of a metre, relaxed along an arc to the left by ``turn`` [rad]; a weight beside its tip [N, m]."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
     share = np.full(PIECES, turn / PIECES)
     share[0] /= 2  # pieces are chords: the first leaves the clamp at half an angle
-    bends = frames.yaw(share)
-    last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(modulus, 8.0, 0.3, shear), PIECES, bends=bends)[-1]
+    bends = frames.from_yaw(share)
+    last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(modulus, 8.0, 0.3, shear), PIECES, bends=bends)[-1]
     mass = max(weight / beam_theory.G, 1e-6)
     half = 2.0 * np.asarray(
         tree.bodies[last]["stiffness"]
     )  # half an element lies between the last joint and the weight
-    tree.add(
-        last, offset=(1 / PIECES, 0, 0), rest=frames.yaw(np.array(turn / PIECES / 2)), mass=mass, com=(0, beside, 0),
+    tree.add_body(
+        last, offset=(1 / PIECES, 0, 0), rest=frames.from_yaw(np.array(turn / PIECES / 2)), mass=mass, com=(0, beside, 0),
         inertia=[mass * 1e-4] * 3, length=1e-3, stiffness=half, damping=0.3 * half,
     )  # fmt: skip
     return tree
@@ -80,7 +80,7 @@ def test_a_bent_cane_twisted_by_an_offset_weight_rests_where_kirchhoffs_rod_does
         travel = place - relaxed
         bound = 0.01 if turn else 0.005
         assert np.linalg.norm(end[:3] - start[:3] - travel) < bound * np.linalg.norm(travel), case
-        turned = frames.log(frames.multiply(q, frames.conjugate(frames.yaw(np.array(turn)))))
+        turned = frames.log(frames.multiply(q, frames.conjugate(frames.from_yaw(np.array(turn)))))
         seen = frames.log(frames.multiply(end[3:], frames.conjugate(start[3:])))
         assert np.linalg.norm(seen - turned) < 0.01 * np.linalg.norm(turned), case
 
@@ -98,17 +98,17 @@ def test_forked_trees_rest_where_mujocos_do() -> None:
     """Crooked, forked, sagging by decimetres: every body within 1e-4 m of MuJoCo's at rest."""
     rng = np.random.default_rng(23)
     model = assemble([forked(rng, beta=0.1, soft=soft) for soft in (0.3, 0.5, 1.0, 3.0)])
-    plants = Plants(model, State.at_rest(model), phi=1.0)
+    plants = ArticulationSolver(model, State.at_rest(model), phi=1.0)
     plants.wake(np.arange(4))
     peer = compile_plants(model)
     data = mujoco.MjData(peer)
     copy_state_to_mujoco(plants.state, data)
-    drawn = model.forward(plants.state.joint_q)[:, :3]
+    drawn = model.forward_kinematics(plants.state.joint_q)[:, :3]
     for _ in range(4000):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
         mujoco.mj_step(peer, data)
-    plants.kinematics()
+    plants.forward_kinematics()
     mujoco.mj_kinematics(peer, data)
     assert plants.tree_rate.max() < 1e-3
     assert np.abs(data.qvel).max() < 1e-3
@@ -116,36 +116,36 @@ def test_forked_trees_rest_where_mujocos_do() -> None:
     np.testing.assert_allclose(plants.state.body_q[:, :3], data.xpos[1:], atol=1e-4)
 
 
-def drift(tree: Tree, kick: np.ndarray, *, phi: float = 0.5, seconds: float = 60.0) -> tuple[np.ndarray, float]:
+def drift(tree: TreeBuilder, kick: np.ndarray, *, phi: float = 0.5, seconds: float = 60.0) -> tuple[np.ndarray, float]:
     """Energy above that at rest [J] every 50 ms of an undamped tree whose joints start with ``kick`` [rad/s], and the
     fastest turning of any body in all that time [rad/s]."""
     rest, plants = (beam_theory.standing([tree], phi=phi) for _ in range(2))
-    rest.free()
+    rest.predict()
     plants.state.joint_qd[:] = kick
     seen, fastest = [], 0.0
     for tick in range(int(seconds / plants.dt)):
-        plants.free()
+        plants.predict()
         if tick % 5 == 0:
             seen.append(energy(plants) - energy(rest))
             fastest = max(fastest, np.linalg.norm(plants.state.body_qd[:, 3:], axis=1).max())
-        plants.commit()
+        plants.integrate()
     return np.array(seen), float(fastest)
 
 
-def drawn_cane(modulus: float = 5e9, shear: float | None = None) -> Tree:
+def drawn_cane(modulus: float = 5e9, shear: float | None = None) -> TreeBuilder:
     """Level and straight when at rest, tapered, undamped."""
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.003), Wood(modulus, 800.0, shear=shear), 16)
-    tree.settle()
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.003), RodMaterial(modulus, 800.0, shear_modulus=shear), 16)
+    tree.solve_rest_pose()
     return tree
 
 
-def loaded_cane(tip: float) -> Tree:
+def loaded_cane(tip: float) -> TreeBuilder:
     """Level and straight when at rest with so much on its tip [kg], undamped."""
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0), 16)
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0), 16)
     tree.bodies[-1]["mass"] += tip
-    tree.settle()
+    tree.solve_rest_pose()
     return tree
 
 
@@ -189,34 +189,34 @@ def test_survives_violence_for_ten_seconds(phi: float, rate: float) -> None:
     light = [forked(rng, beta=0.004, soft=5.0) for _ in range(6)]
     light += [beam_theory.Beam(beta=0.004, taper=taper).tree() for taper in (1.0, 0.5)]
     for tree in light:
-        tree.settle()
+        tree.solve_rest_pose()
     loaded = [beam_theory.Beam(beta=0.004, tip=tip).tree() for tip in (0.05, 0.2, 0.5, 0.05, 0.2, 0.5)]
     plants = beam_theory.standing(light + loaded, phi=phi)
-    plants.kinematics()
+    plants.forward_kinematics()
     home = plants.state.body_q[:, :3].copy()
     plants.state.joint_qd[:] = rate * frames.normalize(rng.normal(size=plants.state.joint_qd.shape))
     for _ in range(1000):
-        plants.free()
-        plants.commit()
-        assert (plants.tree_rate < plants.bound).all()
+        plants.predict()
+        plants.integrate()
+        assert (plants.tree_rate < plants.fault_rate).all()
     assert plants.tree_rate[: len(light)].max() < 0.5
     assert plants.tree_rate.max() < 3.0
-    plants.kinematics()
+    plants.forward_kinematics()
     bare = plants.model.body_tree < len(light)
     assert np.abs(plants.state.body_q[bare, :3] - home[bare]).max() < 0.05
 
 
-def thread(piece: float, stiffness: float, beta: float) -> Tree:
+def thread(piece: float, stiffness: float, beta: float) -> TreeBuilder:
     """Half a kilogram on 16 pieces of 4 cm that weigh next to nothing [kg], each spring [N m/rad] hardly stiffer than
     the 0.2 N m of the load at a piece's length, or much softer."""
-    tree = Tree(frames.pose(np.zeros(3), frames.aligned(np.array([0.0, 0.0, -1.0]))))
+    tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, -1.0]))))
     last = -1
     for i in range(16):
-        last = tree.add(
+        last = tree.add_body(
             last, offset=(0.04 * (i > 0), 0, 0), mass=piece, com=(0.02, 0, 0), length=0.04, radius=(0.001, 0.001),
             inertia=piece * np.array([1e-6, 1.3e-4, 1.3e-4]), stiffness=[stiffness] * 3, damping=[beta * stiffness] * 3,
         )  # fmt: skip
-    tree.add(
+    tree.add_body(
         last, offset=(0.04, 0, 0), mass=0.5, com=(0.05, 0, 0), length=0.1, inertia=[2e-4, 3e-4, 3e-4],
         stiffness=[stiffness] * 3, damping=[beta * stiffness] * 3,
     )  # fmt: skip
@@ -235,16 +235,16 @@ def test_limp_threads_calm_down(beta: float) -> None:
         for _ in range(3)
     ]
     rest, plants = (beam_theory.standing(trees) for _ in range(2))
-    rest.free()
+    rest.predict()
     rng = np.random.default_rng(31)
     plants.state.joint_qd[:] = 20.0 * frames.normalize(rng.normal(size=plants.state.joint_qd.shape))
     rates, seen = np.zeros((2000, len(trees))), np.zeros(2000)
     for tick in range(2000):
-        plants.free()
+        plants.predict()
         seen[tick] = energy(plants) - energy(rest)
-        plants.commit()
+        plants.integrate()
         rates[tick] = plants.tree_rate
-    assert rates.max() < plants.bound
+    assert rates.max() < plants.fault_rate
     assert np.median(rates[-200:], axis=0).max() < 6.0
     assert seen[-500:].mean() < 0.35 * seen[:100].mean()
 
@@ -253,18 +253,18 @@ def test_a_thrown_tree_keeps_phi_1_until_it_has_been_calm_for_a_second() -> None
     """Not so a quiet one, nor one that is touched while it swings below ``brisk``."""
     trees = [beam_theory.Beam(beta=0.004).tree(i) for i in range(3)]
     for tree in trees:
-        tree.settle()
+        tree.solve_rest_pose()
     plants = beam_theory.standing(trees)
     thrown, quiet, touched = (plants.model.bodies_of(i) for i in range(3))
     plants.state.joint_qd[thrown, 2] = 8.0
     plants.state.joint_qd[quiet, 2] = plants.state.joint_qd[touched, 2] = 0.2
     phi, rate = np.zeros((400, 3), np.float32), np.zeros((400, 3))
     for tick in range(400):
-        plants.free()
+        plants.predict()
         push = np.array([[0.0, 0.1, 0.0, 0.0, 0.0, 0.0]]) * (50 <= tick < 60)
-        plants.commit(np.array([touched.start + 12]), push) if push.any() else plants.commit()
+        plants.integrate(np.array([touched.start + 12]), push) if push.any() else plants.integrate()
         phi[tick], rate[tick] = plants.phi_used, plants.tree_rate
-    wild = np.flatnonzero(rate[:, 0] > 0.06 * plants.limit)
+    wild = np.flatnonzero(rate[:, 0] > 0.06 * plants.max_rate)
     assert (phi[: wild[-1] + 101, 0] == 1.0).all()
     assert (phi[wild[-1] + 102 :, 0] == np.float32(0.55)).all()
     assert wild[-1] < 250

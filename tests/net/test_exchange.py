@@ -17,7 +17,7 @@ from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.exchange import Exchange, Inbox, Mismatch
 from vinesim.net.transport.bus import MemoryBus, MemoryHub
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate, TreeUpdate
@@ -31,8 +31,8 @@ TREES = 12
 def vineyard() -> Model:
     trees = []
     for number in range(TREES):
-        tree = Tree(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
-        tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)
+        tree = TreeBuilder(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
+        tree.add_rod(-1, 0.6, (0.006, 0.004), RodMaterial(2e9, 900.0), 6)
         trees.append(tree)
     return assemble(trees)
 
@@ -143,7 +143,7 @@ def test_a_driving_robot_is_seen_where_it_is_now_not_where_it_was():
         t = hub.time + TICK
         bob.robot = dataclasses.replace(
             bob.robot,
-            base_q=frames.pose(np.array([2.0 + t, 0, 0]), frames.yaw(0.5 * t)),
+            base_q=frames.pose(np.array([2.0 + t, 0, 0]), frames.from_yaw(0.5 * t)),
             position=np.array([0.1 + 0.3 * t, -0.2]),
         )
         run(hub, [ada, bob], TICK)

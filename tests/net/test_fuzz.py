@@ -19,9 +19,9 @@ from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
-from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 
 def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
@@ -80,7 +80,7 @@ def _fields(value: object) -> dict:
 
 def test_a_client_with_its_physics_lives_through_a_storm():
     """What passes every check may still be nonsense: trees turned inside out, boxes in the sky. Nothing infinite."""
-    scene = load("demo")
+    scene = load_scene("demo")
     model = generate(scene)
     hub = MemoryHub()
     now = [10.0]

@@ -25,7 +25,7 @@ from vinesim.net.codec.messages import MessageError
 from vinesim.physics.rigid.human_body import standing
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
-HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.yaw(2.0))
+HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))
 
 
 def somebody(seed: int = 0) -> HumanUpdate:
@@ -35,7 +35,7 @@ def somebody(seed: int = 0) -> HumanUpdate:
     points[1:, :3] += rng.uniform(-0.5, 0.5, (6, 3))
     points[1:, 3:] = frames.normalize(rng.normal(size=(6, 4)))
     fingers = tuple(rng.uniform(size=5))
-    pose = dataclasses.replace(pose.at(points), left_closed=True, right_busy=True, right_fingers=fingers)
+    pose = dataclasses.replace(pose.with_points(points), left_closed=True, right_busy=True, right_fingers=fingers)
     return HumanUpdate("eva", 12.5, pose, rng.normal(size=(7, 6)))
 
 
@@ -83,10 +83,10 @@ def test_a_pose_that_cannot_be_does_not_leave(point, wrong):
     points = told.pose.points
     points[point, 1] = wrong
     with pytest.raises(MessageError, match="not finite"):
-        encode_human(dataclasses.replace(told, pose=told.pose.at(points)))
+        encode_human(dataclasses.replace(told, pose=told.pose.with_points(points)))
     points[point] = 0.0
     with pytest.raises(MessageError, match="unit quaternion"):
-        encode_human(dataclasses.replace(told, pose=told.pose.at(points)))
+        encode_human(dataclasses.replace(told, pose=told.pose.with_points(points)))
 
 
 def test_pushes_arrive_as_they_left():

@@ -23,7 +23,7 @@ from vinesim.net.recording import mcap_file
 from vinesim.net.recording.mcap_file import NotARecording, Recording, RecordingStopped, free_path, read
 from vinesim.physics.rigid.human_body import standing
 from vinesim.scene.ids import Kind, thing
-from vinesim.scene.values import POINTS, HumanUpdate
+from vinesim.scene.values import POINT_NAMES, HumanUpdate
 
 
 def write(path: pathlib.Path, entries: list[tuple[int, str, bytes]], **about: str) -> pathlib.Path:
@@ -85,7 +85,7 @@ def test_what_a_message_says():
 
     person = standing(pose, 1.8)
     said = mcap_file.said("a/eva", encode_human(HumanUpdate("eva", 5.0, person, np.zeros((7, 6)))))
-    assert said["points"].keys() == set(POINTS)
+    assert said["points"].keys() == set(POINT_NAMES)
     assert list(said["points"]["head"]["position"].values()) == pytest.approx(person.head[:3], abs=2e-4)
     assert said["pose"] == said["points"]["hips"]
     pushed = encode_push(Push(6.0, {"hand": np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.5])}))

@@ -24,7 +24,7 @@ from vinesim.net.transport.bus import EVERY, NameTaken
 from vinesim.net.transport.certificates import new
 from vinesim.net.transport.endpoints import chosen
 from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate
 
@@ -245,8 +245,8 @@ class Client:
     def __init__(self, bus: ZenohBus, x: float) -> None:
         trees = []
         for number in range(3):
-            tree = Tree(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
-            tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)
+            tree = TreeBuilder(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
+            tree.add_rod(-1, 0.6, (0.006, 0.004), RodMaterial(2e9, 900.0), 6)
             trees.append(tree)
         self.model = assemble(trees)
         self.state = State.at_rest(self.model)

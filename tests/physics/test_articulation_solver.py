@@ -10,10 +10,10 @@ import warp as wp
 
 from tests.support.clustered_trees import clustered, momenta, moving
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ONSET, Plants
-from vinesim.physics.plants.device_buffers import Memory, NoDevice
-from vinesim.physics.plants.fault_guard import Guard
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.articulation_solver import ONSET, ArticulationSolver
+from vinesim.physics.plants.device_buffers import DeviceBuffers, DeviceUnavailable
+from vinesim.physics.plants.fault_guard import FaultGuard
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -21,54 +21,54 @@ from vinesim.scene.state import State
 def canes(count: int) -> Model:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 5)
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), 5)
+        tree.solve_rest_pose()
         trees.append(tree)
     return assemble(trees)
 
 
 @pytest.fixture
-def plants() -> Plants:
+def plants() -> ArticulationSolver:
     model = canes(4)
-    return Plants(model, State.at_rest(model))
+    return ArticulationSolver(model, State.at_rest(model))
 
 
-def step(plants: Plants, ticks: int = 1) -> None:
+def step(plants: ArticulationSolver, ticks: int = 1) -> None:
     for _ in range(ticks):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
 
 
-def test_drawn_shape_stays(plants: Plants) -> None:
+def test_drawn_shape_stays(plants: ArticulationSolver) -> None:
     drawn = plants.state.body_q.copy()
     plants.wake(np.arange(4))
     step(plants, 200)
-    plants.kinematics()
+    plants.forward_kinematics()
     np.testing.assert_allclose(plants.state.body_q, drawn, atol=2e-5)
 
 
-def test_state_is_shared_memory_and_kinematics_follow_it(plants: Plants) -> None:
+def test_state_is_shared_memory_and_kinematics_follow_it(plants: ArticulationSolver) -> None:
     state, rng = plants.state, np.random.default_rng(1)
     state.joint_q[:] = frames.exp(rng.normal(size=(20, 3)))
     state.joint_qd[:] = rng.normal(size=(20, 3))
-    plants.kinematics(np.arange(4))
-    np.testing.assert_allclose(state.body_q, plants.model.forward(state.joint_q), atol=2e-6)
+    plants.forward_kinematics(np.arange(4))
+    np.testing.assert_allclose(state.body_q, plants.model.forward_kinematics(state.joint_q), atol=2e-6)
     ahead = state.joint_q.astype(float)
     h = 1e-5
-    there = plants.model.forward(frames.multiply(frames.exp(h * state.joint_qd.astype(float)), ahead))
-    here = plants.model.forward(ahead)
+    there = plants.model.forward_kinematics(frames.multiply(frames.exp(h * state.joint_qd.astype(float)), ahead))
+    here = plants.model.forward_kinematics(ahead)
     np.testing.assert_allclose(state.body_qd[:, :3], (there - here)[:, :3] / h, atol=1e-3)
     turn = frames.log(frames.multiply(there[:, 3:], frames.conjugate(here[:, 3:]))) / h
     np.testing.assert_allclose(state.body_qd[:, 3:], turn, atol=1e-3)
 
 
-def test_awake_is_sorted_and_sleepers_are_untouched(plants: Plants) -> None:
+def test_awake_is_sorted_and_sleepers_are_untouched(plants: ArticulationSolver) -> None:
     state = plants.state
     plants.wake(np.array([3, 1]))
     assert plants.awake.tolist() == [1, 3]
     plants.wake(0)
-    plants.rest(np.array([1]))
+    plants.put_to_sleep(np.array([1]))
     assert plants.awake.tolist() == [0, 3]
     assert state.tree_awake.tolist() == [True, False, False, True]
     asleep = plants.bodies_of(np.array([1, 2]))
@@ -81,23 +81,23 @@ def test_awake_is_sorted_and_sleepers_are_untouched(plants: Plants) -> None:
     assert np.abs(state.joint_qd[:5]).max() > 1e-3
 
 
-def test_touching_a_sleeper_is_refused(plants: Plants) -> None:
+def test_touching_a_sleeper_is_refused(plants: ArticulationSolver) -> None:
     plants.wake(np.array([0, 2]))
-    plants.free()
+    plants.predict()
     plants.wake(1)  # too late for this tick
-    with pytest.raises(ValueError, match=r"body 7 is touched, but tree 1 slept: wake it before free\(\)"):
-        plants.commit(np.array([2, 7]), np.zeros((2, 6)))
+    with pytest.raises(ValueError, match=r"body 7 is touched, but tree 1 slept: wake it before predict\(\)"):
+        plants.integrate(np.array([2, 7]), np.zeros((2, 6)))
     with pytest.raises(ValueError, match=r"body 15 .* tree 3"):
-        plants.response(np.array([15]))
+        plants.impulse_response(np.array([15]))
 
 
-def test_resting_between_free_and_commit_holds(plants: Plants) -> None:
+def test_resting_between_free_and_commit_holds(plants: ArticulationSolver) -> None:
     plants.wake(np.array([0, 1]))
     plants.state.joint_qd[:, 1] = 1.0
-    plants.free()
-    plants.rest(0)
+    plants.predict()
+    plants.put_to_sleep(0)
     before = plants.state.joint_q[:5].copy()
-    plants.commit()
+    plants.integrate()
     np.testing.assert_array_equal(plants.state.joint_q[:5], before)
     assert not plants.state.joint_qd[:5].any()
 
@@ -109,10 +109,10 @@ def test_wrenches_on_one_body_add_up_and_do_not_linger() -> None:
         ([4], [[1.0, 2.0, 3.0, 0.1, 0.0, 0.0]]),
         ([4, 4], [[1.0, 0.0, 3.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.1, 0.0, 0.0]]),
     ):
-        plants = Plants(model, State.at_rest(model))
+        plants = ArticulationSolver(model, State.at_rest(model))
         plants.wake(0)
-        plants.free()
-        plants.commit(np.array(bodies), np.array(wrenches))
+        plants.predict()
+        plants.integrate(np.array(bodies), np.array(wrenches))
         kicked = plants.state.joint_qd.copy()
         step(plants, 400)
         runs.append((kicked, plants.tree_rate[0]))
@@ -123,25 +123,25 @@ def test_wrenches_on_one_body_add_up_and_do_not_linger() -> None:
 
 def test_steady_load_bends_by_the_beam_formula() -> None:
     """A small sideways force on the tip: deflection F L^3 / 3 EI."""
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.2), 16)
-    tree.settle()
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.2), 16)
+    tree.solve_rest_pose()
     model = assemble([tree])
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(0)
     plants.body_load[15] = [0.0, 0.01, 0.0, 0.0, 0.0, 0.01 / 16]  # at the tip
     step(plants, 1500)
-    plants.kinematics()
+    plants.forward_kinematics()
     tip = frames.compose(plants.state.body_q[15], frames.pose([1 / 16, 0, 0]))
     assert tip[1] == pytest.approx(0.01 / (3 * 5e9 * np.pi * 0.004**4 / 4), rel=0.01)
 
 
-def test_response_of_nothing_and_of_many(plants: Plants) -> None:
+def test_response_of_nothing_and_of_many(plants: ArticulationSolver) -> None:
     plants.wake(np.arange(4))
-    plants.free()
-    assert plants.response(np.zeros(0, np.int32)).shape == (0, 6, 0, 6)
-    one = plants.response(np.array([7]))
-    many = plants.response(np.arange(20))
+    plants.predict()
+    assert plants.impulse_response(np.zeros(0, np.int32)).shape == (0, 6, 0, 6)
+    one = plants.impulse_response(np.array([7]))
+    many = plants.impulse_response(np.arange(20))
     assert many.shape == (20, 6, 20, 6)
     np.testing.assert_array_equal(many[7, :, 7], one[0, :, 0])
     flat = many.reshape(120, 120)
@@ -150,50 +150,50 @@ def test_response_of_nothing_and_of_many(plants: Plants) -> None:
     assert not many[0, :, 5:].any()
 
 
-def test_phi_is_one_after_a_touch_begins_and_when_brisk(plants: Plants) -> None:
+def test_phi_is_one_after_a_touch_begins_and_when_brisk(plants: ArticulationSolver) -> None:
     plants.wake(np.arange(2))
     used = plants.phi_used
     step(plants)
     assert used[:2].tolist() == pytest.approx([0.55, 0.55])
     seen = []
     for _ in range(ONSET + 3):  # a lasting touch begins
-        plants.free()
+        plants.predict()
         seen.append(float(used[0]))
-        plants.commit(np.array([2]), np.array([[0.0, 0.0, 0.01, 0.0, 0.0, 0.0]]))
+        plants.integrate(np.array([2]), np.array([[0.0, 0.0, 0.01, 0.0, 0.0, 0.0]]))
         assert used[1] == pytest.approx(0.55)
     assert seen == pytest.approx([0.55] + [1.0] * ONSET + [0.55] * 2)
     plants.state.joint_qd[6, 0] = 6.0
-    plants.free()
+    plants.predict()
     assert used[1] == 1.0
 
 
-def test_pull_moves_by_blend(plants: Plants) -> None:
+def test_pull_moves_by_blend(plants: ArticulationSolver) -> None:
     rng = np.random.default_rng(2)
     state, bodies = plants.state, plants.model.bodies_of(2)
     start = state.joint_q[bodies].copy()
     goal = frames.exp(rng.normal(size=(5, 3)) * 0.5)
     rates = rng.normal(size=(5, 3))
-    plants.pull(2, -3.0 * goal, rates, 0.25)  # neither sign nor length of a quaternion matters
+    plants.blend_towards(2, -3.0 * goal, rates, 0.25)  # neither sign nor length of a quaternion matters
     np.testing.assert_allclose(state.joint_qd[bodies], rates, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(state.joint_q[bodies], axis=-1), 1.0, atol=1e-6)
     whole = frames.log(frames.multiply(frames.conjugate(start), goal))
     done = frames.log(frames.multiply(frames.conjugate(start), state.joint_q[bodies]))
     np.testing.assert_allclose(done, 0.25 * whole, atol=1e-5)
-    plants.pull(2, goal, rates, 1.0)
+    plants.blend_towards(2, goal, rates, 1.0)
     there = frames.multiply(frames.conjugate(goal), state.joint_q[bodies])
     np.testing.assert_allclose(frames.log(there), 0.0, atol=1e-5)
     with pytest.raises(ValueError, match="tree 2: pulled to a pose that is not finite"):
-        plants.pull(2, np.full((5, 4), np.nan), rates, 0.5)
+        plants.blend_towards(2, np.full((5, 4), np.nan), rates, 0.5)
     with pytest.raises(ValueError, match=r"tree 2: .* it has 5 bodies"):
-        plants.pull(2, goal[:4], rates, 0.5)
+        plants.blend_towards(2, goal[:4], rates, 0.5)
 
 
-def test_a_lighter_body_hangs_less(plants: Plants) -> None:
+def test_a_lighter_body_hangs_less(plants: ArticulationSolver) -> None:
     plants.wake(0)
-    plants.reweigh(4, plants.body_mass[4] / 10)
+    plants.set_mass(4, plants.body_mass[4] / 10)
     before = plants.state.body_q[4, 2]
     step(plants, 300)
-    plants.kinematics()
+    plants.forward_kinematics()
     assert plants.state.body_q[4, 2] > before + 1e-5
     assert plants.model.body_mass[4] > 5 * plants.body_mass[4]  # the model is everyone's, and constant
 
@@ -217,7 +217,7 @@ def test_what_cannot_be_simulated_is_refused_in_words(name: str, value: float, s
     state = State.at_rest(model)
     getattr(model, name)[6] = value
     with pytest.raises(ValueError, match=says):
-        Plants(model, state)
+        ArticulationSolver(model, state)
 
 
 def test_bad_state_and_options_are_refused() -> None:
@@ -225,24 +225,24 @@ def test_bad_state_and_options_are_refused() -> None:
     state = State.at_rest(model)
     state.joint_q[2] = np.nan
     with pytest.raises(ValueError, match=r"State.joint_q\[2, 0\] is not finite"):
-        Plants(model, state)
+        ArticulationSolver(model, state)
     with pytest.raises(ValueError, match=r"phi 0\.4"):
-        Plants(model, State.at_rest(model), phi=0.4)
+        ArticulationSolver(model, State.at_rest(model), phi=0.4)
     with pytest.raises(ValueError, match=r"use State\.at_rest"):
-        Plants(model, State.at_rest(canes(2)))
+        ArticulationSolver(model, State.at_rest(canes(2)))
 
 
 # ---- coarse and fine
 
 
 @pytest.fixture
-def fruit() -> Plants:
+def fruit() -> ArticulationSolver:
     """Three canes with clustered bunches and one plain."""
     model = clustered(3)
-    return Plants(model, State.at_rest(model))
+    return ArticulationSolver(model, State.at_rest(model))
 
 
-def beyond(plants: Plants, joint: int) -> np.ndarray:
+def beyond(plants: ArticulationSolver, joint: int) -> np.ndarray:
     """The moving bodies that a joint carries."""
     bodies = moving(plants, plants.model.body_tree[[joint]])
     up = bodies.copy()
@@ -251,37 +251,37 @@ def beyond(plants: Plants, joint: int) -> np.ndarray:
     return bodies[up == joint]
 
 
-def stir(plants: Plants, rate: float = 2.0) -> None:
+def stir(plants: ArticulationSolver, rate: float = 2.0) -> None:
     """Random rates in every joint that moves."""
     rng, state = np.random.default_rng(3), plants.state
     plants.wake(np.arange(len(plants.model.tree_first)))
     bodies = moving(plants, np.arange(len(plants.model.tree_first)))
     state.joint_q[bodies] = frames.multiply(frames.exp(rng.normal(size=(len(bodies), 3)) * 0.1), state.joint_q[bodies])
     state.joint_qd[bodies] = rng.normal(size=(len(bodies), 3)) * rate
-    plants.kinematics()
+    plants.forward_kinematics()
 
 
-def test_clusters_of_a_coarse_tree_ride(fruit: Plants) -> None:
+def test_clusters_of_a_coarse_tree_ride(fruit: ArticulationSolver) -> None:
     model, state = fruit.model, fruit.state
     stir(fruit)
     still = state.joint_q.copy()
     step(fruit, 20)
-    fruit.kinematics()
+    fruit.forward_kinematics()
     riding = np.setdiff1d(np.arange(len(still)), moving(fruit, np.arange(3)))
     assert len(riding) == 15
     np.testing.assert_array_equal(state.joint_q[riding], still[riding])
-    np.testing.assert_allclose(state.body_q, model.forward(state.joint_q), atol=3e-6)
+    np.testing.assert_allclose(state.body_q, model.forward_kinematics(state.joint_q), atol=3e-6)
     cluster, bunch = model.bunch_cluster[1], model.bunch_body[1]
     offset = state.body_q[cluster, :3] - state.body_q[bunch, :3]
     velocity = state.body_qd[bunch, :3] + np.cross(state.body_qd[bunch, 3:], offset)
     np.testing.assert_allclose(state.body_qd[cluster], [*velocity, *state.body_qd[bunch, 3:]], atol=1e-5)
 
 
-def test_refining_goes_on_with_pose_velocity_and_momentum(fruit: Plants) -> None:
+def test_refining_goes_on_with_pose_velocity_and_momentum(fruit: ArticulationSolver) -> None:
     state, model = fruit.state, fruit.model
     stir(fruit)
     step(fruit, 5)
-    fruit.kinematics()
+    fruit.forward_kinematics()
     pose, speed = state.body_q.copy(), state.body_qd.copy()
     joints = np.arange(*model.bodies_of(1).indices(99))[:-5]
     before = [momenta(fruit, beyond(fruit, j), pose[j, :3].astype(float)) for j in joints]
@@ -298,7 +298,7 @@ def test_refining_goes_on_with_pose_velocity_and_momentum(fruit: Plants) -> None
         assert after[3] == pytest.approx(energy, rel=2e-6)
 
 
-def test_coarsening_keeps_pose_and_momentum_and_never_adds_energy(fruit: Plants) -> None:
+def test_coarsening_keeps_pose_and_momentum_and_never_adds_energy(fruit: ArticulationSolver) -> None:
     """A bunch keeps its angular momentum about its origin; no other tree feels anything."""
     state, model = fruit.state, fruit.model
     fruit.refine(np.arange(3))
@@ -324,12 +324,12 @@ def test_coarsening_keeps_pose_and_momentum_and_never_adds_energy(fruit: Plants)
 def test_energy_never_grows_whatever_the_clusters_do() -> None:
     model = clustered(1)
     for seed in range(20):
-        plants = Plants(model, State.at_rest(model))
+        plants = ArticulationSolver(model, State.at_rest(model))
         rng = np.random.default_rng(seed)
         plants.refine(0)
         plants.state.joint_q[:] = frames.exp(rng.normal(size=(len(model.body_mass), 3)))
         plants.state.joint_qd[-5:] = rng.normal(size=(5, 3)) * 10.0
-        plants.kinematics(0)
+        plants.forward_kinematics(0)
         energy = momenta(plants, moving(plants, np.array([0])), np.zeros(3))[3]
         plants.coarsen(0)
         assert momenta(plants, moving(plants, np.array([0])), np.zeros(3))[3] < energy
@@ -338,13 +338,13 @@ def test_energy_never_grows_whatever_the_clusters_do() -> None:
 def test_fine_and_coarse_hang_the_same() -> None:
     """A fine tree comes to rest, is coarsened, and stays: nothing moves by 0.1 mm, nor does it as its twin."""
     model = clustered(2)
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.refine(0)
     stir(plants, 1.0)
     for _ in range(100):  # stop it at every turning point, or nearly
         step(plants, 12)
         plants.state.joint_qd[:] = 0.0
-    plants.kinematics()
+    plants.forward_kinematics()
     pose = plants.state.body_q[:, :3].copy()
     size = int(model.tree_size[0])
     tips = pose[[7, size + 7]]
@@ -352,7 +352,7 @@ def test_fine_and_coarse_hang_the_same() -> None:
     plants.coarsen(0)
     plants.refine(1)
     step(plants, 300)
-    plants.kinematics()
+    plants.forward_kinematics()
     np.testing.assert_allclose(plants.state.body_q[:, :3][[7, size + 7]], tips, atol=1e-4)
     np.testing.assert_allclose(plants.state.body_q[:size, :3], pose[:size], atol=1e-4)
 
@@ -361,7 +361,7 @@ def test_fine_and_coarse_hang_the_same() -> None:
 def test_a_cut_tree_that_coarsens_keeps_all_momentum(at: int) -> None:
     """The whole tree, or the bunch alone."""
     model = clustered(1)
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.refine(0)
     stir(plants)
     plants.cut(at)
@@ -373,7 +373,9 @@ def test_a_cut_tree_that_coarsens_keeps_all_momentum(at: int) -> None:
     assert after[3] < energy
 
 
-def test_sleepers_refine_in_their_sleep_and_plain_trees_ignore_it(plants: Plants, fruit: Plants) -> None:
+def test_sleepers_refine_in_their_sleep_and_plain_trees_ignore_it(
+    plants: ArticulationSolver, fruit: ArticulationSolver
+) -> None:
     plants.refine(np.arange(4))
     plants.coarsen(2)
     assert not plants.state.tree_fine.any()
@@ -381,31 +383,31 @@ def test_sleepers_refine_in_their_sleep_and_plain_trees_ignore_it(plants: Plants
     assert len(fruit.awake) == 0
     fruit.wake(0)
     step(fruit, 3)
-    fruit.rest(0)
+    fruit.put_to_sleep(0)
     fruit.coarsen(0)
     assert len(fruit.awake) == 0
 
 
-def test_a_touch_on_what_rides_is_refused(fruit: Plants) -> None:
+def test_a_touch_on_what_rides_is_refused(fruit: ArticulationSolver) -> None:
     fruit.wake(0)
-    fruit.free()
+    fruit.predict()
     cluster = int(fruit.model.bunch_cluster[0])
     with pytest.raises(ValueError, match=rf"body {cluster} is touched, but tree 0 is coarse .* or refine the tree"):
-        fruit.commit(np.array([cluster]), np.zeros((1, 6)))
+        fruit.integrate(np.array([cluster]), np.zeros((1, 6)))
     fruit.refine(0)
-    fruit.free()
-    assert fruit.response(np.array([cluster])).any()
+    fruit.predict()
+    assert fruit.impulse_response(np.array([cluster])).any()
 
 
-def test_a_picked_bunch_stays_light_however_it_is_seen(fruit: Plants) -> None:
+def test_a_picked_bunch_stays_light_however_it_is_seen(fruit: ArticulationSolver) -> None:
     body = int(fruit.model.bunch_body[0])
     inertia = fruit.body_inertia[body].copy()
-    fruit.reweigh(body, 0.001)
+    fruit.set_mass(body, 0.001)
     np.testing.assert_allclose(fruit.body_inertia[body], inertia * 0.002, rtol=1e-5)
     fruit.refine(0)
     bodies = [body, *range(fruit.model.bunch_cluster[0], fruit.model.bunch_cluster[0] + 5)]
     assert fruit.body_mass[bodies].sum() == pytest.approx(0.001, rel=1e-5)
-    fruit.reweigh(body, 0.002)
+    fruit.set_mass(body, 0.002)
     fruit.coarsen(0)
     assert fruit.body_mass[body] == pytest.approx(0.002, rel=1e-5)
     np.testing.assert_allclose(fruit.body_inertia[body], inertia * 0.004, rtol=1e-5)
@@ -415,53 +417,53 @@ def test_a_fine_state_is_taken_over() -> None:
     model = clustered(1)
     state = State.at_rest(model)
     state.tree_fine[0] = True
-    plants = Plants(model, state)
+    plants = ArticulationSolver(model, state)
     assert plants.body_mass[model.bunch_body[0]] == pytest.approx(0.05)
     plants.wake(0)
-    plants.free()
-    assert plants.response(model.bunch_cluster[:1]).any()
+    plants.predict()
+    assert plants.impulse_response(model.bunch_cluster[:1]).any()
 
 
 # ---- cutting
 
 
-def test_cutting_leaves_pose_velocity_and_numbers(plants: Plants) -> None:
+def test_cutting_leaves_pose_velocity_and_numbers(plants: ArticulationSolver) -> None:
     stir(plants)
     state = plants.state
-    plants.rest(1)
+    plants.put_to_sleep(1)
     pose, speed = state.body_q.copy(), state.body_qd.copy()
     plants.cut(7)
     assert plants.awake.tolist() == [0, 1, 2, 3]
     assert np.flatnonzero(state.body_cut).tolist() == [7]
-    plants.kinematics()
+    plants.forward_kinematics()
     np.testing.assert_allclose(state.body_q, pose, atol=1e-6)
     np.testing.assert_allclose(state.body_qd, speed, atol=1e-6)
     step(plants, 50)
-    plants.kinematics()
+    plants.forward_kinematics()
     drop = state.body_q[5:10, 2] - pose[5:10, 2]
     assert (drop[2:] < -1.0).all()
     assert np.abs(drop[:2]).max() < 0.01
     assert not plants.joint_wrench(np.array([7])).any()
-    plants.rest(1)
+    plants.put_to_sleep(1)
     assert not state.joint_xd.any()
 
 
 def test_a_stump_moves_as_if_it_had_grown_that_way() -> None:
     """What is left of a cane after a cut is, bit for bit, a cane that never had more."""
     whole, short = canes(1), canes(1)
-    plants = Plants(whole, State.at_rest(whole))
+    plants = ArticulationSolver(whole, State.at_rest(whole))
     plants.wake(0)
     plants.state.joint_qd[:, 1] = 1.0
-    plants.kinematics()
+    plants.forward_kinematics()
     plants.cut(3)
-    short = Model(**{name: getattr(whole, name).copy() for name in Model.dims()})
-    for name, dim in Model.dims().items():
+    short = Model(**{name: getattr(whole, name).copy() for name in Model.array_fields()})
+    for name, dim in Model.array_fields().items():
         if dim.shape[0] == "body":
             setattr(short, name, getattr(whole, name)[:3].copy())
     short.tree_size[:] = short.tree_core[:] = 3
     state = State.at_rest(short)
     state.joint_q[:], state.joint_qd[:] = plants.state.joint_q[:3], plants.state.joint_qd[:3]
-    twin = Plants(short, state)
+    twin = ArticulationSolver(short, state)
     twin.wake(0)
     for _ in range(100):
         step(plants)
@@ -469,7 +471,7 @@ def test_a_stump_moves_as_if_it_had_grown_that_way() -> None:
     np.testing.assert_array_equal(plants.state.joint_q[:3], state.joint_q)
 
 
-def test_cuts_of_cuts_of_roots_and_of_bunches(fruit: Plants) -> None:
+def test_cuts_of_cuts_of_roots_and_of_bunches(fruit: ArticulationSolver) -> None:
     state, model = fruit.state, fruit.model
     fruit.wake(np.arange(3))
     fruit.cut(4)
@@ -480,7 +482,7 @@ def test_cuts_of_cuts_of_roots_and_of_bunches(fruit: Plants) -> None:
     step(fruit, 30)
     fruit.refine(1)
     step(fruit, 30)
-    fruit.kinematics()
+    fruit.forward_kinematics()
     fallen = state.body_q[:, 2] < 1.5
     first = fruit.model.tree_first
     assert not fallen[:2].any()
@@ -489,19 +491,19 @@ def test_cuts_of_cuts_of_roots_and_of_bunches(fruit: Plants) -> None:
     hanging = np.isin(at_one, [bunch, *range(model.bunch_cluster[1], model.bunch_cluster[1] + 5)])
     np.testing.assert_array_equal(fallen[at_one], hanging)
     assert fallen[2 * size :].all()
-    again = Plants(model, state)  # the cuts are in the state
+    again = ArticulationSolver(model, state)  # the cuts are in the state
     np.testing.assert_array_equal(again.joint_stiffness, fruit.joint_stiffness)
     step(fruit)
     before = state.copy()
-    fruit.kinematics()
+    fruit.forward_kinematics()
     pose = state.body_q.copy()
-    for name in State.dims():
+    for name in State.array_fields():
         getattr(state, name)[:] = getattr(before, name)
-    again.kinematics()
+    again.forward_kinematics()
     np.testing.assert_array_equal(state.body_q, pose)
 
 
-def test_what_cannot_be_cut_is_refused_in_words(fruit: Plants) -> None:
+def test_what_cannot_be_cut_is_refused_in_words(fruit: ArticulationSolver) -> None:
     fruit.cut(3)
     with pytest.raises(ValueError, match="body 3 of tree 0 has been cut off already"):
         fruit.cut(3)
@@ -532,17 +534,19 @@ def test_wrong_clusters_are_refused_in_words(change: dict[str, float], says: str
     for name, value in change.items():
         getattr(model, name)[1] = value
     with pytest.raises(ValueError, match=says):
-        Plants(model, state)
+        ArticulationSolver(model, state)
 
 
 def grove(rng: np.random.Generator, count: int = 7) -> Model:
     """Trees of unlike size: the shares of threads and the rows of a device's copies are uneven."""
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        rod = tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), int(rng.integers(2, 9)))
-        tree.rod(rod[1], 0.3, (0.003, 0.002), Wood(5e9, 800.0, 0.01), 3, rest=frames.exp(np.array([0.0, 0.4, 0.9])))
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        rod = tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), int(rng.integers(2, 9)))
+        tree.add_rod(
+            rod[1], 0.3, (0.003, 0.002), RodMaterial(5e9, 800.0, 0.01), 3, rest=frames.exp(np.array([0.0, 0.4, 0.9]))
+        )
+        tree.solve_rest_pose()
         trees.append(tree)
     return assemble(trees)
 
@@ -551,7 +555,7 @@ def eventful(**options: object) -> tuple[list[bytes], np.ndarray]:
     """Trees are pushed, loaded, woken, reweighed, pulled, cut and put to rest: what was told, and a response."""
     rng = np.random.default_rng(5)
     model = grove(rng)
-    plants = Plants(model, State.at_rest(model), **options)
+    plants = ArticulationSolver(model, State.at_rest(model), **options)
     state, first = plants.state, model.tree_first
     plants.wake(np.array([0, 2, 3, 5, 6]))
     state.joint_qd[:] = rng.normal(size=state.joint_qd.shape)
@@ -560,35 +564,35 @@ def eventful(**options: object) -> tuple[list[bytes], np.ndarray]:
     for tick in range(12):
         if tick == 4:
             plants.wake(1)
-            plants.reweigh(int(first[3]) + 1, 0.2)
+            plants.set_mass(int(first[3]) + 1, 0.2)
         if tick == 9:
             plants.cut(int(first[6]) + 1)
         if tick == 7:
-            plants.rest(5)
-            plants.pull(0, model.joint_settled[model.bodies_of(0)], np.zeros((model.tree_size[0], 3)), 0.5)
-        plants.free()
+            plants.put_to_sleep(5)
+            plants.blend_towards(0, model.joint_settled[model.bodies_of(0)], np.zeros((model.tree_size[0], 3)), 0.5)
+        plants.predict()
         told += [x.tobytes() for x in (state.body_q, state.body_qd, plants.velocity_free, plants.phi_used)]
         if 3 <= tick < 6:
             bodies = np.array([first[0] + 1, first[6] + 2])
-            response = plants.response(bodies)
-            plants.commit(bodies, rng.normal(size=(2, 6)))
+            response = plants.impulse_response(bodies)
+            plants.integrate(bodies, rng.normal(size=(2, 6)))
             told += [plants.joint_wrench(bodies).tobytes()]
         else:
-            plants.commit()
+            plants.integrate()
         told += [x.tobytes() for x in (state.joint_q, state.joint_qd, plants.acceleration, plants.tree_rate)]
     plants.upload()
     plants.advance(5)
     plants.download()
-    plants.kinematics()
+    plants.forward_kinematics()
     told += [x.tobytes() for x in (state.joint_q, state.joint_qd, state.joint_x, state.body_q, plants.acceleration)]
     return told, response
 
 
 def test_threads_and_copies_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinesim.physics.plants.articulation_solver.FEW", 0)
-    monkeypatch.setattr("vinesim.physics.plants.articulation_solver.FEW_MOVES", 0)
+    monkeypatch.setattr("vinesim.physics.plants.articulation_solver.MIN_TREES_PER_THREAD", 0)
+    monkeypatch.setattr("vinesim.physics.plants.articulation_solver.MIN_INTEGRATED_TREES_PER_THREAD", 0)
     alone, response = eventful()
-    copies = [{"memory": Memory("cpu", lanes=lanes)} for lanes in (1, 3)]
+    copies = [{"buffers": DeviceBuffers("cpu", interleave=lanes)} for lanes in (1, 3)]
     for options in ({"threads": 2}, {"threads": 3}, *copies):
         told, seen = eventful(**options)
         assert told == alone, options
@@ -599,12 +603,12 @@ def test_advance_is_free_and_commit_many_times() -> None:
     runs = []
     for together in (False, True):
         model = grove(np.random.default_rng(2))
-        plants = Plants(model, State.at_rest(model), threads=2)
+        plants = ArticulationSolver(model, State.at_rest(model), threads=2)
         plants.wake(np.arange(6))
         plants.state.joint_qd[:, 1] = 0.5
         step(plants)
-        plants.free()
-        plants.commit(np.array([3]), np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]))
+        plants.predict()
+        plants.integrate(np.array([3]), np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]))
         if together:
             plants.upload()
             plants.advance(30)
@@ -617,9 +621,9 @@ def test_advance_is_free_and_commit_many_times() -> None:
 
 def test_shares_hold_like_numbers_of_bodies() -> None:
     model = grove(np.random.default_rng(3), 40)
-    plants = Plants(model, State.at_rest(model), threads=3)
+    plants = ArticulationSolver(model, State.at_rest(model), threads=3)
     plants.wake(np.arange(1, 40))
-    plants.free()
+    plants.predict()
     ends, trees = plants._share_ends, np.arange(1, 40)
     assert (ends[0], ends[-1]) == (0, 39)
     shares = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(ends)]
@@ -630,7 +634,7 @@ def test_threads_end_with_their_plants() -> None:
     gc.collect()
     before = set(threading.enumerate())
     model = canes(1)
-    plants = Plants(model, State.at_rest(model), threads=3)
+    plants = ArticulationSolver(model, State.at_rest(model), threads=3)
     crew = set(threading.enumerate()) - before
     assert len(crew) == 2
     del plants
@@ -642,13 +646,13 @@ def test_threads_end_with_their_plants() -> None:
 
 def test_devices_that_are_not_there_are_refused_in_words() -> None:
     model = canes(1)
-    with pytest.raises(NoDevice, match="device 'tpu': give cpu, cuda or cuda:N"):
-        Plants(model, State.at_rest(model), device="tpu")
+    with pytest.raises(DeviceUnavailable, match="device 'tpu': give cpu, cuda or cuda:N"):
+        ArticulationSolver(model, State.at_rest(model), device="tpu")
     with pytest.raises(ValueError, match="0 threads on cpu"):
-        Plants(model, State.at_rest(model), threads=0)
+        ArticulationSolver(model, State.at_rest(model), threads=0)
     if wp.get_cuda_device_count() == 0:
-        with pytest.raises(NoDevice, match=r"'cuda': Warp sees no NVIDIA GPU here .* use cpu") as refused:
-            Plants(model, State.at_rest(model), device="cuda")
+        with pytest.raises(DeviceUnavailable, match=r"'cuda': Warp sees no NVIDIA GPU here .* use cpu") as refused:
+            ArticulationSolver(model, State.at_rest(model), device="cuda")
         assert refused.value.exit_code == 3
 
 
@@ -674,40 +678,40 @@ def test_a_gpu_agrees_with_the_cpu() -> None:
     ],
 )
 def test_wrong_ties_and_drag_are_refused_in_words(change: dict[str, float], says: str) -> None:
-    tree = Tree(frames.pose(np.zeros(3)))
-    tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0), 10)
+    tree = TreeBuilder(frames.pose(np.zeros(3)))
+    tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0), 10)
     model = assemble([tree], tie_body=[3, 4], tie_point=np.zeros((2, 3)), tie_stiffness=[10.0, 10.0])
     state = State.at_rest(model)
     for name, value in change.items():
         getattr(model, name)[1] = value
     with pytest.raises(ValueError, match=says):
-        Plants(model, state)
+        ArticulationSolver(model, state)
 
 
 def test_a_cluster_is_not_tied() -> None:
     model = clustered(1)
     ties = Model.allocate(**(model.counts() | {"tie": 1}))
-    for name in Model.dims():
+    for name in Model.array_fields():
         if not name.startswith("tie_"):
             setattr(ties, name, getattr(model, name))
     ties.tie_body[0] = model.bunch_cluster[0]
     with pytest.raises(ValueError, match="a berry cluster cannot be tied; tie its bunch"):
-        Plants(ties, State.at_rest(ties))
+        ArticulationSolver(ties, State.at_rest(ties))
 
 
-def test_a_bad_pose_of_a_cut_tree_is_stopped(plants: Plants) -> None:
-    guard = Guard(plants)
+def test_a_bad_pose_of_a_cut_tree_is_stopped(plants: ArticulationSolver) -> None:
+    guard = FaultGuard(plants)
     plants.wake(np.arange(4))
     plants.cut(7)
     plants.state.joint_x[7, 1] = np.nan
     step(plants)
-    assert guard.check().tolist() == [1]
-    plants.kinematics(np.arange(4))
+    assert guard.stop_faulty_trees().tolist() == [1]
+    plants.forward_kinematics(np.arange(4))
     assert np.isfinite(plants.state.body_q).all()
     plants.wake(1)
     step(plants, 5)
-    assert len(guard.check()) == 0
+    assert len(guard.stop_faulty_trees()) == 0
     plants.state.joint_xd[7] = [0.0, 0.0, np.inf]
     step(plants)
-    assert guard.check().tolist() == [1]
+    assert guard.stop_faulty_trees().tolist() == [1]
     assert not plants.state.joint_xd[7].any()

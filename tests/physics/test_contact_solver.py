@@ -15,7 +15,7 @@ from vinesim.kernels.contact import solver
 from vinesim.physics.contact.contact_solver import ContactSolver, plant_capsules
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
@@ -274,7 +274,7 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
     physics = Physics(assemble([tree], **box))
     for _ in range(50):
         physics.step()
-    physics.plants.rest(physics.plants.awake)
+    physics.plants.put_to_sleep(physics.plants.awake)
     for _ in range(20):
         physics.step()
     assert len(physics.plants.awake) == 0
@@ -294,7 +294,7 @@ def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     stages = (
         physics.rigid.prep,
         physics.contact_solver.wake_near_trees,
-        physics.plants.free,
+        physics.plants.predict,
         physics.contact_solver.solve,
     )
     for tick in range(250):
@@ -388,7 +388,7 @@ def test_views_own_what_they_show_and_share_it_while_all_sleep():
     kept = second.body_q.copy()
     assert second.moved.tolist() == [0]
     assert (second.body_q != first.body_q).any()
-    np.testing.assert_allclose(second.body_q, model.forward(physics.state.joint_q), atol=1e-5)
+    np.testing.assert_allclose(second.body_q, model.forward_kinematics(physics.state.joint_q), atol=1e-5)
     physics.step()
     physics.view()
     assert (second.body_q == kept).all()
@@ -490,15 +490,15 @@ def test_a_swinging_cane_stops_at_a_pole():
 
 def clustered() -> Model:
     """A cane with a bunch of two clusters at its tip."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, 1.0])))
-    last = tree.rod(-1, 0.4, (0.006, 0.006), Wood(5e9, 800.0, 0.02), 4)[-1]
-    down = frames.aligned(np.array([0.0, 0.0, -1.0]))
-    bunch = tree.add(
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 1.0])))
+    last = tree.add_rod(-1, 0.4, (0.006, 0.006), RodMaterial(5e9, 800.0, 0.02), 4)[-1]
+    down = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
+    bunch = tree.add_body(
         last, offset=(0.1, 0, 0), rest=down, organ=int(Organ.BUNCH), mass=0.3, com=(0.08, 0, 0), length=0.16,
         radius=(0.04, 0.04), inertia=(3e-4, 8e-4, 8e-4), stiffness=np.full(3, 0.3), damping=np.full(3, 0.02),
     )  # fmt: skip
     parts = [
-        tree.add(
+        tree.add_body(
             bunch, offset=(0.02 + 0.07 * i, 0, 0), organ=int(Organ.BUNCH), mass=0.14, com=(0.035, 0, 0), length=0.07,
             radius=(0.03, 0.03), inertia=(1e-4, 1e-4, 1e-4), stiffness=np.full(3, 0.1), damping=np.full(3, 0.01),
         )
@@ -534,7 +534,7 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         stages = (
             physics.rigid.prep,
             physics.contact_solver.wake_near_trees,
-            physics.plants.free,
+            physics.plants.predict,
             physics.contact_solver.solve,
         )
         for _ in range(40):
@@ -608,7 +608,7 @@ def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed)
 def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axis: np.ndarray) -> np.ndarray:
     """Least distance [tree] of the shapes of each tree and a capsule on a robot's link, from many points of both."""
     touching, model = physics.contact_solver, physics.model
-    body_q = model.forward(physics.state.joint_q)[touching.capsules.body]
+    body_q = model.forward_kinematics(physics.state.joint_q)[touching.capsules.body]
     t = np.linspace(0.0, 1.0, 9)[:, None, None]
     along = touching.capsules.start + t * (touching.capsules.end - touching.capsules.start)
     points = body_q[:, :3] + frames.rotate(body_q[:, 3:], along.astype(float))
@@ -662,7 +662,7 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
         for stage in (
             physics.rigid.prep,
             physics.contact_solver.wake_near_trees,
-            physics.plants.free,
+            physics.plants.predict,
             physics.contact_solver.solve,
         ):
             stage()

@@ -9,7 +9,7 @@ import pytest
 from tests.support.contact_scenes import DOWN, bar, bunch_scene, cane, grasp, gripper
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Parting
 
@@ -33,7 +33,7 @@ def test_a_cut_bunch_keeps_its_momentum_and_falls():
     physics.state.joint_qd[4] = 0.0, 0.5, 0.3
     for _ in range(7):
         physics.step()
-    physics.plants.kinematics()
+    physics.plants.forward_kinematics()
     pose, velocity = physics.state.body_q[body].astype(float), physics.state.body_qd[body].astype(float)
     com = frames.rotate(pose[3:], model.body_com[body].astype(float))
     before = 0.5 * (velocity[:3] + np.cross(velocity[3:], com))
@@ -213,15 +213,15 @@ def test_a_bunch_dropped_over_a_crate_ends_in_it():
     assert np.abs(physics.rigid.data.qvel).max() < 0.1
 
 
-def laden(clusters: bool = True, side: bool = True) -> Tree:
+def laden(clusters: bool = True, side: bool = True) -> TreeBuilder:
     """A cane of 1 m with a bunch half way along, and a side shoot behind it that carries another."""
-    tree = Tree(frames.pose(np.array([0.0, 0.0, 1.6])))
-    wood, green = Wood(5e9, 900.0, 0.01), Wood(3e8, 1000.0, 0.05)
-    main = tree.rod(-1, 1.0, (0.006, 0.004), wood, 10)
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 1.6])))
+    wood, green = RodMaterial(5e9, 900.0, 0.01), RodMaterial(3e8, 1000.0, 0.05)
+    main = tree.add_rod(-1, 1.0, (0.006, 0.004), wood, 10)
     for at in (main[4], main[8]) if side else (main[4],):
-        stalk = tree.rod(at, 0.06, (0.0022, 0.0022), green, 2, organ=Organ.PEDUNCLE, rest=DOWN)
-        tree.bunch(stalk[-1], 0.5, count=80, seed=3, clusters=clusters)
-    tree.settle()
+        stalk = tree.add_rod(at, 0.06, (0.0022, 0.0022), green, 2, organ=Organ.PEDUNCLE, rest=DOWN)
+        tree.add_bunch(stalk[-1], 0.5, count=80, seed=3, clusters=clusters)
+    tree.solve_rest_pose()
     return tree
 
 
@@ -231,7 +231,7 @@ def test_a_cut_cane_falls_and_takes_its_bunch_along(fine):
     physics = Physics(model)
     if fine:
         physics.plants.wake(0)
-        physics.watch(model.forward(model.joint_settled)[model.bunch_body, :3], 0.1)
+        physics.watch(model.forward_kinematics(model.joint_settled)[model.bunch_body, :3], 0.1)
     for _ in range(5):
         physics.step()
     assert physics.state.tree_fine[0] == fine
@@ -286,7 +286,7 @@ def test_a_fine_bunch_is_picked_as_the_compound_that_it_is():
     physics = Physics(model)
     parts = np.arange(model.bunch_cluster[0], model.bunch_cluster[0] + model.bunch_clusters[0])
     everything = np.append(parts, model.bunch_body[0])
-    physics.watch(model.forward(model.joint_settled)[model.bunch_body, :3], 0.2)
+    physics.watch(model.forward_kinematics(model.joint_settled)[model.bunch_body, :3], 0.2)
     physics.plants.wake(0)
     physics.step()
     physics.state.joint_qd[parts[0], 1] = 2.0
@@ -320,7 +320,7 @@ def test_a_fine_bunch_cut_in_the_grasp_stays_in_it():
     """As the coarse one: its shapes go along as they are held."""
     tree = laden(side=False)
     model = assemble([tree])
-    pose = model.forward(model.joint_settled)[model.bunch_body[0]]
+    pose = model.forward_kinematics(model.joint_settled)[model.bunch_body[0]]
     middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[0], 0.0, 0.0]))
     physics = Physics(model)
     physics.add_robot(gripper(middle))

@@ -9,44 +9,44 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.plants.fault_guard import Guard
-from vinesim.physics.plants.sleep import Sleep
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.fault_guard import FaultGuard
+from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.scene import spec
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.state import State
 
 
-def row(count: int) -> Plants:
+def row(count: int) -> ArticulationSolver:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 6)
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), 6)
+        tree.solve_rest_pose()
         trees.append(tree)
     model = assemble(trees)
-    return Plants(model, State.at_rest(model))
+    return ArticulationSolver(model, State.at_rest(model))
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e9])
 def test_a_poisoned_tree_is_rolled_back_and_the_others_go_on(poison: float, caplog: pytest.LogCaptureFixture) -> None:
     plants, clean = row(3), row(3)
-    guard = Guard(plants)
+    guard = FaultGuard(plants)
     for each in (plants, clean):
         each.wake(np.arange(3))
         each.state.joint_qd[:, 1] = 0.3
     for tick in range(30):
-        plants.free()
-        clean.free()
-        clean.commit()
+        plants.predict()
+        clean.predict()
+        clean.integrate()
         if tick != 10:
-            plants.commit()
-            assert guard.check().size == 0
+            plants.integrate()
+            assert guard.stop_faulty_trees().size == 0
             continue
         before = plants.state.joint_q.copy()
-        plants.commit(np.array([8]), np.array([[poison, 0.0, 0.0, 0.0, 0.0, 0.0]]))
-        assert guard.check().tolist() == [1]
+        plants.integrate(np.array([8]), np.array([[poison, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+        assert guard.stop_faulty_trees().tolist() == [1]
         assert not caplog.records
     bad, good = plants.model.bodies_of(1), np.delete(np.arange(18), plants.model.bodies_of(1))
     np.testing.assert_array_equal(plants.state.joint_q[bad], before[bad])
@@ -63,18 +63,18 @@ def test_a_poisoned_tree_is_rolled_back_and_the_others_go_on(poison: float, capl
 
 def test_a_stopped_tree_wakes_sound() -> None:
     plants = row(1)
-    guard = Guard(plants)
+    guard = FaultGuard(plants)
     plants.wake(0)
     plants.state.joint_q[3] = np.nan
     plants.body_load[2, 1] = np.inf
-    plants.free()
-    plants.commit()
-    assert guard.check().tolist() == [0]
+    plants.predict()
+    plants.integrate()
+    assert guard.stop_faulty_trees().tolist() == [0]
     plants.wake(0)
     for _ in range(20):
-        plants.free()
-        plants.commit()
-        assert guard.check().size == 0
+        plants.predict()
+        plants.integrate()
+        assert guard.stop_faulty_trees().size == 0
     assert np.isfinite(plants.state.body_q).all()
     assert plants.tree_rate[0] < 0.1
 
@@ -87,8 +87,8 @@ def clean_run(count: int) -> tuple[np.ndarray, ...]:
     plants.state.joint_qd[:, 1] = 0.3
     seen = []
     for _ in range(40):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
         seen.append(plants.state.joint_q.copy())
     return tuple(seen)
 
@@ -107,7 +107,7 @@ def test_no_bad_number_survives_a_tick(tick: int, body: int, entry: int, value_i
     """Written anywhere, at any time: its tree sleeps, finite, reported, wakeable; the others are equal to the bit."""
     value, what = value_in
     plants = row(3)
-    guard = Guard(plants)
+    guard = FaultGuard(plants)
     plants.wake(np.arange(3))
     plants.state.joint_qd[:, 1] = 0.3
     others = np.r_[0:6, 12:18]
@@ -119,9 +119,9 @@ def test_no_bad_number_survives_a_tick(tick: int, body: int, entry: int, value_i
         elif now == tick:
             array = plants.body_load if what == "body_load" else getattr(plants.state, what)
             array[body, entry] = value
-        plants.free()
-        plants.commit(None if wrench is None else np.array([body]), wrench)
-        stopped = guard.check()
+        plants.predict()
+        plants.integrate(None if wrench is None else np.array([body]), wrench)
+        stopped = guard.stop_faulty_trees()
         assert stopped.tolist() == ([1] if now == tick else [])
         everything_is_finite(plants)
         np.testing.assert_array_equal(plants.state.joint_q[others], clean_run(3)[now][others])
@@ -134,8 +134,8 @@ def test_no_bad_number_survives_a_tick(tick: int, body: int, entry: int, value_i
     assert np.isfinite(plants.tree_rate).all()
 
 
-def everything_is_finite(plants: Plants) -> None:
-    plants.kinematics()
+def everything_is_finite(plants: ArticulationSolver) -> None:
+    plants.forward_kinematics()
     state = plants.state
     for array in (state.joint_q, state.joint_qd, state.body_q, state.body_qd, plants.body_load, plants.acceleration):
         assert np.isfinite(array).all()
@@ -143,15 +143,15 @@ def everything_is_finite(plants: Plants) -> None:
 
 def test_a_tree_woken_at_once_after_a_bad_wrench_is_sound() -> None:
     plants = row(1)
-    guard = Guard(plants)
+    guard = FaultGuard(plants)
     plants.wake(0)
-    plants.free()
-    plants.commit(np.array([3]), np.full((1, 6), np.nan))
-    assert guard.check().tolist() == [0]
+    plants.predict()
+    plants.integrate(np.array([3]), np.full((1, 6), np.nan))
+    assert guard.stop_faulty_trees().tolist() == [0]
     plants.wake(0)
-    plants.free()
-    plants.commit()
-    assert guard.check().size == 0
+    plants.predict()
+    plants.integrate()
+    assert guard.stop_faulty_trees().size == 0
 
 
 def test_a_cut_body_without_a_place_is_put_back_where_it_grew() -> None:
@@ -162,26 +162,26 @@ def test_a_cut_body_without_a_place_is_put_back_where_it_grew() -> None:
     state.joint_x[9], state.joint_xd[9] = np.nan, 3.0
     plants.wake(1)
     plants.tree_rate[1] = np.nan
-    assert Guard(plants).check().tolist() == [1]
+    assert FaultGuard(plants).stop_faulty_trees().tolist() == [1]
     np.testing.assert_array_equal(state.joint_x[9], drawn)
     assert not state.joint_xd[9].any()
 
 
-def wild(rng: np.random.Generator) -> Tree:
+def wild(rng: np.random.Generator) -> TreeBuilder:
     """Any tree that the model can say: lengths 1 mm to 3 m, E 1e5 to 1e11 Pa, masses 1 mg to 1 t, damped or not."""
-    tree = Tree(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
+    tree = TreeBuilder(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
     ends = [-1]
     for _ in range(rng.integers(1, 4)):
         length = 10 ** rng.uniform(-3.0, 0.5)
         radius = length * 10 ** rng.uniform(-3.5, -0.5)
         beta = rng.choice([0.0, 10 ** rng.uniform(-4.0, 3.0)])
-        wood = Wood(10 ** rng.uniform(5.0, 11.0), 10 ** rng.uniform(1.0, 4.3), beta)
+        wood = RodMaterial(10 ** rng.uniform(5.0, 11.0), 10 ** rng.uniform(1.0, 4.3), beta)
         turn = frames.exp(rng.normal(size=3))
         tapered = (radius, rng.uniform(0.2, 1.0) * radius)
-        ends += tree.rod(int(rng.choice(ends)), length, tapered, wood, int(rng.integers(1, 9)), rest=turn)
+        ends += tree.add_rod(int(rng.choice(ends)), length, tapered, wood, int(rng.integers(1, 9)), rest=turn)
     if rng.random() < 0.5:
         mass, reach = 10 ** rng.uniform(-6.0, 3.0), 10 ** rng.uniform(-3.0, -0.5)
-        tree.add(
+        tree.add_body(
             int(rng.choice(ends[1:])), offset=(0.01, 0, 0), mass=mass, com=(reach, 0, 0), length=reach,
             inertia=[0.4 * mass * reach**2] * 3, stiffness=[rng.choice([0.0, 10 ** rng.uniform(-4.0, 4.0)])] * 3,
             damping=[rng.choice([0.0, 10 ** rng.uniform(-6.0, 2.0)])] * 3,
@@ -193,15 +193,15 @@ def wild(rng: np.random.Generator) -> Tree:
     return tree
 
 
-def thrown(seed: int, trees: list[Tree], ticks: int, start: int = 0) -> tuple[Plants, Guard]:
+def thrown(seed: int, trees: list[TreeBuilder], ticks: int, start: int = 0) -> tuple[ArticulationSolver, FaultGuard]:
     """Trees in any pose, up to 1e4 rad/s, under loads and pushes up to 1e6 N, half the time; checked every tick.
 
     Each tree draws from its own stream, numbered from ``start``: it meets the same whoever is beside it.
     """
     draws = [np.random.default_rng((seed, start + i)) for i in range(len(trees))]
     model = assemble(trees)
-    plants = Plants(model, State.at_rest(model))
-    guard = Guard(plants)
+    plants = ArticulationSolver(model, State.at_rest(model))
+    guard = FaultGuard(plants)
     spans = [model.bodies_of(i) for i in range(len(trees))]
     sizes = []
     for rng, span in zip(draws, spans, strict=True):
@@ -215,13 +215,13 @@ def thrown(seed: int, trees: list[Tree], ticks: int, start: int = 0) -> tuple[Pl
         loaded = tick < ticks // 2
         for rng, span, size in zip(draws, spans, sizes, strict=True):
             plants.body_load[span] = loaded * size * rng.uniform(-1.0, 1.0, (span.stop - span.start, 6))
-        plants.free()
+        plants.predict()
         bodies = model.tree_first[plants.awake]
         pushes = [loaded * draws[i].uniform(-1e6, 1e6, 6) for i in plants.awake]
-        plants.commit(bodies, np.array(pushes).reshape(-1, 6))
-        guard.check()
+        plants.integrate(bodies, np.array(pushes).reshape(-1, 6))
+        guard.stop_faulty_trees()
         everything_is_finite(plants)
-        assert np.linalg.norm(plants.state.joint_qd, axis=1).max() <= 1.001 * plants.limit or tick == 0
+        assert np.linalg.norm(plants.state.joint_qd, axis=1).max() <= 1.001 * plants.max_rate or tick == 0
     return plants, guard
 
 
@@ -237,9 +237,9 @@ def test_no_tree_and_no_load_breaks_the_world(seed: int) -> None:
     plants.wake(stopped)
     assert plants.state.tree_awake.all()
     for _ in range(100):
-        plants.free()
-        plants.commit()
-        guard.check()
+        plants.predict()
+        plants.integrate()
+        guard.stop_faulty_trees()
     everything_is_finite(plants)
 
 
@@ -257,9 +257,9 @@ def test_neighbours_of_wild_trees_are_equal_to_the_bit() -> None:
 def test_a_vineyard_calms_down_after_any_load() -> None:
     """Every shoot of the demo under loads up to 1e6 N, ten ticks at a time: ten seconds later all hang quietly."""
     rng = np.random.default_rng(1)
-    model = generate(spec.load("demo"))
-    plants = Plants(model, State.at_rest(model))
-    guard, sleep = Guard(plants), Sleep(plants)
+    model = generate(spec.load_scene("demo"))
+    plants = ArticulationSolver(model, State.at_rest(model))
+    guard, sleep = FaultGuard(plants), SleepMonitor(plants)
     everyone = np.arange(len(model.tree_first))
     size = 10 ** rng.uniform(0.0, 6.0, len(everyone))[model.body_tree]
     for tick in range(60):
@@ -267,22 +267,22 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
             chosen = rng.random(len(size)) < 0.1
             plants.body_load[:, :3] = (chosen * size)[:, None] * frames.normalize(rng.normal(size=(len(size), 3)))
         plants.wake(everyone)
-        plants.free()
-        plants.commit()
-        guard.check()
+        plants.predict()
+        plants.integrate()
+        guard.stop_faulty_trees()
     assert guard.count.sum() > 10
     plants.body_load[:] = 0.0
     plants.wake(everyone)
     before = guard.count.sum()
     for _ in range(1000):
-        plants.free()
-        plants.commit()
-        guard.check()
+        plants.predict()
+        plants.integrate()
+        guard.stop_faulty_trees()
         sleep.update()
     assert guard.count.sum() == before
     assert plants.tree_rate.max() < 2.0
-    plants.kinematics()
-    fallen = np.linalg.norm(plants.state.body_q[:, :3] - model.forward(model.joint_settled)[:, :3], axis=1)
+    plants.forward_kinematics()
+    fallen = np.linalg.norm(plants.state.body_q[:, :3] - model.forward_kinematics(model.joint_settled)[:, :3], axis=1)
     assert np.median(fallen) < 0.02
 
 
@@ -291,13 +291,19 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
     [
         ({"length": 0.0}, r"rod of length 0.0 m, .*all must be positive"),
         ({"radius": (0.004, -0.001)}, r"rod of .*radius \(0.004, -0.001\) m.*all must be positive"),
-        ({"wood": Wood(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
-        ({"wood": Wood(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
+        ({"wood": RodMaterial(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
+        ({"wood": RodMaterial(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
         ({"pieces": 0}, r"rod of .* 0 pieces.*all must be positive"),
         ({"parent": 3, "offset": (0, 0, 0)}, r"body 0 names parent 3, which does not stand before it"),
     ],
 )
 def test_wood_that_cannot_be_is_refused_in_words(change: dict, says: str) -> None:
-    given = {"parent": -1, "length": 1.0, "radius": (0.004, 0.004), "wood": Wood(5e9, 800.0), "pieces": 4} | change
+    given = {
+        "parent": -1,
+        "length": 1.0,
+        "radius": (0.004, 0.004),
+        "wood": RodMaterial(5e9, 800.0),
+        "pieces": 4,
+    } | change
     with pytest.raises(ValueError, match=says):
-        Tree(frames.pose(np.zeros(3))).rod(**given)
+        TreeBuilder(frames.pose(np.zeros(3))).add_rod(**given)

@@ -10,14 +10,14 @@ import pytest
 from tests.physics.test_human_body import eva, put
 from tests.support.contact_scenes import bunch_scene, cane, gripper, probe
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import HANDS, HELD, Plants
+from vinesim.physics.plants.articulation_solver import MAX_TIED_BODIES, MAX_TIES_PER_BODY, ArticulationSolver
 from vinesim.physics.rigid.human_body import THICK
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.state import State
-from vinesim.scene.values import POINTS, Drive, HumanPose, HumanSpec
+from vinesim.scene.values import POINT_NAMES, Drive, HumanPose, HumanSpec
 
-FORWARD = frames.multiply(frames.yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
+FORWARD = frames.multiply(frames.from_yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
 """Fingers up, palm along +y."""
 SIGNS = {"left": 1.0, "right": -1.0}
 SOFT = (Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), Drive("press", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0))
@@ -78,7 +78,7 @@ def test_a_body_that_walks_takes_canes_along():
     furthest = 0.0
     for tick in range(60):
         walk = np.array([0.0, 0.014 * tick, 0, 0, 0, 0, 0])
-        moved = {name: getattr(spec.pose, name) + walk for name in POINTS}
+        moved = {name: getattr(spec.pose, name) + walk for name in POINT_NAMES}
         physics.move_human("eva", dataclasses.replace(spec.pose, **moved))
         physics.step()
         furthest = max(furthest, *(-contact.distance for contact in physics.contacts), 0.0)
@@ -97,43 +97,43 @@ def test_a_tie_holds_a_body_beside_its_own_ties():
     tree = cane((0.0, 0.0, 2.0))
     model = assemble([tree], tie_body=[15], tie_point=np.zeros((1, 3)), tie_anchor=np.zeros((1, 3)),
                      tie_stiffness=[500.0], tie_damping=[5.0])  # fmt: skip
-    model.tie_anchor[0] = model.forward(model.joint_settled)[15, :3]
+    model.tie_anchor[0] = model.forward_kinematics(model.joint_settled)[15, :3]
     twin = assemble([tree], tie_body=[15, 15], tie_point=[[0.0, 0, 0], [0.05, 0, 0]], tie_anchor=np.zeros((2, 3)),
                     tie_stiffness=[500.0, 200.0], tie_damping=[5.0, 10.0])  # fmt: skip
-    at = model.forward(model.joint_settled)[15]
+    at = model.forward_kinematics(model.joint_settled)[15]
     twin.tie_anchor[:] = model.tie_anchor[0], at[:3] + frames.rotate(at[3:], np.array([0.05, 0.0, 0.0]))
-    held, drawn = Plants(model, State.at_rest(model)), Plants(twin, State.at_rest(twin))
-    tie = held.hold(15, np.array([0.05, 0.0, 0.0]), 200.0, 10.0)
+    held, drawn = ArticulationSolver(model, State.at_rest(model)), ArticulationSolver(twin, State.at_rest(twin))
+    tie = held.add_tie(15, np.array([0.05, 0.0, 0.0]), 200.0, 10.0)
     np.testing.assert_allclose(held.tie_anchor[tie], twin.tie_anchor[1], atol=1e-6)
     drawn.tie_anchor[1] = held.tie_anchor[tie]
     for plants, k in ((held, tie), (drawn, 1)):
         plants.tie_anchor[k, 1] += 0.1
         plants.wake(0)
         for _ in range(100):
-            plants.free()
-            plants.commit()
+            plants.predict()
+            plants.integrate()
     np.testing.assert_array_equal(held.state.joint_q, drawn.state.joint_q)
     assert np.abs(held.state.joint_q - model.joint_settled).max() > 1e-3
-    held.let_go(15, tie)
+    held.remove_tie(15, tie)
     drawn.tie_stiffness[1] = drawn.tie_damping[1] = 0.0
     for plants in (held, drawn):
         for _ in range(100):
-            plants.free()
-            plants.commit()
+            plants.predict()
+            plants.integrate()
     np.testing.assert_array_equal(held.state.joint_q, drawn.state.joint_q)
 
 
 def test_so_many_can_be_held():
     model = assemble([cane((0.0, y, 2.0)) for y in range(2)])
-    plants = Plants(model, State.at_rest(model))
-    for _ in range(HANDS):
-        plants.hold(0, np.zeros(3), 1.0, 0.0)
-    with pytest.raises(ValueError, match=f"body 0 is held in {HANDS} places already"):
-        plants.hold(0, np.zeros(3), 1.0, 0.0)
-    for body in range(1, HELD):
-        plants.hold(body, np.zeros(3), 1.0, 0.0)
-    with pytest.raises(ValueError, match=f"body {HELD} is one too many"):
-        plants.hold(HELD, np.zeros(3), 1.0, 0.0)
+    plants = ArticulationSolver(model, State.at_rest(model))
+    for _ in range(MAX_TIES_PER_BODY):
+        plants.add_tie(0, np.zeros(3), 1.0, 0.0)
+    with pytest.raises(ValueError, match=f"body 0 is held in {MAX_TIES_PER_BODY} places already"):
+        plants.add_tie(0, np.zeros(3), 1.0, 0.0)
+    for body in range(1, MAX_TIED_BODIES):
+        plants.add_tie(body, np.zeros(3), 1.0, 0.0)
+    with pytest.raises(ValueError, match=f"body {MAX_TIED_BODIES} is one too many"):
+        plants.add_tie(MAX_TIED_BODIES, np.zeros(3), 1.0, 0.0)
 
 
 def test_a_bunch_is_held_and_follows():

@@ -17,7 +17,7 @@ from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import POINTS, Drive, HumanPose, HumanSpec
+from vinesim.scene.values import POINT_NAMES, Drive, HumanPose, HumanSpec
 
 POLE = 3.0 - 0.05
 """The yard's pole stands at x = 3, y = 0 and is 5 cm thick."""
@@ -29,7 +29,7 @@ PALM = frames.exp(np.array([0.0, -0.5 * np.pi, 0.0]))
 
 
 def eva(x: float = 0.0, y: float = 0.0, heading: float = 0.0, name: str = "eva", **settings) -> HumanSpec:
-    pose = standing(frames.pose(np.array([x, y, 0.0]), frames.yaw(heading)))
+    pose = standing(frames.pose(np.array([x, y, 0.0]), frames.from_yaw(heading)))
     return HumanSpec(name, 3, pose, **settings)
 
 
@@ -244,7 +244,7 @@ def test_a_pair_in_contact_keeps_its_momentum():
 
 
 def test_knees_bend_forward_and_limbs_keep_their_lengths():
-    pose = standing(frames.pose(np.zeros(3), frames.yaw(0.7)), 1.8)
+    pose = standing(frames.pose(np.zeros(3), frames.from_yaw(0.7)), 1.8)
     for drop in (0.0, 0.2, 0.5):
         crouched = dataclasses.replace(pose, hips=pose.hips - np.array([0, 0, drop, 0, 0, 0, 0]))
         parts = dict(zip(PARTS, posture(1.8, crouched), strict=True))
@@ -313,7 +313,7 @@ def test_legs_that_walk_push_a_sleeping_box_along(speed):
     assert rigid.data.body_awake[rigid.world.body("box/0").id] == 0
     deep = 0.0
     for x in np.arange(0.0, 1.0, 0.01 * speed):
-        moved = {name: getattr(spec.pose, name) + np.array([x, 0, 0, 0, 0, 0, 0]) for name in POINTS}
+        moved = {name: getattr(spec.pose, name) + np.array([x, 0, 0, 0, 0, 0, 0]) for name in POINT_NAMES}
         rigid.move_human("eva", dataclasses.replace(spec.pose, **moved))
         step(rigid)
         deep = max(deep, deepest(rigid, "box/0"))
@@ -356,11 +356,13 @@ def limbs_of(pose: HumanPose) -> tuple[Rigid, dict[str, np.ndarray]]:
     return rigid, {k.name.partition("/")[2]: q for k, q in zip(rigid.links(), rigid.link_q(), strict=True)}
 
 
-@pytest.mark.parametrize("posture", appearance.postures())
+@pytest.mark.parametrize("posture", appearance.posture_names())
 def test_arms_reach_from_shoulders_to_wrists(posture: str):
     """Bones keep their lengths, elbows join, and both arms of a mirrored pose mirror each other."""
-    look = appearance.person(1.75)
-    pose = appearance.posed(standing(frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(0.7))), posture, 1.75)
+    look = appearance.load_human_model(1.75)
+    pose = appearance.apply_posture(
+        standing(frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(0.7))), posture, 1.75
+    )
     _, at = limbs_of(pose)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         upper, fore, hand = at[f"{side}_upper_arm"], at[f"{side}_forearm"], at[f"{side}_hand"]
@@ -387,7 +389,7 @@ def test_an_arm_that_is_too_short_points_at_its_hand():
 
 def test_fingers_bend_as_they_are_told():
     """Each by itself, towards the palm, and no joint comes apart."""
-    look = appearance.person(1.75)
+    look = appearance.load_human_model(1.75)
     for bent in range(5):
         told = tuple(float(k == bent) for k in range(5))
         pose = dataclasses.replace(standing(frames.pose(np.zeros(3))), left_fingers=told, right_fingers=told)

@@ -9,7 +9,7 @@ from tests.support.contact_scenes import DOWN, bar
 from vinesim import frames
 from vinesim.physics.plants.level_of_detail import LINGER
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.sensors.scene.primitives import Primitives
@@ -19,19 +19,19 @@ def laden(rows: int = 1) -> Model:
     """Level canes of 1 m, 0.6 m apart, each with a bunch of 0.6 kg at three quarters of its length."""
     trees = []
     for row in range(rows):
-        tree = Tree(frames.pose(np.array([0.0, 0.6 * row, 1.8])))
-        cane = tree.rod(-1, 1.0, (0.006, 0.005), Wood(5e9, 900.0, 0.01), 10)
-        stalk = tree.rod(
-            cane[7], 0.07, (0.0022, 0.0022), Wood(3e8, 1000.0, 0.05), 2, organ=Organ.PEDUNCLE, rest=DOWN
+        tree = TreeBuilder(frames.pose(np.array([0.0, 0.6 * row, 1.8])))
+        cane = tree.add_rod(-1, 1.0, (0.006, 0.005), RodMaterial(5e9, 900.0, 0.01), 10)
+        stalk = tree.add_rod(
+            cane[7], 0.07, (0.0022, 0.0022), RodMaterial(3e8, 1000.0, 0.05), 2, organ=Organ.PEDUNCLE, rest=DOWN
         )  # fmt: skip
-        tree.bunch(stalk[-1], 0.6, count=100, seed=4 + row, pull=1e4, bend=1e4)
-        tree.settle()
+        tree.add_bunch(stalk[-1], 0.6, count=100, seed=4 + row, pull=1e4, bend=1e4)
+        tree.solve_rest_pose()
         trees.append(tree)
     return assemble(trees)
 
 
 def middle(model: Model, bunch: int = 0) -> np.ndarray:
-    pose = model.forward(model.joint_settled)[model.bunch_body[bunch]]
+    pose = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch]]
     return pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
 
 
@@ -77,10 +77,10 @@ def test_touched_pushed_released_coarsened_without_a_jump():
     refine, coarsen = physics.plants.refine, physics.plants.coarsen
 
     def seen(change, trees):
-        physics.plants.kinematics(np.array([0]))
+        physics.plants.forward_kinematics(np.array([0]))
         pose, before = physics.state.body_q.copy(), momentum(physics, moving(physics))
         change(trees)
-        physics.plants.kinematics(np.array([0]))
+        physics.plants.forward_kinematics(np.array([0]))
         assert np.array_equal(pose, physics.state.body_q)
         switches.append((physics.tick, change.__name__, momentum(physics, moving(physics)) - before, before))
 
@@ -106,7 +106,7 @@ def test_touched_pushed_released_coarsened_without_a_jump():
     assert bent > 0.05
     assert np.abs(jump).max() < 1e-6
     assert np.linalg.norm(drop) < 1e-6 + 0.02 * np.linalg.norm(before)
-    assert len(detail.fine) == 0
+    assert len(detail.fine_trees) == 0
 
 
 def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
@@ -128,7 +128,7 @@ def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
             fine += int(physics.state.tree_fine[0])
         assert (fine > 100) == closely
         ways.append(np.array(at))
-    moved = np.abs(ways[0] - model.forward(model.joint_settled)[9, :3]).max()
+    moved = np.abs(ways[0] - model.forward_kinematics(model.joint_settled)[9, :3]).max()
     print("tip", np.abs(ways[0] - ways[1]).max(), moved, fine)
     assert moved > 5e-3
     assert np.abs(ways[0] - ways[1]).max() < 1e-3
@@ -139,15 +139,15 @@ def test_looking_closely_refines_what_moves_and_looking_away_coarsens_it():
     physics = Physics(model)
     physics.watch(middle(model, 1)[None], 0.2)
     physics.step()
-    assert len(physics.detail.fine) == 0  # asleep: nothing of it moves
+    assert len(physics.detail.fine_trees) == 0  # asleep: nothing of it moves
     physics.plants.wake(np.arange(3))
     for _ in range(3):
         physics.step()
-    assert physics.detail.fine.tolist() == [1]
+    assert physics.detail.fine_trees.tolist() == [1]
     physics.watch(np.zeros((0, 3)), 0.0)
     for _ in range(LINGER + 40):
         physics.step()
-    assert len(physics.detail.fine) == 0
+    assert len(physics.detail.fine_trees) == 0
 
 
 def test_a_tree_stays_fine_while_somebody_is_there_and_not_once_its_bunch_is_gone():
@@ -200,12 +200,14 @@ def test_twice_the_same_bits():
 def test_trees_without_clusters_are_left_alone(bunches):
     trees = []
     for row in range(2):
-        tree = Tree(frames.pose(np.array([0.0, 0.6 * row, 1.8])))
-        cane = tree.rod(-1, 1.0, (0.006, 0.005), Wood(5e9, 900.0, 0.01), 4)
+        tree = TreeBuilder(frames.pose(np.array([0.0, 0.6 * row, 1.8])))
+        cane = tree.add_rod(-1, 1.0, (0.006, 0.005), RodMaterial(5e9, 900.0, 0.01), 4)
         if row < bunches:
-            stalk = tree.rod(cane[2], 0.05, (0.002, 0.002), Wood(3e8, 1000.0, 0.05), 1, organ=Organ.PEDUNCLE, rest=DOWN)
-            tree.bunch(stalk[-1], 0.4, clusters=False)
-        tree.settle()
+            stalk = tree.add_rod(
+                cane[2], 0.05, (0.002, 0.002), RodMaterial(3e8, 1000.0, 0.05), 1, organ=Organ.PEDUNCLE, rest=DOWN
+            )
+            tree.add_bunch(stalk[-1], 0.4, clusters=False)
+        tree.solve_rest_pose()
         trees.append(tree)
     physics = Physics(assemble(trees))
     physics.plants.wake(np.arange(2))

@@ -58,7 +58,7 @@ HOME = np.array([0.4, -0.9, 0.05])
 
 
 def arm(name: str = "anna", index: int = 0, x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> RobotSpec:
-    pose = frames.pose(np.array([x, y, 0.0]), frames.yaw(heading))
+    pose = frames.pose(np.array([x, y, 0.0]), frames.from_yaw(heading))
     return RobotSpec(name, index, ARM, "base_footprint", pose, DRIVES, HOME)
 
 

@@ -5,9 +5,9 @@ import pytest
 
 from tests.support.clustered_trees import clustered
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.plants.rollout import Rollout, WentWrong
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.rollout import Rollout, RolloutDiverged
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -15,8 +15,8 @@ from vinesim.scene.state import State
 def canes(count: int = 2) -> Model:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.02), 4 + i)
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.02), 4 + i)
         trees.append(tree)
     return assemble(trees)
 
@@ -28,7 +28,7 @@ def test_a_rollout_is_what_plants_do(fine: bool) -> None:
     rng = np.random.default_rng(2)
     rates = rng.normal(size=(len(model.body_mass), 3))
     load = 0.01 * rng.normal(size=(len(model.body_mass), 6))
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(2))
     if fine:
         plants.refine(np.arange(2))
@@ -39,14 +39,14 @@ def test_a_rollout_is_what_plants_do(fine: bool) -> None:
     rollout = Rollout(model, 17, checkpoint=7, fine=fine)
     track = rollout.run(joint_qd=rates, load=load)
     for tick in range(17):
-        plants.free()
-        np.testing.assert_array_equal(track.body_q[tick], plants.state.body_q[rollout.watch])
-        np.testing.assert_array_equal(track.body_qd[tick], plants.state.body_qd[rollout.watch])
+        plants.predict()
+        np.testing.assert_array_equal(track.body_q[tick], plants.state.body_q[rollout.watched])
+        np.testing.assert_array_equal(track.body_qd[tick], plants.state.body_qd[rollout.watched])
         np.testing.assert_array_equal(track.phi[tick], plants.phi_used)
-        plants.commit()
-    plants.kinematics()
-    np.testing.assert_array_equal(track.body_q[-1], plants.state.body_q[rollout.watch])
-    assert len(rollout.watch) == (len(rates) if fine else len(rates) - len(plants._clusters_of(np.arange(2))))
+        plants.integrate()
+    plants.forward_kinematics()
+    np.testing.assert_array_equal(track.body_q[-1], plants.state.body_q[rollout.watched])
+    assert len(rollout.watched) == (len(rates) if fine else len(rates) - len(plants._clusters_of(np.arange(2))))
 
 
 def test_gradients_do_not_depend_on_checkpoints_or_history() -> None:
@@ -54,7 +54,7 @@ def test_gradients_do_not_depend_on_checkpoints_or_history() -> None:
     seed = np.random.default_rng(1).normal(size=(31, 2, 7))
     found = []
     for checkpoint in (30, 11, 1):
-        rollout = Rollout(model, 30, watch=np.array([3, 8]), checkpoint=checkpoint)
+        rollout = Rollout(model, 30, watched=np.array([3, 8]), checkpoint=checkpoint)
         for _ in range(2):
             rollout.run()
             found += [rollout.gradient(seed).stiffness, rollout.gradient(seed).stiffness]
@@ -64,7 +64,7 @@ def test_gradients_do_not_depend_on_checkpoints_or_history() -> None:
 
 
 def test_trees_do_not_hear_of_each_other() -> None:
-    rollout = Rollout(canes(), 20, watch=np.array([3]))
+    rollout = Rollout(canes(), 20, watched=np.array([3]))
     rollout.run()
     gradient = rollout.gradient(by_qd=np.ones((21, 1, 6)))
     assert np.abs(gradient.mass[:4]).min() > 0.0
@@ -89,8 +89,8 @@ def test_bad_input_is_refused_in_words() -> None:
         rollout.gradient(np.zeros((6, 1, 7)))
     rates = np.zeros((9, 3))
     rates[5] = 1e6
-    with pytest.raises(WentWrong, match=r"tree 1 turned at .* rad/s in tick 0"):
+    with pytest.raises(RolloutDiverged, match=r"tree 1 turned at .* rad/s in tick 0"):
         rollout.run(joint_qd=rates)
     fruit = clustered(1)
     with pytest.raises(ValueError, match="berry cluster that rides on its bunch: watch that, or give fine=True"):
-        Rollout(fruit, 5, watch=np.array([len(fruit.body_mass) - 1]))
+        Rollout(fruit, 5, watched=np.array([len(fruit.body_mass) - 1]))

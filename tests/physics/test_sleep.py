@@ -3,32 +3,32 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.plants.sleep import Sleep
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.sleep import SleepMonitor
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
 
-def row(count: int) -> Plants:
+def row(count: int) -> ArticulationSolver:
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 2.0])))
-        tree.rod(-1, 0.5, (0.004, 0.003), Wood(5e9, 800.0, 0.01), 6)
-        tree.settle()
+        tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
+        tree.add_rod(-1, 0.5, (0.004, 0.003), RodMaterial(5e9, 800.0, 0.01), 6)
+        tree.solve_rest_pose()
         trees.append(tree)
     model = assemble(trees)
-    return Plants(model, State.at_rest(model))
+    return ArticulationSolver(model, State.at_rest(model))
 
 
-def tick(plants: Plants, sleep: Sleep, busy: np.ndarray | None = None) -> np.ndarray:
-    plants.free()
-    plants.commit()
+def tick(plants: ArticulationSolver, sleep: SleepMonitor, busy: np.ndarray | None = None) -> np.ndarray:
+    plants.predict()
+    plants.integrate()
     return sleep.update(busy)
 
 
 def test_a_kicked_tree_swings_then_sleeps_and_the_others_never_woke() -> None:
     plants = row(5)
-    sleep = Sleep(plants)
+    sleep = SleepMonitor(plants)
     state = plants.state
     others = np.delete(np.arange(30), plants.model.bodies_of(2))
     before = [getattr(state, name)[others].tobytes() for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
@@ -45,13 +45,13 @@ def test_a_kicked_tree_swings_then_sleeps_and_the_others_never_woke() -> None:
     after = [getattr(state, name)[others].tobytes() for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
     assert before == after
     np.testing.assert_allclose(
-        state.body_q, plants.model.forward(state.joint_q), atol=1e-5
+        state.body_q, plants.model.forward_kinematics(state.joint_q), atol=1e-5
     )  # up to date, not a tick old
 
 
 def test_a_tree_drawn_at_rest_sleeps_after_patience() -> None:
     plants = row(2)
-    sleep = Sleep(plants, patience=7)
+    sleep = SleepMonitor(plants, patience=7)
     sleep.wake(np.array([0, 1]))
     drawn = plants.state.body_q.copy()
     rested = [tick(plants, sleep).tolist() for _ in range(7)]
@@ -61,7 +61,7 @@ def test_a_tree_drawn_at_rest_sleeps_after_patience() -> None:
 
 def test_busy_trees_stay_awake() -> None:
     plants = row(3)
-    sleep = Sleep(plants, patience=5)
+    sleep = SleepMonitor(plants, patience=5)
     sleep.wake(np.array([0, 2]))
     for _ in range(20):
         tick(plants, sleep, busy=np.array([2]))

@@ -10,7 +10,7 @@ from vinesim import frames
 from vinesim.physics.rigid.support_tracking import PATIENCE, Riding
 from vinesim.physics.step import Physics
 from vinesim.robot.drives import Robot
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 
 DECK = frames.pose([0.0, 0.0, 0.253])
 
@@ -142,8 +142,8 @@ def test_a_copy_is_pulled_the_faster_part_at_once_and_a_far_one_put_there():
 def test_a_bunch_that_has_just_come_can_be_called_moving_at_once():
     """Found by the bench of two who fight for one bunch: the first loose bunch of a world without boxes, in the tick
     in which it comes, was looked for in the arrays of before."""
-    tree = Tree(frames.pose(np.array([0.5, 0.0, 1.5])))
-    tree.bunch(tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)[-1], 0.4, clusters=False)
+    tree = TreeBuilder(frames.pose(np.array([0.5, 0.0, 1.5])))
+    tree.add_bunch(tree.add_rod(-1, 0.6, (0.006, 0.004), RodMaterial(2e9, 900.0), 6)[-1], 0.4, clusters=False)
     physics = Physics(assemble([tree]))
     physics.riding.update()
     physics.told_pick(0, frames.pose([0.5, 0.0, 1.0]), np.zeros(6))

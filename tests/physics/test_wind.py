@@ -5,10 +5,10 @@ import pytest
 
 from tests.support.contact_scenes import bar
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import AIR, Plants
+from vinesim.physics.plants.articulation_solver import AIR_DENSITY, ArticulationSolver
 from vinesim.physics.plants.wind import ROUND, Wind
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -17,18 +17,22 @@ def leafy(count: int, area: float = 0.004, **wood: float) -> Model:
     """Upright canes of half a metre, side by side a metre apart, each body with a leaf or two."""
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, i, 0.0]), frames.aligned(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
-        tree.rod(-1, 0.5, (0.003, 0.003), Wood(**{"modulus": 3e9, "density": 800.0, "damping": 0.02} | wood), 8)
+        tree = TreeBuilder(
+            frames.pose(np.array([0.0, i, 0.0]), frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.eye(3)[0]))
+        )
+        tree.add_rod(
+            -1, 0.5, (0.003, 0.003), RodMaterial(**{"modulus": 3e9, "density": 800.0, "damping": 0.02} | wood), 8
+        )
         trees.append(tree)
     model = assemble(trees)
     model.body_drag[:] = area
     return model
 
 
-def step(plants: Plants, ticks: int) -> None:
+def step(plants: ArticulationSolver, ticks: int) -> None:
     for _ in range(ticks):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
 
 
 # ---- the field
@@ -37,33 +41,35 @@ def step(plants: Plants, ticks: int) -> None:
 def test_wind_is_a_pure_function() -> None:
     points = np.random.default_rng(0).normal(size=(5, 7, 3)) * 10.0
     first, again = (Wind([3.0, 1.0, 0.0], gusts=1.0, seed=4) for _ in range(2))
-    once = first.at(points, 12.5)
-    first.at(points, 3.0)
-    np.testing.assert_array_equal(first.at(points, 12.5), once)
-    np.testing.assert_array_equal(again.at(points, 12.5), once)
-    assert np.abs(Wind([3.0, 1.0, 0.0], gusts=1.0, seed=5).at(points, 12.5) - once).max() > 0.1
+    once = first.velocity_at(points, 12.5)
+    first.velocity_at(points, 3.0)
+    np.testing.assert_array_equal(first.velocity_at(points, 12.5), once)
+    np.testing.assert_array_equal(again.velocity_at(points, 12.5), once)
+    assert np.abs(Wind([3.0, 1.0, 0.0], gusts=1.0, seed=5).velocity_at(points, 12.5) - once).max() > 0.1
     np.testing.assert_array_equal(
-        Wind([3.0, 1.0, 0.0]).at(points, 12.5), np.broadcast_to([3.0, 1.0, 0.0], points.shape)
+        Wind([3.0, 1.0, 0.0]).velocity_at(points, 12.5), np.broadcast_to([3.0, 1.0, 0.0], points.shape)
     )
 
 
 def test_gusts_travel_with_the_mean() -> None:
     wind = Wind([3.0, 1.0, 0.0], gusts=1.0)
     here = np.array([2.0, -1.0, 1.5])
-    np.testing.assert_allclose(wind.at(here + 7.0 * wind.mean, 7.0), wind.at(here, 0.0), atol=1e-9)
+    np.testing.assert_allclose(wind.velocity_at(here + 7.0 * wind.mean, 7.0), wind.velocity_at(here, 0.0), atol=1e-9)
 
 
 def test_gusts_are_as_strong_and_as_large_as_asked_and_without_divergence() -> None:
     """Over many places: the mean, the standard deviation of each component; and over many seeds the correlation."""
     points = np.random.default_rng(1).uniform(-300, 300, (20000, 3))
     wind = Wind([3.0, 0.0, 0.0], gusts=0.8, scale=2.0, seed=3)
-    gust = wind.at(points, 0.0) - wind.mean
+    gust = wind.velocity_at(points, 0.0) - wind.mean
     np.testing.assert_allclose(gust.mean(0), 0.0, atol=0.03)
     near, far = [], []
     power = np.zeros(3)
     for seed in range(40):
         wind = Wind([3.0, 0.0, 0.0], gusts=0.8, scale=2.0, seed=seed)
-        a, b, c = (wind.at(points[:500] + shift, 0.0) - wind.mean for shift in ([0, 0, 0], [0.2, 0, 0], [20.0, 0, 0]))
+        a, b, c = (
+            wind.velocity_at(points[:500] + shift, 0.0) - wind.mean for shift in ([0, 0, 0], [0.2, 0, 0], [20.0, 0, 0])
+        )
         power += (a * a).mean(0) / 40
         near.append((a * b).sum(1).mean() / 1.92)
         far.append((a * c).sum(1).mean() / 1.92)
@@ -72,7 +78,8 @@ def test_gusts_are_as_strong_and_as_large_as_asked_and_without_divergence() -> N
     assert abs(np.mean(far)) < 0.1
     h = 1e-4
     divergence = sum(
-        (wind.at(points + h * e, 0.0) - wind.at(points - h * e, 0.0))[:, i] for i, e in enumerate(np.eye(3))
+        (wind.velocity_at(points + h * e, 0.0) - wind.velocity_at(points - h * e, 0.0))[:, i]
+        for i, e in enumerate(np.eye(3))
     )
     np.testing.assert_allclose(divergence / (2 * h), 0.0, atol=2e-5)
 
@@ -98,7 +105,7 @@ def test_without_drag_wind_changes_no_bit() -> None:
     runs = []
     for air in (0.0, 20.0):
         model = leafy(1, area=0.0)
-        plants = Plants(model, State.at_rest(model))
+        plants = ArticulationSolver(model, State.at_rest(model))
         plants.wake(0)
         plants.state.joint_qd[:] = 1.0
         plants.tree_air[:] = air
@@ -110,7 +117,7 @@ def test_without_drag_wind_changes_no_bit() -> None:
 def test_a_cane_leans_as_statics_say() -> None:
     """Uniform wind on an upright cane, its weight in balance: w(L) = q L^4 / 8 EI, from the model's own springs."""
     model = leafy(1, area=1e-4)
-    plants = Plants(model, State.at_rest(model), phi=1.0)
+    plants = ArticulationSolver(model, State.at_rest(model), phi=1.0)
     plants.wake(0)
     plants.tree_air[0] = [0.0, 3.0, 0.0]
     plants.body_load[:, 2] = 9.81 * model.body_mass  # hold the weight, so that only the wind bends
@@ -118,8 +125,8 @@ def test_a_cane_leans_as_statics_say() -> None:
         arm = frames.rotate(frame[3:].astype(float), model.body_com[body].astype(float))
         plants.body_load[body, 3:] = np.cross(arm, plants.body_load[body, :3])
     step(plants, 1500)
-    plants.kinematics()
-    q = 0.5 * AIR * 1e-4 * 9.0 / (0.5 / 8)
+    plants.forward_kinematics()
+    q = 0.5 * AIR_DENSITY * 1e-4 * 9.0 / (0.5 / 8)
     tip = frames.compose(plants.state.body_q[7], frames.pose([0.5 / 8, 0, 0]))
     assert tip[1] == pytest.approx(q * 0.5**4 / 8 / (3e9 * np.pi / 4 * 0.003**4), rel=0.02)
     root = plants.joint_wrench(np.array([0]))[0]
@@ -129,11 +136,11 @@ def test_a_cane_leans_as_statics_say() -> None:
 def test_a_falling_cane_reaches_its_terminal_velocity() -> None:
     """m g = rho Cd A v^2 / 2, straight down, momentum lost to the air only."""
     model = leafy(1, area=0.002)
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.cut(0)
     step(plants, 500)
     mass, area = model.body_mass.sum(), model.body_drag.sum()
-    fast = np.sqrt(2.0 * mass * 9.81 / AIR / area)
+    fast = np.sqrt(2.0 * mass * 9.81 / AIR_DENSITY / area)
     np.testing.assert_allclose(plants.state.joint_xd[0], [0.0, 0.0, -fast], atol=2e-3 * fast)
     plants.tree_air[0] = [2.0, 0.0, 0.0]
     step(plants, 1500)
@@ -144,7 +151,7 @@ def test_a_falling_cane_reaches_its_terminal_velocity() -> None:
 def test_a_storm_blows_nothing_up(area: float) -> None:
     """40 m/s and gusts, a thousand times the weight: canes stream, no faster than the air throws them."""
     model = leafy(3, area=area, damping=0.004)
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(3))
     wind = Wind([32.0, 24.0, 0.0], gusts=16.0, seed=2)
     for tick in range(1000):
@@ -156,7 +163,7 @@ def test_a_storm_blows_nothing_up(area: float) -> None:
     step(plants, 1000)
     if area == 0.004:
         assert plants.tree_rate.max() < 0.01
-    plants.kinematics()
+    plants.forward_kinematics()
     lean = plants.state.body_q[7::8, :3] - model.tree_pose[:, :3]
     assert (lean @ [0.8, 0.6, 0.0] > 0.38).all()
 
@@ -167,7 +174,7 @@ def test_a_storm_blows_nothing_up(area: float) -> None:
 def test_wind_wakes_whom_it_moves_and_only_them() -> None:
     model = leafy(100)
     model.body_drag[model.bodies_of(7)] = 0.0
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     breeze = Wind([0.05, 0.0, 0.0])
     for tick in range(ROUND):
         breeze.update(plants, 0.01 * tick)
@@ -177,12 +184,12 @@ def test_wind_wakes_whom_it_moves_and_only_them() -> None:
         wind.update(plants, 0.01 * tick)
     assert plants.awake.tolist() == [t for t in range(100) if t != 7]
     wind.update(plants, 1.0)
-    np.testing.assert_allclose(plants.tree_air[50], wind.at(np.array([0.0, 50.0, 0.0]), 1.0), rtol=1e-5)
+    np.testing.assert_allclose(plants.tree_air[50], wind.velocity_at(np.array([0.0, 50.0, 0.0]), 1.0), rtol=1e-5)
 
 
 def test_out_of_reach_the_air_stands_still() -> None:
     model = leafy(100)
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(90)
     plants.tree_air[90] = [1.0, 0.0, 0.0]
     wind = Wind([4.0, 0.0, 0.0], gusts=1.0)
@@ -194,12 +201,12 @@ def test_out_of_reach_the_air_stands_still() -> None:
 
 def test_a_tree_asleep_in_steady_wind_stays_asleep() -> None:
     model = leafy(1)
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     wind = Wind([2.0, 0.0, 0.0])
     for tick in range(ROUND):
         wind.update(plants, 0.01 * tick)
     assert plants.awake.tolist() == [0]
-    plants.rest(0)
+    plants.put_to_sleep(0)
     for tick in range(ROUND):
         wind.update(plants, 0.01 * tick)
     assert len(plants.awake) == 0
@@ -213,7 +220,7 @@ def test_a_tick_blows_on_what_is_near_a_robot() -> None:
     for _ in range(200):
         physics.step()
     model = physics.model
-    grown = model.forward(model.joint_settled)
+    grown = model.forward_kinematics(model.joint_settled)
     first, last = model.bodies_of(0), model.bodies_of(9)
     assert 0 in physics.plants.awake
     assert 9 not in physics.plants.awake

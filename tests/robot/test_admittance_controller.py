@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.control.admittance_controller import Admittance
-from vinesim.robot.description.description import load
+from vinesim.robot.control.admittance_controller import AdmittanceController
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.scene.builder import assemble
 
@@ -17,9 +17,9 @@ class Pushed:
 
     def __init__(self, *, heeding: bool, **gains: float) -> None:
         self.rigid = Rigid(assemble([]))
-        self.robot = Robot(self.rigid, load("vinebot"), "anna")
+        self.robot = Robot(self.rigid, load_description("vinebot"), "anna")
         self.time = 0.0
-        self.controller = Admittance(self.robot, "arm_left", "wrist_left_ft", **gains) if heeding else None
+        self.controller = AdmittanceController(self.robot, "arm_left", "wrist_left_ft", **gains) if heeding else None
         self._step()
         self.run(0.3)
 
@@ -84,8 +84,8 @@ def test_weight_is_no_push_even_after_a_turn_of_the_hand() -> None:
 
 
 def test_wrong_settings_are_named() -> None:
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
     with pytest.raises(CommandError, match=r"no wrist sensor 'elbow'.*wrist_left_ft"):
-        Admittance(robot, "arm_left", "elbow")
+        AdmittanceController(robot, "arm_left", "elbow")
     with pytest.raises(CommandError, match="above 0"):
-        Admittance(robot, "arm_left", "wrist_left_ft", mass=0.0)
+        AdmittanceController(robot, "arm_left", "wrist_left_ft", mass=0.0)

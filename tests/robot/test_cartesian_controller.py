@@ -7,23 +7,25 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.control.cartesian_controller import Hand, axes_of, prioritized
-from vinesim.robot.description.description import load
+from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose, solve_prioritized_ik
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def led(hand: Hand, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, seconds: float = 6.0) -> np.ndarray:
+def led(
+    hand: CartesianController, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, seconds: float = 6.0
+) -> np.ndarray:
     """Lead a hand for a while; the places [tick, 3] m that its point went through."""
     robot, points = hand.robot, []
     for tick in range(round(seconds / 0.01)):
-        hand.lead(goal, ahead, up, speed=0.3, height=float(goal[2]))
+        hand.move_towards(goal, ahead, up, speed=0.3, shoulder_height=float(goal[2]))
         robot.control(0.01 * tick)
         robot.rigid.prep()
         robot.rigid.finish()
-        points.append(hand.point)
+        points.append(hand.tip_position)
     return np.array(points)
 
 
@@ -34,22 +36,22 @@ def led(hand: Hand, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, 
     ids=["level, to a bunch", "down, to a box"],
 )
 def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple, ahead: tuple, up: np.ndarray):
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
-    hand = Hand(robot, side)
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    hand = CartesianController(robot, side)
     there = np.array(goal) * [1.0, 1.0 if side == "left" else -1.0, 1.0]
     led(hand, there, np.array(ahead), np.array(up))
-    assert hand.distance(there) < 0.002
-    axes = axes_of(robot.frame_pose(hand.tool))
+    assert hand.distance_to(there) < 0.002
+    axes = axes_of_pose(robot.frame_pose(hand.tool))
     assert axes[0] @ np.array(ahead) > 0.999
     assert axes[2] @ np.array(up) > 0.999
 
 
 def test_a_hand_goes_straight_and_not_too_fast():
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
-    hand = Hand(robot, "left", tip=0.03)
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    hand = CartesianController(robot, "left", tip_offset=0.03)
     led(hand, np.array([0.6, 0.25, 1.3]), np.array([1.0, 0.0, 0.0]), UP)
-    hand.start()
-    start, goal = hand.point, np.array([0.8, 0.15, 1.6])
+    hand.reset()
+    start, goal = hand.tip_position, np.array([0.8, 0.15, 1.6])
     points = led(hand, goal, np.array([1.0, 0.0, 0.0]), UP)
     along = frames.normalize(goal - start)
     beside = (points - start) - ((points - start) @ along)[:, None] * along
@@ -63,15 +65,15 @@ def test_priorities_hold() -> None:
     first, second = rng.normal(size=(3, 7)), rng.normal(size=(5, 7))
     one, two, posture = rng.normal(size=3), rng.normal(size=5), rng.normal(size=7)
     far = np.full(7, 1e3)
-    rates = prioritized([(first, one), (second, two)], posture, -far, far, np.ones(7))
+    rates = solve_prioritized_ik([(first, one), (second, two)], posture, -far, far, np.ones(7))
     np.testing.assert_allclose(first @ rates, one, atol=1e-9)
     particular = np.linalg.pinv(first) @ one
     null = np.eye(7) - np.linalg.pinv(first) @ first
     best = particular + null @ (np.linalg.pinv(second @ null, rcond=1e-9) @ (two - second @ particular))
     np.testing.assert_allclose(rates, best, atol=1e-9)
-    alone = prioritized([(first, one)], posture, -far, far, np.ones(7))
+    alone = solve_prioritized_ik([(first, one)], posture, -far, far, np.ones(7))
     np.testing.assert_allclose(alone, particular + null @ posture, atol=1e-9)
     bound = np.full(7, 0.9 * np.abs(alone).max())
-    kept = prioritized([(first, one)], posture, -bound, bound, np.ones(7))
+    kept = solve_prioritized_ik([(first, one)], posture, -bound, bound, np.ones(7))
     assert (np.abs(kept) <= bound + 1e-9).all()
     np.testing.assert_allclose(first @ kept, one, atol=1e-9)

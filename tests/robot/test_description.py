@@ -13,17 +13,17 @@ import trimesh
 import yourdfpy
 
 from vinesim import frames
-from vinesim.robot.description.description import Description, DescriptionError, load
+from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
 from vinesim.scene import data_files
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
 @pytest.fixture(scope="module")
-def parsed(vinebot: Description) -> yourdfpy.Robot:
+def parsed(vinebot: RobotDescription) -> yourdfpy.Robot:
     return parse(vinebot.urdf)
 
 
@@ -43,20 +43,20 @@ def test_urdf_is_what_its_writer_writes() -> None:
     assert (root / "data" / "robots" / "vinebot.urdf").read_text() == writer.vinebot()
 
 
-def test_vinebot_is_a_dual_arm_carrier(vinebot: Description) -> None:
+def test_vinebot_is_a_dual_arm_carrier(vinebot: RobotDescription) -> None:
     assert vinebot.base == "base_footprint"
     assert 150.0 < vinebot.mass < 250.0
     assert len(vinebot.drives) == 21
     for side in ("left", "right"):
         assert vinebot.groups[f"arm_{side}"].joints == tuple(f"arm_{side}_{i}_joint" for i in range(1, 8))
-        assert f"gripper_{side}_cutter_link" in vinebot.anchors
+        assert f"gripper_{side}_cutter_link" in vinebot.link_anchors
     assert vinebot.cameras[0].frame == "head_front_camera_rgb_optical_frame"
     assert vinebot.notes == ()
     for drive, home in zip(vinebot.drives, vinebot.home, strict=True):
         assert drive.lower <= home <= drive.upper, drive.joint
 
 
-def test_arms_weigh_as_arms_do(vinebot: Description, parsed: yourdfpy.Robot) -> None:
+def test_arms_weigh_as_arms_do(vinebot: RobotDescription, parsed: yourdfpy.Robot) -> None:
     for side in ("left", "right"):
         parts = [
             link for link in parsed.links if link.name.startswith((f"arm_{side}", f"gripper_{side}", f"wrist_{side}"))
@@ -92,10 +92,10 @@ def test_inertias_are_those_of_the_shapes(parsed: yourdfpy.Robot) -> None:
     assert checked == 32
 
 
-def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: Description) -> None:
+def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: RobotDescription) -> None:
     """Wood that stands across the finger tips passes through the mouth."""
     assert [cutter.group for cutter in vinebot.cutters] == ["gripper_left", "gripper_right"]
-    poses = vinebot.frame_poses(vinebot.home)
+    poses = vinebot.link_poses(vinebot.home)
     for cutter in vinebot.cutters:
         tips = poses[f"{cutter.group}_grasping_link"]
         mouth = frames.compose(poses[cutter.frame], frames.pose(np.array(cutter.origin)))
@@ -105,11 +105,11 @@ def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: Description) -> Non
         assert -0.10 < off[2] < -0.02
 
 
-def test_bunches_are_within_reach(vinebot: Description) -> None:
+def test_bunches_are_within_reach(vinebot: RobotDescription) -> None:
     """From the shoulder, with the lift inside its range, the arm's length covers 0.45-0.9 m ahead, 1.3-1.8 m high."""
     zero = vinebot.home.copy()
-    zero[vinebot.indices("arm_left")] = 0.0
-    poses = vinebot.frame_poses(zero)
+    zero[vinebot.joint_indices("arm_left")] = 0.0
+    poses = vinebot.link_poses(zero)
     shoulder, tool = poses["arm_left_2_link"][:3], poses["gripper_left_grasping_link"][:3]
     length = np.linalg.norm(shoulder - tool)
     assert 0.85 < length < 1.05
@@ -121,27 +121,27 @@ def test_bunches_are_within_reach(vinebot: Description) -> None:
             assert np.linalg.norm(target - raised) < length
 
 
-def test_sides_mirror_each_other(vinebot: Description) -> None:
-    poses = vinebot.frame_poses(vinebot.home)
+def test_sides_mirror_each_other(vinebot: RobotDescription) -> None:
+    poses = vinebot.link_poses(vinebot.home)
     left, right = poses["gripper_left_grasping_link"], poses["gripper_right_grasping_link"]
     np.testing.assert_allclose(left[:3] * [1, -1, 1], right[:3], atol=1e-12)
 
 
-def test_moving_joints_agree_with_yourdfpy(vinebot: Description, parsed: yourdfpy.Robot) -> None:
+def test_moving_joints_agree_with_yourdfpy(vinebot: RobotDescription, parsed: yourdfpy.Robot) -> None:
     """Oracle: yourdfpy's forward kinematics at a random configuration."""
     oracle = yourdfpy.URDF(parsed, build_scene_graph=True, load_meshes=False)
     rng = np.random.default_rng(4)
     position = np.array([rng.uniform(drive.lower, drive.upper) for drive in vinebot.drives])
     oracle.update_cfg(dict(zip(vinebot.joints, position, strict=True)))
-    poses = vinebot.frame_poses(position)
+    poses = vinebot.link_poses(position)
     for link in ("gripper_left_left_finger_link", "head_front_camera_depth_optical_frame", "arm_right_5_link"):
         expected = oracle.get_transform(link, "base_footprint")
         np.testing.assert_allclose(poses[link][:3], expected[:3, 3], atol=1e-9)
-        np.testing.assert_allclose(frames.matrix(poses[link][3:]), expected[:3, :3], atol=1e-9)
+        np.testing.assert_allclose(frames.to_matrix(poses[link][3:]), expected[:3, :3], atol=1e-9)
 
 
-def test_camera_looks_ahead(vinebot: Description) -> None:
-    pose = vinebot.frame_poses(vinebot.home)["head_front_camera_rgb_optical_frame"]
+def test_camera_looks_ahead(vinebot: RobotDescription) -> None:
+    pose = vinebot.link_poses(vinebot.home)["head_front_camera_rgb_optical_frame"]
     np.testing.assert_allclose(frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0])), [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(frames.rotate(pose[3:], np.array([0.0, 1.0, 0.0])), [0, 0, -1], atol=1e-9)
 
@@ -149,9 +149,9 @@ def test_camera_looks_ahead(vinebot: Description) -> None:
 # ---------------------------------------------------------------------- foreign robots
 
 
-def tiago_pro() -> Description:
+def tiago_pro() -> RobotDescription:
     try:
-        return load("tiago_pro")
+        return load_description("tiago_pro")
     except DescriptionError as error:
         if "not installed" in str(error):
             pytest.skip(str(error))
@@ -161,24 +161,24 @@ def tiago_pro() -> Description:
 def test_tiago_pro_loads() -> None:
     tiago = tiago_pro()
     assert len(tiago.groups["arm_left"].joints) == 7
-    assert not any("wheel" in joint for joint in tiago.moving.names)
-    assert any("wheel" in child for _, child in tiago.fixed)
+    assert not any("wheel" in joint for joint in tiago.moving_joints.names)
+    assert any("wheel" in child for _, child in tiago.fixed_frames)
     for shape in (shape for link in parse(tiago.urdf).links for shape in (*link.visuals, *link.collisions)):
         if shape.geometry.mesh is not None:
             assert pathlib.Path(shape.geometry.mesh.filename).is_absolute()
     assert tiago.cameras[0].frame.endswith("optical_frame")
-    ahead = frames.rotate(tiago.frame_poses(tiago.home)[tiago.cameras[0].frame][3:], np.array([0.0, 0.0, 1.0]))
+    ahead = frames.rotate(tiago.link_poses(tiago.home)[tiago.cameras[0].frame][3:], np.array([0.0, 0.0, 1.0]))
     assert ahead[0] > 0.9
     assert abs(ahead[1]) < 1e-3
 
 
 def test_mimic_joints_follow_their_source() -> None:
     tiago = tiago_pro()
-    moving = tiago.moving
+    moving = tiago.moving_joints
     assert "gripper_left_fingertip_left_joint" not in tiago.joints
     position = tiago.home.copy()
     position[tiago.joints.index("gripper_left_finger_joint")] += 0.3
-    angle = dict(zip(moving.names, moving.multiplier * position[moving.source] + moving.offset, strict=True))
+    angle = dict(zip(moving.names, moving.multiplier * position[moving.drive_index] + moving.offset, strict=True))
     assert angle["gripper_left_fingertip_left_joint"] == -angle["gripper_left_finger_joint"]
     turned = 2.0 * np.arccos(
         np.clip(np.abs((moving.poses(position)[:, 3:] * moving.poses(tiago.home)[:, 3:]).sum(1)), 0, 1)
@@ -209,11 +209,11 @@ def test_defaults_without_a_sidecar(tmp_path: pathlib.Path) -> None:
     moments = 'ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"'
     camera = f'<link name="camera_link"><inertial><mass value="0.2"/><inertia {moments}/></inertial></link>'
     camera += '<link name="caster"/>'
-    simple = load(write(tmp_path, robot(links=camera, joints=joints)))
+    simple = load_description(write(tmp_path, robot(links=camera, joints=joints)))
     assert simple.joints == ("shoulder_joint", "turret_joint")
     shoulder, turret = simple.drives
     assert shoulder.stiffness * 0.05 == pytest.approx(shoulder.effort)
-    assert shoulder.rotor == pytest.approx(0.02 * 10.0 / 1.0)
+    assert shoulder.armature == pytest.approx(0.02 * 10.0 / 1.0)
     assert shoulder.damping == pytest.approx(2.0 * np.sqrt(200.0 * (0.1 + 0.2)))
     assert (turret.lower, turret.upper) == (-np.inf, np.inf)
     assert simple.cameras[0].frame == "camera_optical_frame"
@@ -223,7 +223,7 @@ def test_defaults_without_a_sidecar(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(("lower", "upper", "home"), [(0.5, 1.5, 1.0), (-1.0, 1.1, 0.0), (-2.4, 1.1, -0.65)])
 def test_home_is_zero_or_the_middle(lower: float, upper: float, home: float, tmp_path: pathlib.Path) -> None:
     limit = f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
-    assert load(write(tmp_path, robot(arm_joint=limit))).home == pytest.approx([home])
+    assert load_description(write(tmp_path, robot(arm_joint=limit))).home == pytest.approx([home])
 
 
 def test_meshes_are_found_and_unreadable_ones_replaced(tmp_path: pathlib.Path) -> None:
@@ -239,7 +239,7 @@ def test_meshes_are_found_and_unreadable_ones_replaced(tmp_path: pathlib.Path) -
       <visual><geometry><mesh filename="../meshes/part.ply"/></geometry></visual>
       <collision><geometry><mesh filename="../meshes/part.ply" scale="1 1 2"/></geometry></collision></link>"""
     joint = '<joint name="shell_joint" type="fixed"><parent link="arm"/><child link="shell"/></joint>'
-    simple = load(write(package / "urdf", robot(links=shapes, joints=joint)))
+    simple = load_description(write(package / "urdf", robot(links=shapes, joints=joint)))
     shell = next(link for link in parse(simple.urdf).links if link.name == "shell")
     assert shell.visuals[0].geometry.mesh.filename == str((package / "meshes" / "part.stl").resolve())
     for shape in (shell.visuals[1], shell.collisions[0]):
@@ -328,7 +328,7 @@ FAULTS = {
 def test_faults_are_named_in_one_line(fault: str, tmp_path: pathlib.Path) -> None:
     text, words = FAULTS[fault]
     with pytest.raises(DescriptionError) as caught:
-        load(write(tmp_path, text))
+        load_description(write(tmp_path, text))
     message = str(caught.value)
     assert words in message
     assert message.startswith(str(tmp_path / "simple.urdf"))
@@ -338,18 +338,18 @@ def test_faults_are_named_in_one_line(fault: str, tmp_path: pathlib.Path) -> Non
 
 def test_missing_file_lists_what_there_is() -> None:
     with pytest.raises(DescriptionError, match=r"no file 'vinbot'.*vinebot"):
-        load("vinbot")
+        load_description("vinbot")
 
 
 def test_springs_and_slip_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
     file = write(tmp_path, robot())
-    assert load(file).drives[0].elastic == 0.0
+    assert load_description(file).drives[0].series_stiffness == 0.0
     file.with_suffix(".toml").write_text(
         "[base]\nslip = [0.1, 0.2]\n"
         "[groups.arm]\njoints = ['shoulder_joint']\nelastic = [800.0]\nelastic_damping = [4.0]\n"
     )
-    found = load(file)
-    assert (found.drives[0].elastic, found.drives[0].elastic_damping) == (800.0, 4.0)
+    found = load_description(file)
+    assert (found.drives[0].series_stiffness, found.drives[0].series_damping) == (800.0, 4.0)
     assert found.base_limits.slip == (0.1, 0.2)
 
 
@@ -379,7 +379,7 @@ def test_sidecar_faults_name_the_toml(toml: str, words: str, tmp_path: pathlib.P
     file = write(tmp_path, robot())
     file.with_suffix(".toml").write_text(toml)
     with pytest.raises(DescriptionError, match=r"simple\.toml") as caught:
-        load(file)
+        load_description(file)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -387,4 +387,4 @@ def test_sidecar_faults_name_the_toml(toml: str, words: str, tmp_path: pathlib.P
 def test_an_extra_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vinesim.robot.description.description._resource", lambda path: None)
     with pytest.raises(DescriptionError, match=r"tiago_pro: .*pip install vinesim\[tiago\]"):
-        load("tiago_pro")
+        load_description("tiago_pro")

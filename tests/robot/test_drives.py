@@ -14,21 +14,21 @@ from vinesim import frames
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, load
-from vinesim.robot.drives import CommandError, Interface, RemoteRobot, Robot
+from vinesim.robot.description.description import RobotDescription, load_description
+from vinesim.robot.drives import CommandError, CommandInterface, RemoteRobot, Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
 class Yard:
     """One robot on bare ground, and a clock."""
 
-    def __init__(self, description: Description, pose: np.ndarray | None = None) -> None:
+    def __init__(self, description: RobotDescription, pose: np.ndarray | None = None) -> None:
         self.rigid = Rigid(assemble([]))
         self.robot = Robot(self.rigid, description, "anna", pose=pose)
         self.time = 0.0
@@ -47,18 +47,18 @@ class Yard:
 
 
 @pytest.fixture
-def yard(vinebot: Description) -> Yard:
+def yard(vinebot: RobotDescription) -> Yard:
     return Yard(vinebot)
 
 
-def test_home_is_held_without_sag(yard: Yard, vinebot: Description) -> None:
+def test_home_is_held_without_sag(yard: Yard, vinebot: RobotDescription) -> None:
     position = yard.run(0.5)[-1, 0]
     np.testing.assert_allclose(position, vinebot.home, atol=1e-9)
 
 
 def test_step_command_ramps_at_the_speed_limit(yard: Yard) -> None:
     joint = yard.robot.joint_indices(["arm_left_4_joint"])[0]
-    limit, start = yard.robot.speed[joint], yard.robot.setpoint[joint]
+    limit, start = yard.robot.max_velocity[joint], yard.robot.setpoint[joint]
     yard.robot.command_position([start - 1.1], ["arm_left_4_joint"])
     position, velocity, _, setpoint = yard.run(1.0)[:, :, joint].T
     steps = np.abs(np.diff(setpoint, prepend=start))
@@ -98,8 +98,8 @@ def test_velocity_command_moves_and_ends_at_the_limit(yard: Yard) -> None:
     np.testing.assert_allclose(rows[30:, 1, joint], 0.5, rtol=0.02)
     yard.robot.command_velocity([50.0], ["arm_right_2_joint"])
     rows = yard.run(2.0)
-    assert np.abs(np.diff(rows[:, 3, joint])).max() <= yard.robot.speed[joint] * yard.rigid.dt * (1.0 + 1e-9)
-    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper[joint], abs=2e-3)
+    assert np.abs(np.diff(rows[:, 3, joint])).max() <= yard.robot.max_velocity[joint] * yard.rigid.dt * (1.0 + 1e-9)
+    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper_limit[joint], abs=2e-3)
 
 
 def test_effort_command_is_the_effort_at_rest(yard: Yard) -> None:
@@ -107,10 +107,10 @@ def test_effort_command_is_the_effort_at_rest(yard: Yard) -> None:
     joint = yard.robot.joint_indices(["head_1_joint"])[0]
     yard.robot.command_effort([2.0], ["head_1_joint"])
     rows = yard.run(3.0)
-    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper[joint], abs=0.02)
+    assert rows[-1, 0, joint] == pytest.approx(yard.robot.upper_limit[joint], abs=0.02)
     assert rows[-1, 2, joint] == pytest.approx(2.0, rel=0.01)
     yard.robot.command_effort([100.0], ["head_1_joint"])
-    assert yard.run(1.0)[-1, 2, joint] == pytest.approx(yard.robot.effort[joint], rel=0.01)
+    assert yard.run(1.0)[-1, 2, joint] == pytest.approx(yard.robot.max_effort[joint], rel=0.01)
 
 
 def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
@@ -123,7 +123,7 @@ def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
     yard.robot.command_effort([10.0], ["torso_lift_joint"])
     velocity = np.concatenate([[0.0], yard.run(0.8)[:, 1, joint]])
     acceleration = np.diff(velocity) / yard.rigid.dt
-    expected = (10.0 - 50.0 * velocity[1:]) / (carried + yard.robot.description.drives[joint].rotor)
+    expected = (10.0 - 50.0 * velocity[1:]) / (carried + yard.robot.description.drives[joint].armature)
     assert 0.04 < velocity[-1] < 0.15
     np.testing.assert_allclose(acceleration[5:], expected[5:], rtol=0.02)  # until then the arms sag in their joints
 
@@ -153,7 +153,7 @@ def test_impedance_gives_way_as_its_stiffness_says(yard: Yard) -> None:
         yard.robot.command_impedance([-1.0], [1.0], ["arm_left_4_joint"])
 
 
-def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: Description) -> None:
+def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: RobotDescription) -> None:
     yard.robot.command_effort([0.0], ["arm_left_1_joint"])
     yard.run(0.02)
     Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
@@ -167,7 +167,7 @@ def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yar
     before = yard.run(0.2)[-1, 0]
     yard.rigid.push("anna", "arm_left_4_link", np.array([900.0, 0.0, 0.0]))
     rows = yard.run(0.6)
-    assert (np.abs(rows[:, 2]) <= yard.robot.effort * (1.0 + 1e-9)).all()
+    assert (np.abs(rows[:, 2]) <= yard.robot.max_effort * (1.0 + 1e-9)).all()
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
     yielded = rows[-1, 0, joint] - before[joint]
     assert abs(yielded) > 0.1
@@ -179,7 +179,7 @@ def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yar
 
 
 def test_gripper_opens_by_the_given_width(yard: Yard) -> None:
-    fingers = yard.robot.description.indices("gripper_left")
+    fingers = yard.robot.description.joint_indices("gripper_left")
     for opening in (0.0, 0.1):
         yard.robot.command_gripper("gripper_left", opening)
         assert yard.run(1.2)[-1, 0, fingers].sum() == pytest.approx(opening, abs=1e-4)
@@ -207,9 +207,9 @@ def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard)
     assert np.linalg.norm(yard.rigid.base("anna")[1][:2]) < limits.linear * 1.1
 
 
-def test_samples_agree_with_the_rigid_world(vinebot: Description) -> None:
+def test_samples_agree_with_the_rigid_world(vinebot: RobotDescription) -> None:
     """Oracle: MuJoCo's kinematics of every moving link; odometry: the way since the start."""
-    start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
+    start = frames.pose([3.0, -2.0, 0.0], frames.from_yaw(2.0))
     yard = Yard(vinebot, start)
     first = yard.robot.sample(0.0)
     np.testing.assert_allclose(first.odom_q, frames.pose([0.0, 0.0, 0.0]), atol=1e-12)
@@ -225,7 +225,7 @@ def test_samples_agree_with_the_rigid_world(vinebot: Description) -> None:
         found = frames.compose(yard.robot.frame_pose(parent), pose)
         np.testing.assert_allclose(found[:3], expected[:3], atol=1e-9)
         assert abs(found[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-9)
-    for (parent, child), pose in zip(vinebot.fixed, vinebot.fixed_q, strict=True):
+    for (parent, child), pose in zip(vinebot.fixed_frames, vinebot.fixed_poses, strict=True):
         found = frames.compose(yard.robot.frame_pose(parent), pose)
         np.testing.assert_allclose(found[:3], yard.robot.frame_pose(child)[:3], atol=1e-9)
     np.testing.assert_allclose(frames.compose(start, sample.odom_q), sample.base_q, atol=1e-9)
@@ -238,7 +238,7 @@ def test_samples_keep_their_own_contacts(yard: Yard) -> None:
     assert yard.robot.sample(0.0, (other, mine)).contacts == (mine,)
 
 
-def test_two_runs_are_the_same_to_the_bit(vinebot: Description) -> None:
+def test_two_runs_are_the_same_to_the_bit(vinebot: RobotDescription) -> None:
     ends = []
     for _ in range(2):
         yard = Yard(vinebot)
@@ -250,11 +250,11 @@ def test_two_runs_are_the_same_to_the_bit(vinebot: Description) -> None:
 
 
 def test_stop_holds_everything_where_it_is(yard: Yard) -> None:
-    yard.robot.command_velocity(0.3 * yard.robot.speed)
+    yard.robot.command_velocity(0.3 * yard.robot.max_velocity)
     yard.robot.command_base(0.5, 0.0, yard.time)
     yard.run(0.3)
     yard.robot.stop()
-    assert (yard.robot.interface == Interface.POSITION).all()
+    assert (yard.robot.interface == CommandInterface.POSITION).all()
     rows = yard.run(1.5)
     np.testing.assert_allclose(rows[-1, 1], 0.0, atol=1e-3)
     assert np.abs(yard.rigid.base("anna")[1]).max() < 0.02
@@ -271,7 +271,7 @@ def test_wrong_commands_are_named(yard: Yard) -> None:
         yard.robot.command_base(np.inf, 0.0, 0.0)
 
 
-def test_remote_copy_follows_its_original(vinebot: Description) -> None:
+def test_remote_copy_follows_its_original(vinebot: RobotDescription) -> None:
     here = Yard(vinebot)
     far = Rigid(assemble([]))
     copy = RemoteRobot(far, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
@@ -295,10 +295,10 @@ def test_remote_copy_follows_its_original(vinebot: Description) -> None:
         copy.follow(RobotUpdate("anna", 0.0, np.zeros(7), np.zeros(6), np.zeros(3), np.zeros(3)))
 
 
-def test_robots_leave(yard: Yard, vinebot: Description) -> None:
+def test_robots_leave(yard: Yard, vinebot: RobotDescription) -> None:
     second = Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
     yard.run(0.05)
-    second.leave()
+    second.remove()
     assert yard.rigid.robots == ("anna",)
     np.testing.assert_allclose(yard.run(0.05)[-1, 0], vinebot.home, atol=1e-9)
 
@@ -315,7 +315,7 @@ def test_foreign_robot_moves(tmp_path) -> None:
     links = "".join(f'<link name="{name}">{inertial}</link>' for name in ("arm", "left", "right"))
     file = tmp_path / "foreign.urdf"
     file.write_text(f'<robot name="foreign"><link name="base">{inertial}</link>{links}{joints}</robot>')
-    yard = Yard(load(file))
+    yard = Yard(load_description(file))
     yard.robot.command_position([7.0, 0.08])
     yard.run(5.0)
     sample = yard.robot.sample(yard.time)
@@ -330,7 +330,7 @@ def test_foreign_robot_moves(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("interface", ["position", "velocity", "effort"])
-def test_each_interface_tracks_a_swing(vinebot: Description, interface: str) -> None:
+def test_each_interface_tracks_a_swing(vinebot: RobotDescription, interface: str) -> None:
     """0.3 rad at 0.4 Hz in shoulder and elbow; by effort a controller outside closes the loop at 100 Hz."""
     yard, names = Yard(vinebot), ["arm_left_1_joint", "arm_left_4_joint"]
     joints = yard.robot.joint_indices(names)
@@ -358,7 +358,7 @@ def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
     joints = yard.robot.joint_indices(None)
     for command in (
         lambda: yard.robot.command_velocity(np.zeros(len(joints))),
-        lambda: yard.robot.command_elastic(yard.robot.sample(yard.time).elements.motor),
+        lambda: yard.robot.command_motor_position(yard.robot.sample(yard.time).elements.motor),
         lambda: yard.robot.command_position(yard.rigid.read("anna")[0]),
         lambda: yard.robot.command_effort(np.zeros(len(joints))),
         lambda: yard.robot.command_velocity(np.zeros(len(joints))),
@@ -372,20 +372,20 @@ def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
 def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
     """All of the effort is there at rest, as good as none at the largest speed."""
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
-    yard.robot.command_effort([yard.robot.effort[joint]], ["arm_left_1_joint"])
+    yard.robot.command_effort([yard.robot.max_effort[joint]], ["arm_left_1_joint"])
     rows = yard.run(1.5)[:, :, joint]
-    moving = rows[:, 0] < yard.robot.upper[joint] - 0.2
-    assert rows[moving, 1].max() == pytest.approx(yard.robot.speed[joint], rel=0.02)
-    assert rows[0, 2] == pytest.approx(yard.robot.effort[joint], rel=1e-6)
-    assert np.abs(rows[10:40, 2] - yard.rigid.weight("anna")[joint]).max() < 0.2 * yard.robot.effort[joint]
+    moving = rows[:, 0] < yard.robot.upper_limit[joint] - 0.2
+    assert rows[moving, 1].max() == pytest.approx(yard.robot.max_velocity[joint], rel=0.02)
+    assert rows[0, 2] == pytest.approx(yard.robot.max_effort[joint], rel=1e-6)
+    assert np.abs(rows[10:40, 2] - yard.rigid.weight("anna")[joint]).max() < 0.2 * yard.robot.max_effort[joint]
 
 
 # ---------------------------------------------------------------------- what sensors on it feel
 
 
-def hand_of(description: Description, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
+def hand_of(description: RobotDescription, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
     """Mass [kg] of what hangs on the left wrist sensor, and its centre [3] in the base, from the URDF; at home."""
-    poses, mass, moment = description.frame_poses(description.home if position is None else position), 0.0, np.zeros(3)
+    poses, mass, moment = description.link_poses(description.home if position is None else position), 0.0, np.zeros(3)
     for link in ElementTree.fromstring(description.urdf).iterfind("link"):
         name = link.get("name")
         if (name.startswith("gripper_left") or name == "wrist_left_ft_link") and link.find("inertial") is not None:
@@ -407,7 +407,7 @@ def wrench_of(yard: Yard) -> tuple[np.ndarray, np.ndarray]:
     return frames.rotate(turn, wrench.force), frames.rotate(turn, wrench.torque)
 
 
-def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: Description) -> None:
+def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: RobotDescription) -> None:
     yard.run(0.5)
     force, torque = wrench_of(yard)
     mass, centre = hand_of(vinebot)
@@ -427,7 +427,7 @@ def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: Descriptio
     assert np.linalg.norm(other.force) == pytest.approx(9.81 * mass, rel=0.01)
 
 
-def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: Description) -> None:
+def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: RobotDescription) -> None:
     """Inertia counts: as the lift drops and the hand with it, the wrist carries m (g + a)."""
     hand, _ = hand_of(vinebot)
     yard.run(0.2)
@@ -456,7 +456,7 @@ def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
         yard.robot.command_base(0.5, 0.6, yard.time)
         yard.run(yard.rigid.dt)
     imu = yard.robot.sample(yard.time).imus[0]
-    x, y = yard.robot.description.frame_poses(yard.robot.description.home)["base_imu_link"][:2]
+    x, y = yard.robot.description.link_poses(yard.robot.description.home)["base_imu_link"][:2]
     np.testing.assert_allclose(imu.angular_velocity, [0.0, 0.0, 0.6], atol=0.005)
     expected = [-(0.6**2) * x, 0.5 * 0.6 - 0.6**2 * y, 9.81]
     np.testing.assert_allclose(imu.linear_acceleration, expected, atol=0.02)
@@ -466,10 +466,12 @@ def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
 
 
 @pytest.mark.parametrize(("ahead", "turning"), [(0.0, 0.0), (0.08, 0.0), (0.05, 0.2)])
-def test_odometry_believes_in_what_the_tracks_travelled(vinebot: Description, ahead: float, turning: float) -> None:
+def test_odometry_believes_in_what_the_tracks_travelled(
+    vinebot: RobotDescription, ahead: float, turning: float
+) -> None:
     """Straight on, then a turn on the spot: travel = way / (1 - slip)."""
     limits = msgspec.structs.replace(vinebot.base_limits, slip=(ahead, turning))
-    start = frames.pose([3.0, -2.0, 0.0], frames.yaw(2.0))
+    start = frames.pose([3.0, -2.0, 0.0], frames.from_yaw(2.0))
     yard = Yard(dataclasses.replace(vinebot, base_limits=limits), start)
     for drive in ((0.5, 0.0), (0.0, 0.8)):
         for _ in range(250):
@@ -488,7 +490,7 @@ def test_odometry_believes_in_what_the_tracks_travelled(vinebot: Description, ah
 # ---------------------------------------------------------------------- grippers and cutters
 
 
-def bunch_in_hand(description: Description, effort: float) -> tuple[Yard, int]:
+def bunch_in_hand(description: RobotDescription, effort: float) -> tuple[Yard, int]:
     """A loose round bunch of 0.3 kg between the fingers of the left hand, held with ``effort`` [N] each."""
     yard = Yard(description)
     yard.robot.command_gripper("gripper_left", 0.08)
@@ -519,10 +521,10 @@ def slid(yard: Yard, body: int, force: np.ndarray) -> float:
     return float(np.linalg.norm(place() - before))
 
 
-def test_a_bunch_is_held_by_friction_and_no_more(vinebot: Description) -> None:
+def test_a_bunch_is_held_by_friction_and_no_more(vinebot: RobotDescription) -> None:
     """Two pads of 15 N and mu 0.8 hold 24 N: with the weight of 2.9 N, 16 N more hold and 25 N more do not."""
     yard, body = bunch_in_hand(vinebot, 15.0)
-    fingers = vinebot.indices("gripper_left")
+    fingers = vinebot.joint_indices("gripper_left")
     squeeze = yard.rigid.read("anna")[3][fingers]
     np.testing.assert_allclose(squeeze, 15.0, atol=0.3 * 9.81 * 0.2)  # the hand is tilted: a bit of the bunch's weight
     along = frames.rotate(yard.robot.frame_pose("gripper_left_grasping_link")[3:], np.array([0.0, 0.0, -1.0]))
@@ -530,7 +532,7 @@ def test_a_bunch_is_held_by_friction_and_no_more(vinebot: Description) -> None:
     assert slid(yard, body, 25.0 * along) > 0.02
 
 
-def test_a_held_bunch_weighs_on_the_wrist_what_it_weighs(vinebot: Description) -> None:
+def test_a_held_bunch_weighs_on_the_wrist_what_it_weighs(vinebot: RobotDescription) -> None:
     yard, _ = bunch_in_hand(vinebot, 30.0)
     mass, _ = hand_of(vinebot)
     np.testing.assert_allclose(wrench_of(yard)[0], [0.0, 0.0, -9.81 * (mass + 0.3)], atol=0.05)
@@ -545,12 +547,12 @@ def test_gripper_commands_that_make_no_sense_are_named(yard: Yard) -> None:
         yard.robot.command_cutter("gripper_left")
 
 
-def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: Description) -> None:
+def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: RobotDescription) -> None:
     """Beside the peduncle it cuts nothing, over it the bunch; and the wrist feels the vine that touches the hand."""
     model, body, _ = bunch_scene()
     stalk = Physics(model).view().body_q[body - 1, :3].astype(float)
     cutter = next(c for c in vinebot.cutters if c.group == "gripper_left")
-    home = vinebot.frame_poses(vinebot.home)[cutter.frame]
+    home = vinebot.link_poses(vinebot.home)[cutter.frame]
     ahead = np.array([cutter.half[0] - 0.005, 0.0, 0.0])  # before the blades' cover, not in it
     mouth = frames.compose(home, frames.pose(np.array(cutter.origin) + ahead))[:3]
     physics = Physics(model)
@@ -568,20 +570,20 @@ def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: Description)
     assert cut("gripper_right") == ()
     (parting,) = cut("gripper_left")
     assert (parting.bunch, parting.cause, parting.actor) == (0, "blade", "anna")
-    robot.leave()
+    robot.remove()
     assert physics.parting.blades == []
     physics.step()
 
 
 def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
     """Oracle: MuJoCo knows nothing of them, so weight and contact forces must make up the reading at rest."""
-    description = load("vinebot")
+    description = load_description("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
-    tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
+    tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
     ahead = np.array([0.15, 0.0, 0.0])  # it comes from beyond the cane's tip
-    place = middle + ahead - frames.rotate(frames.yaw(np.pi), tip)
-    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
+    place = middle + ahead - frames.rotate(frames.from_yaw(np.pi), tip)
+    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.from_yaw(np.pi)))
     met = 0
     for _ in range(900):
         met += any(c.link.startswith("gripper_left") for c in physics.contacts)
@@ -602,13 +604,13 @@ def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
 
 def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
     """All joints soft, a set-point behind the bunch: at rest K times what is missing is what the plants press."""
-    description = load("vinebot")
+    description = load_description("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
-    tip = description.frame_poses(description.home)["gripper_left_grasping_link"][:3]
-    place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.yaw(np.pi), tip)
-    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.yaw(np.pi)))
-    joints = description.indices("arm_left")
+    tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
+    place = middle + np.array([0.22, 0.0, 0.0]) - frames.rotate(frames.from_yaw(np.pi), tip)
+    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.from_yaw(np.pi)))
+    joints = description.joint_indices("arm_left")
     stiffness = np.array([60.0, 60.0, 40.0, 40.0, 15.0, 15.0, 15.0])
     robot.command_impedance(stiffness, 0.2 * stiffness, joints)
     robot.control(physics.time)

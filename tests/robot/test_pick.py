@@ -13,27 +13,27 @@ from tests.support.contact_forces import pressed_on_ground
 from vinesim import frames
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.pick import Pick, Task
+from vinesim.robot.tasks.pick import PickBunch, PickPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load as load_scene
-from vinesim.scene.spec import reseeded
+from vinesim.scene.spec import load_scene as load_scene
+from vinesim.scene.spec import with_seed
 
 GRAVITY = 9.81
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
 @functools.cache
-def vineyard(seed: int) -> tuple[Model, Task]:
-    plan = reseeded(load_scene("harvest"), seed)
+def vineyard(seed: int) -> tuple[Model, PickPlan]:
+    plan = with_seed(load_scene("harvest"), seed)
     model = generate(plan)
-    return model, next(pick_planning.tasks(model, start_poses.spawn_pose(plan, 0)[:2]))
+    return model, next(pick_planning.plan_picks(model, start_poses.spawn_pose(plan, 0)[:2]))
 
 
 def awake(physics: Physics) -> None:
@@ -41,24 +41,24 @@ def awake(physics: Physics) -> None:
     physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
-def picker(physics: Physics, description: Description, pose: np.ndarray) -> Robot:
+def picker(physics: Physics, description: RobotDescription, pose: np.ndarray) -> Robot:
     robot = Robot(physics.rigid, description, "anna", pose=pose)
     robot.fit_cutters(physics)
     return robot
 
 
-def run(pick: Pick) -> Pick:
-    while not pick.done:
+def run(pick: PickBunch) -> PickBunch:
+    while not pick.is_done:
         pick.control(pick.physics.time)
         pick.robot.control(pick.physics.time)
         pick.physics.step()
     return pick
 
 
-def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(vinebot: Description):
+def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(vinebot: RobotDescription):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = picker(physics, vinebot, task.stand)
+    robot = picker(physics, vinebot, task.base_pose)
     awake(physics)
     body = model.bunch_body[task.bunch]
     physics.plants.wake(int(model.body_tree[body]))
@@ -69,7 +69,7 @@ def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(
     empty = pressed_on_ground(physics, task.box)
     assert empty == pytest.approx(float(model.box_mass[task.box]) * GRAVITY, rel=1e-3)
 
-    pick = run(Pick(physics, robot, task))
+    pick = run(PickBunch(physics, robot, task))
     assert pick.picked, pick.reason
     assert not physics.state.bunch_attached[task.bunch]
     assert physics.state.bunch_attached.sum() == len(model.bunch_body) - 1, "no other bunch may be torn off"
@@ -81,7 +81,7 @@ def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(
     assert on_vine > 3.0
     assert in_box == pytest.approx(on_vine, rel=0.01)
     # it was cut, not torn: the blade did it, and the hand that held it is empty now
-    assert np.abs(physics.rigid.bunch_pose(task.bunch)[:3] - pick.hand.point).max() > 0.2
+    assert np.abs(physics.rigid.bunch_pose(task.bunch)[:3] - pick.arm.tip_position).max() > 0.2
 
 
 def _next(physics: Physics, robot: Robot, box: int) -> float:
@@ -90,33 +90,33 @@ def _next(physics: Physics, robot: Robot, box: int) -> float:
     return pressed_on_ground(physics, box)
 
 
-def test_a_bunch_out_of_reach_is_told_in_words(vinebot: Description):
+def test_a_bunch_out_of_reach_is_told_in_words(vinebot: RobotDescription):
     model, task = vineyard(7)
-    far = frames.compose(task.stand, frames.pose([-0.8, 0.0, 0.0]))
+    far = frames.compose(task.base_pose, frames.pose([-0.8, 0.0, 0.0]))
     physics = Physics(model)
-    pick = run(Pick(physics, picker(physics, vinebot, far), task))
+    pick = run(PickBunch(physics, picker(physics, vinebot, far), task))
     assert not pick.picked
     assert pick.reason.startswith("reach: the hand is 0.")
     assert "out of reach" in pick.reason
     assert physics.state.bunch_attached.all()
 
 
-def test_a_blade_that_does_not_cut_is_told_in_words(vinebot: Description, monkeypatch: pytest.MonkeyPatch):
+def test_a_blade_that_does_not_cut_is_told_in_words(vinebot: RobotDescription, monkeypatch: pytest.MonkeyPatch):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = picker(physics, vinebot, task.stand)
+    robot = picker(physics, vinebot, task.base_pose)
     monkeypatch.setattr(robot, "command_cutter", lambda group: None)
-    pick = run(Pick(physics, robot, task))
+    pick = run(PickBunch(physics, robot, task))
     assert not pick.picked
     assert pick.reason.startswith("cut: the blade closed beside the stalk")
     assert physics.state.bunch_attached.all()
 
 
-def test_a_bunch_that_is_gone_is_told_in_words(vinebot: Description):
+def test_a_bunch_that_is_gone_is_told_in_words(vinebot: RobotDescription):
     """The fingers close where nothing is: what hung there fell before."""
     model, task = vineyard(7)
     physics = Physics(model)
-    pick = Pick(physics, picker(physics, vinebot, task.stand), task)
+    pick = PickBunch(physics, picker(physics, vinebot, task.base_pose), task)
     while pick.phase != "advance":
         pick.control(physics.time)
         pick.robot.control(physics.time)
@@ -125,20 +125,20 @@ def test_a_bunch_that_is_gone_is_told_in_words(vinebot: Description):
     assert "slipped out of the fingers" in run(pick).reason
 
 
-def test_a_robot_without_a_cutter_is_refused(vinebot: Description):
+def test_a_robot_without_a_cutter_is_refused(vinebot: RobotDescription):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = picker(physics, dataclasses.replace(vinebot, cutters=()), task.stand)
+    robot = picker(physics, dataclasses.replace(vinebot, cutters=()), task.base_pose)
     with pytest.raises(CommandError, match="no gripper with a cutter on its"):
-        Pick(physics, robot, task)
+        PickBunch(physics, robot, task)
 
 
-def test_the_same_pick_twice_is_the_same_to_the_bit(vinebot: Description):
+def test_the_same_pick_twice_is_the_same_to_the_bit(vinebot: RobotDescription):
     ends = []
     for _ in range(2):
         model, task = vineyard(7)
         physics = Physics(model)
-        pick = Pick(physics, picker(physics, vinebot, task.stand), task)
+        pick = PickBunch(physics, picker(physics, vinebot, task.base_pose), task)
         while pick.phase != "tuck":
             pick.control(physics.time)
             pick.robot.control(physics.time)

@@ -9,21 +9,21 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import Description, DescriptionError, load
+from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.push import Phase, ReachAndPush
+from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble
 
 HERE = frames.pose([0.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def vinebot() -> Description:
-    return load("vinebot")
+def vinebot() -> RobotDescription:
+    return load_description("vinebot")
 
 
 @pytest.fixture(scope="module")
-def robot(vinebot: Description) -> Robot:
+def robot(vinebot: RobotDescription) -> Robot:
     return Robot(Rigid(assemble([])), vinebot, "anna")
 
 
@@ -33,7 +33,7 @@ class Run:
     def __init__(self, robot: Robot, side: str, target: np.ndarray, base: np.ndarray = HERE, **options) -> None:
         robot.rigid.place("anna", base, robot.description.home)
         robot.stop()
-        self.reach = reach = ReachAndPush(robot, side, lambda: target, repeat=False, **options)
+        self.reach = reach = PushBunch(robot, side, lambda: target, repeat=False, **options)
         self.phases, self.tips, self.speeds, self.setpoints, self.errors = [], [], [], [robot.setpoint.copy()], {}
         self.time = 0.0
         while reach.phase is not Phase.DONE and self.time < 40.0:
@@ -58,17 +58,17 @@ GRID = list(itertools.product((0.45, 0.65, 0.9), (0.1, 0.35), (1.3, 1.55, 1.8)))
 
 @pytest.mark.parametrize("target", GRID, ids=str)
 def test_fingertips_arrive_within_a_centimetre(robot: Robot, target: tuple[float, float, float]) -> None:
-    run = Run(robot, "left", np.array(target), radius=0.0, hold=0.1)
+    run = Run(robot, "left", np.array(target), radius=0.0, hold_time=0.1)
     for phase in (Phase.APPROACH, Phase.TOUCH, Phase.PUSH):
         assert run.errors[phase] < 0.01, phase
     touched = np.flatnonzero([phase is Phase.PUSH for phase in run.phases])[0]
     assert np.linalg.norm(run.tips[touched - 1] - np.array(target)) < 0.01
     # within the limits of the URDF: what is asked strictly, what happens but for the servos' ringing
     steps = np.abs(np.diff(run.setpoints, axis=0)) / robot.rigid.dt
-    assert (steps <= robot.speed * (1.0 + 1e-6)).all()
-    assert (np.abs(run.speeds) <= 1.5 * robot.speed).all()
-    assert run.reach.cycles == 1
-    assert run.reach.missed == 0
+    assert (steps <= robot.max_velocity * (1.0 + 1e-6)).all()
+    assert (np.abs(run.speeds) <= 1.5 * robot.max_velocity).all()
+    assert run.reach.push_count == 1
+    assert run.reach.missed_count == 0
 
 
 @pytest.mark.parametrize("target", [(0.5, -0.2, 1.4), (0.8, -0.3, 1.7), (0.7, 0.1, 1.5)], ids=str)
@@ -80,7 +80,7 @@ def test_the_right_arm_mirrors_the_left(robot: Robot, target: tuple[float, float
 
 
 def test_targets_are_in_the_world(robot: Robot) -> None:
-    base = frames.pose([4.0, -3.0, 0.0], frames.yaw(2.5))
+    base = frames.pose([4.0, -3.0, 0.0], frames.from_yaw(2.5))
     target = frames.compose(base, frames.pose([0.65, 0.2, 1.5]))[:3]
     run = Run(robot, "left", target, base, radius=0.05)
     assert run.errors[Phase.TOUCH] < 0.01
@@ -107,17 +107,17 @@ def test_the_fingers_come_from_below_and_touch_slowly(robot: Robot) -> None:
 
 def test_the_hand_is_smooth(robot: Robot) -> None:
     run = Run(robot, "left", np.array([0.7, 0.25, 1.5]))
-    arm = robot.description.indices("arm_left")
+    arm = robot.description.joint_indices("arm_left")
     acceleration = np.diff(np.array(run.speeds)[:, arm], axis=0) / robot.rigid.dt
     assert np.abs(acceleration).max() < 60.0
 
 
-def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: Description) -> None:
+def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescription) -> None:
     robot = Robot(Rigid(assemble([])), vinebot, "anna")
     time = 0.0
-    reach = ReachAndPush(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold=0.2)
+    reach = PushBunch(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold_time=0.2)
     errors = []
-    while reach.cycles < 2 and time < 30.0:
+    while reach.push_count < 2 and time < 30.0:
         before, error = reach.phase, reach.error
         robot.command_base(0.05 if time < 2.0 else 0.0, 0.0, time)
         reach.control(time)
@@ -127,26 +127,26 @@ def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: Descriptio
         robot.rigid.prep()
         robot.rigid.finish()
         time += robot.rigid.dt
-    assert reach.cycles == 2
+    assert reach.push_count == 2
     assert max(errors) < 0.01
 
 
 def test_what_is_out_of_reach_is_given_up_calmly(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
     run = Run(robot, "left", np.array([1.6, 0.2, 1.5]))
-    assert run.reach.missed == 1
+    assert run.reach.missed_count == 1
     assert Phase.TOUCH not in run.phases
     assert "out of reach" in caplog.text
-    assert (np.abs(run.speeds) <= 2.0 * robot.speed).all()
+    assert (np.abs(run.speeds) <= 2.0 * robot.max_velocity).all()
     position = robot.rigid.read("anna")[0]
-    assert (position >= robot.lower - 0.02).all()
-    assert (position <= robot.upper + 0.02).all()
+    assert (position >= robot.lower_limit - 0.02).all()
+    assert (position <= robot.upper_limit + 0.02).all()
 
 
-def test_two_arms_share_the_robot(vinebot: Description) -> None:
+def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
     robot = Robot(Rigid(assemble([])), vinebot, "anna")
     arms = [
-        ReachAndPush(robot, "left", lambda: np.array([0.7, 0.25, 1.45]), repeat=False),
-        ReachAndPush(robot, "right", lambda: np.array([0.6, -0.3, 1.4]), repeat=False, lift=False),
+        PushBunch(robot, "left", lambda: np.array([0.7, 0.25, 1.45]), repeat=False),
+        PushBunch(robot, "right", lambda: np.array([0.6, -0.3, 1.4]), repeat=False, use_lift=False),
     ]
     touched = {}
     time = 0.0
@@ -164,7 +164,7 @@ def test_two_arms_share_the_robot(vinebot: Description) -> None:
     assert max(touched.values()) < 0.01
 
 
-def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: Description) -> None:
+def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: RobotDescription) -> None:
     ends = []
     for _ in range(2):
         robot = Robot(Rigid(assemble([])), vinebot, "anna")
@@ -174,16 +174,16 @@ def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: Description) -> Non
 
 def test_an_arm_without_a_tool_is_refused(robot: Robot) -> None:
     with pytest.raises(CommandError, match="'arm_middle' with a tool"):
-        ReachAndPush(robot, "middle", lambda: np.zeros(3))
+        PushBunch(robot, "middle", lambda: np.zeros(3))
 
 
 def test_a_foreign_robot_reaches_by_its_names_alone() -> None:
     try:
-        tiago = load("tiago_pro")
+        tiago = load_description("tiago_pro")
     except DescriptionError as error:
         if "not installed" in str(error):
             pytest.skip(str(error))
         raise
     run = Run(Robot(Rigid(assemble([])), tiago, "anna"), "left", np.array([0.55, 0.25, 1.1]))
-    assert run.reach.cycles == 1
+    assert run.reach.push_count == 1
     assert run.errors[Phase.TOUCH] < 0.01

@@ -9,30 +9,30 @@ import pytest
 
 from vinesim.client.tasks import start_poses, swap_planning
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import load
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.swap_boxes import LIFTED, Exchange, Swap
+from vinesim.robot.tasks.swap_boxes import LIFT_HEIGHT, SwapBoxes, SwapPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 
 
 @functools.cache
-def yard() -> tuple[Model, Swap]:
+def yard() -> tuple[Model, SwapPlan]:
     plan = load_scene("harvest")
     model = generate(plan)
-    return model, swap_planning.swap(model, start_poses.spawn_pose(plan, 1))
+    return model, swap_planning.plan_swap(model, start_poses.spawn_pose(plan, 1))
 
 
-def begun(count: int = 6) -> Exchange:
+def begun(count: int = 6) -> SwapBoxes:
     model, swap = yard()
     physics = Physics(model, picking=False)
-    robot = Robot(physics.rigid, load("logistic"), "carrier", pose=swap.start)
-    swap_planning.fill(physics, swap.full, count)
-    return Exchange(physics, robot, swap)
+    robot = Robot(physics.rigid, load_description("logistic"), "carrier", pose=swap.start)
+    swap_planning.fill_box(physics, swap.full_box, count)
+    return SwapBoxes(physics, robot, swap)
 
 
-def tick(exchange: Exchange) -> None:
+def tick(exchange: SwapBoxes) -> None:
     exchange.control(exchange.physics.time)
     exchange.robot.control(exchange.physics.time)
     exchange.physics.step()
@@ -41,11 +41,11 @@ def tick(exchange: Exchange) -> None:
 def test_a_full_box_goes_and_an_empty_one_comes():
     exchange = begun()
     model, swap = yard()
-    place = exchange.box_pose(swap.full).copy()
+    place = exchange.box_pose(swap.full_box).copy()
     load_kg = sum(float(model.body_mass[model.bunch_body[bunch]]) for bunch in exchange.physics.rigid.loose)
-    lift = exchange.robot.description.indices("lift_front")[0]
+    lift = exchange.robot.description.joint_indices("lift_front")[0]
     carried = []
-    while not exchange.done:
+    while not exchange.is_done:
         tick(exchange)
         if exchange.phase == "turn":
             carried.append(exchange.robot.rigid.read("carrier")[2][lift])
@@ -53,12 +53,12 @@ def test_a_full_box_goes_and_an_empty_one_comes():
     report = exchange.report()
     assert report["exchanged"]
     assert report["bunches"] == 6
-    assert np.linalg.norm(exchange.box_pose(swap.empty)[:2] - place[:2]) < 0.05
-    assert exchange.box_pose(swap.empty)[2] == pytest.approx(0.0, abs=2e-3), "on the ground"
-    assert exchange.box_pose(swap.full)[2] == pytest.approx(LIFTED, abs=0.01), "on the carrier"
+    assert np.linalg.norm(exchange.box_pose(swap.empty_box)[:2] - place[:2]) < 0.05
+    assert exchange.box_pose(swap.empty_box)[2] == pytest.approx(0.0, abs=2e-3), "on the ground"
+    assert exchange.box_pose(swap.full_box)[2] == pytest.approx(LIFT_HEIGHT, abs=0.01), "on the carrier"
     # the lift bears what its own parts weigh, the box, and every bunch in it
     parts = 6.0 + 2 * 1.5
-    expected = 9.81 * (parts + float(model.box_mass[swap.full]) + load_kg)
+    expected = 9.81 * (parts + float(model.box_mass[swap.full_box]) + load_kg)
     assert np.median(carried) == pytest.approx(expected, rel=0.01)
 
 
@@ -72,7 +72,7 @@ def test_a_box_that_is_not_there_is_told_in_words():
     for _ in range(20):
         joint.qpos[2], joint.qvel[2] = 5.0, 0.0
         tick(exchange)
-    while not exchange.done:
+    while not exchange.is_done:
         joint.qpos[2], joint.qvel[2] = 5.0, 0.0
         tick(exchange)
     assert not exchange.succeeded
@@ -82,12 +82,12 @@ def test_a_box_that_is_not_there_is_told_in_words():
 def test_a_robot_without_clamps_is_refused():
     model, swap = yard()
     physics = Physics(model)
-    robot = Robot(physics.rigid, load("vinebot"), "anna", pose=swap.start)
+    robot = Robot(physics.rigid, load_description("vinebot"), "anna", pose=swap.start)
     with pytest.raises(CommandError, match="no group 'lift_front'"):
-        Exchange(physics, robot, swap)
+        SwapBoxes(physics, robot, swap)
 
 
 def test_a_box_that_the_scene_has_not_is_refused():
     model, swap = yard()
-    with pytest.raises(start_poses.NoPlace, match="no box 7: this scene has 2"):
-        swap_planning.swap(model, swap.start, full=7)
+    with pytest.raises(start_poses.PlacementError, match="no box 7: this scene has 2"):
+        swap_planning.plan_swap(model, swap.start, full=7)

@@ -8,33 +8,33 @@ import numpy as np
 import pytest
 
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.description.description import load
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
-from vinesim.robot.tasks.task import Failed, Script
+from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.builder import assemble
 
 
-class Story(Script):
+class Story(Task):
     fails = False
 
     def focus(self) -> np.ndarray:
         return np.zeros(3)
 
-    def steps(self) -> Iterator[str]:
+    def run(self) -> Iterator[str]:
         yield from self.wait(0.5, "one")
         yield from self.wait(0.25, "two")
         if self.fails:
-            raise Failed("the end is missing")
+            raise TaskFailed("the end is missing")
 
 
 @pytest.fixture(scope="module")
 def robot() -> Robot:
-    return Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    return Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
 
 
 def tell(story: Story) -> Story:
     tick = 0
-    while not story.done:
+    while not story.is_done:
         story.control(3.0 + 0.01 * tick)
         tick += 1
         assert tick < 1000
@@ -42,7 +42,7 @@ def tell(story: Story) -> Story:
 
 
 def test_phases_follow_and_their_times_are_told(robot: Robot):
-    story = tell(Story(robot, seconds=5.0))
+    story = tell(Story(robot, timeout=5.0))
     assert story.succeeded
     report = story.report()
     assert list(report["phases_s"]) == ["one", "two"]
@@ -52,7 +52,7 @@ def test_phases_follow_and_their_times_are_told(robot: Robot):
 
 
 def test_a_failure_says_where_and_why(robot: Robot, caplog: pytest.LogCaptureFixture):
-    story = Story(robot, seconds=5.0)
+    story = Story(robot, timeout=5.0)
     story.fails = True
     assert not tell(story).succeeded
     assert story.reason == "two: the end is missing"
@@ -62,5 +62,5 @@ def test_a_failure_says_where_and_why(robot: Robot, caplog: pytest.LogCaptureFix
 
 
 def test_patience_ends(robot: Robot):
-    story = tell(Story(robot, seconds=0.3))
+    story = tell(Story(robot, timeout=0.3))
     assert story.reason == "one: not done after 0.3 s"

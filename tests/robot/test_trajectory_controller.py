@@ -7,14 +7,14 @@ import pytest
 
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.robot.control.trajectory_controller import (
+    GoalHandle,
     Outcome,
-    Run,
     Tolerance,
     Trajectory,
     TrajectoryController,
     TrajectoryError,
 )
-from vinesim.robot.description.description import load
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
 
@@ -27,16 +27,16 @@ class Stage:
 
     def __init__(self, **tolerances) -> None:
         self.rigid = Rigid(assemble([]))
-        self.robot = Robot(self.rigid, load("vinebot"), "anna")
+        self.robot = Robot(self.rigid, load_description("vinebot"), "anna")
         self.controller = TrajectoryController(self.robot, ARM, **tolerances)
         self.home = self.robot.setpoint[self.controller.indices].copy()
         self.time = 0.0
         self.rows: list[np.ndarray] = []
 
-    def run(self, seconds: float, until: Run | None = None) -> None:
+    def run(self, seconds: float, until: GoalHandle | None = None) -> None:
         """Go on for some time, or until a trajectory has ended."""
         for _ in range(round(seconds / self.rigid.dt)):
-            if until is not None and until.done:
+            if until is not None and until.is_done:
                 return
             self.controller(self.time)
             self.robot.control(self.time)
@@ -91,17 +91,17 @@ def test_controller_says_where_it_should_be_and_is() -> None:
     stage = Stage()
     stage.controller.start(swing(stage), 0.0)
     stage.run(1.5)
-    state = stage.controller.following(stage.time)
+    state = stage.controller.state(stage.time)
     assert state.joints == ARM
     np.testing.assert_allclose(state.position, stage.at())
     assert np.abs(state.error).max() < 0.01
-    assert np.abs(state.wanted_velocity[[0, 3]]).min() > 0.05
-    assert (state.wanted_velocity[[1, 2, 4, 5, 6]] == 0.0).all()
+    assert np.abs(state.desired_velocity[[0, 3]]).min() > 0.05
+    assert (state.desired_velocity[[1, 2, 4, 5, 6]] == 0.0).all()
 
 
 def test_a_trajectory_too_fast_for_the_drives_breaks_its_path_tolerance() -> None:
     """The URDF allows 1.9 rad/s; 1.2 rad in 0.2 s are three times as fast. The arm stops where it is."""
-    stage = Stage(path=Tolerance.of(7, position=0.1))
+    stage = Stage(path_tolerance=Tolerance.uniform(7, position=0.1))
     run = stage.controller.start(Trajectory(TWO, np.array([0.2]), stage.at(TWO) + np.array([[1.2, 0.0]])), 0.0)
     stage.run(1.0, until=run)
     assert run.outcome is Outcome.PATH_TOLERANCE_VIOLATED
@@ -112,11 +112,11 @@ def test_a_trajectory_too_fast_for_the_drives_breaks_its_path_tolerance() -> Non
     assert np.abs(stage.at() - stopped).max() < 0.12
     assert np.abs(stage.rows[-1][1]).max() < 1e-3
     speeds = np.abs(np.array(stage.rows)[:, 1, 0])
-    assert speeds.max() < 1.1 * stage.robot.speed[stage.controller.indices[0]]
+    assert speeds.max() < 1.1 * stage.robot.max_velocity[stage.controller.indices[0]]
 
 
 def test_a_blocked_arm_misses_its_goal_in_time() -> None:
-    stage = Stage(goal=Tolerance.of(7, position=0.01), goal_time=0.5)
+    stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01), goal_time_tolerance=0.5)
     stage.rigid.push("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
     run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
     stage.run(3.0, until=run)
@@ -126,21 +126,24 @@ def test_a_blocked_arm_misses_its_goal_in_time() -> None:
 
 
 def test_without_a_limit_of_time_it_waits_until_the_goal_is_met() -> None:
-    stage = Stage(goal=Tolerance.of(7, position=0.01))
+    stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01))
     stage.rigid.push("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
     run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
     stage.run(3.0, until=run)
-    assert not run.done
+    assert not run.is_done
     stage.rigid.push("anna", "arm_left_4_link", np.zeros(3))
     stage.run(3.0, until=run)
     assert run.outcome is Outcome.SUCCESSFUL
 
 
 def test_a_tolerance_of_the_trajectory_goes_before_the_controllers() -> None:
-    stage = Stage(path=Tolerance.of(7, position=1e-9))
+    stage = Stage(path_tolerance=Tolerance.uniform(7, position=1e-9))
     loose = swing(stage)
-    for tolerance, outcome in ((None, Outcome.PATH_TOLERANCE_VIOLATED), (Tolerance.of(2, 0.05), Outcome.SUCCESSFUL)):
-        plan = Trajectory(TWO, loose.times, loose.positions, loose.velocities, path=tolerance)
+    for tolerance, outcome in (
+        (None, Outcome.PATH_TOLERANCE_VIOLATED),
+        (Tolerance.uniform(2, 0.05), Outcome.SUCCESSFUL),
+    ):
+        plan = Trajectory(TWO, loose.times, loose.positions, loose.velocities, path_tolerance=tolerance)
         run = stage.controller.start(plan, stage.time)
         stage.run(4.0, until=run)
         assert run.outcome is outcome
@@ -176,7 +179,7 @@ def test_cancelling_stops_where_it_is() -> None:
 def test_a_trajectory_may_begin_later_and_must_not_be_over() -> None:
     stage = Stage()
     plan = swing(stage)
-    later = Trajectory(TWO, plan.times, plan.positions, plan.velocities, start=0.5)
+    later = Trajectory(TWO, plan.times, plan.positions, plan.velocities, start_time=0.5)
     run = stage.controller.start(later, 0.0)
     stage.run(0.5)
     np.testing.assert_allclose(stage.at(), stage.home, atol=1e-4)
@@ -204,8 +207,8 @@ def test_trajectories_that_make_no_sense_are_refused_and_change_nothing() -> Non
             stage.controller.start(Trajectory(joints, times, positions), 0.0)
         assert error.value.code is code
     with pytest.raises(TrajectoryError, match="path tolerances for 7 joints"):
-        stage.controller.start(Trajectory(TWO, one, here[None], path=Tolerance.of(7)), 0.0)
-    assert not run.done
+        stage.controller.start(Trajectory(TWO, one, here[None], path_tolerance=Tolerance.uniform(7)), 0.0)
+    assert not run.is_done
 
 
 def test_two_runs_are_the_same_to_the_bit() -> None:

@@ -7,8 +7,8 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.robot.control.waypoint_follower import PATIENCE, Way
-from vinesim.robot.description.description import load
+from vinesim.robot.control.waypoint_follower import STUCK_TIMEOUT, WaypointFollower
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
 
@@ -17,10 +17,10 @@ def heading(pose: np.ndarray) -> float:
     return 2.0 * float(np.arctan2(pose[5], pose[6]))
 
 
-def drive(way: Way, seconds: float = 60.0) -> np.ndarray:
+def drive(way: WaypointFollower, seconds: float = 60.0) -> np.ndarray:
     """Poses of the base [tick, 7] until the way is done, or the base stuck."""
     robot, poses = way.robot, []
-    while not way.done and not way.stuck and len(poses) < 100 * seconds:
+    while not way.is_done and not way.is_stuck and len(poses) < 100 * seconds:
         time = 0.01 * len(poses)
         way.control(time)
         robot.control(time)
@@ -32,11 +32,11 @@ def drive(way: Way, seconds: float = 60.0) -> np.ndarray:
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_points_are_passed_in_their_order_and_the_heading_is_the_last(backwards: bool):
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
     points = np.array([[1.0, 0.5], [1.0, 1.5], [0.2, 1.0]])
-    way = Way(robot, points, 2.0, backwards=backwards)
+    way = WaypointFollower(robot, points, 2.0, reverse=backwards)
     poses = drive(way)
-    assert way.done
+    assert way.is_done
     off = np.linalg.norm(poses[:, None, :2] - points, axis=-1)
     assert (off.min(0) < 0.015).all()
     assert (np.diff(off.argmin(0)) > 0).all()
@@ -49,18 +49,18 @@ def test_points_are_passed_in_their_order_and_the_heading_is_the_last(backwards:
 
 
 def test_a_base_keeps_to_its_speeds():
-    robot = Robot(Rigid(assemble([])), load("vinebot"), "anna")
-    poses = drive(Way(robot, np.array([[2.0, 0.0]]), 1.0, speed=0.4, turn=0.3))
+    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    poses = drive(WaypointFollower(robot, np.array([[2.0, 0.0]]), 1.0, speed=0.4, turn_rate=0.3))
     assert np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).max() / 0.01 < 1.1 * 0.4
     assert np.abs(np.diff([heading(pose) for pose in poses])).max() / 0.01 < 1.1 * 0.3
 
 
 def test_an_obstacle_is_noticed():
     wall = {"fixed_start": [[1.0, 0.0, -0.3]], "fixed_end": [[1.0, 0.0, 2.0]], "fixed_radius": [[0.1, 0.1]]}
-    robot = Robot(Rigid(assemble([], **wall)), load("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0]))
-    way = Way(robot, np.array([[2.0, 0.0]]))
+    robot = Robot(Rigid(assemble([], **wall)), load_description("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0]))
+    way = WaypointFollower(robot, np.array([[2.0, 0.0]]))
     poses = drive(way, 30.0)
-    assert way.stuck
-    assert not way.done
+    assert way.is_stuck
+    assert not way.is_done
     assert poses[-1][0] < 1.0
-    assert len(poses) > 100 * PATIENCE
+    assert len(poses) > 100 * STUCK_TIMEOUT

@@ -16,8 +16,8 @@ from vinesim import frames
 from vinesim.ros import ros_setup
 
 pytestmark = pytest.mark.ros
-if ros_setup.available() is not None:
-    pytest.skip(str(ros_setup.available()), allow_module_level=True)
+if ros_setup.unavailable_reason() is not None:
+    pytest.skip(str(ros_setup.unavailable_reason()), allow_module_level=True)
 
 from geometry_msgs.msg import TransformStamped, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
@@ -26,7 +26,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from vinesim.ros.messages import convert, interfaces
-from vinesim.ros.messages.transforms import Transforms, split
+from vinesim.ros.messages.transforms import SerializedTransforms, split_time
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
@@ -75,14 +75,14 @@ def points(cloud: PointCloud2) -> np.ndarray:
 
 @given(st.integers(0, 2**31 * 10**6 - 1))
 def test_stamp_keeps_every_microsecond(microseconds):
-    seconds, nanoseconds = split(microseconds * 1e-6)
+    seconds, nanoseconds = split_time(microseconds * 1e-6)
     assert 0 <= nanoseconds < 10**9
     assert abs(seconds * 10**9 + nanoseconds - microseconds * 1000) <= 300  # half a float64 spacing at 2^31 s
 
 
 def test_stamp_of_ticks_is_exact():
     for tick in range(0, 400_000, 37):
-        seconds, nanoseconds = split(tick / 100)
+        seconds, nanoseconds = split_time(tick / 100)
         assert seconds * 100 + nanoseconds // 10_000_000 == tick
         assert nanoseconds % 10_000_000 == 0
 
@@ -229,7 +229,7 @@ def test_joint_state_round_trip_is_exact():
 
 
 def test_odometry_velocity_is_in_the_axes_of_the_base():
-    turned = frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(math.pi / 2))
+    turned = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(math.pi / 2))
     ahead = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.3])  # it looks along world y, and drives there
     sample = RobotSample("r", joint_sample(), turned, ahead, turned, (), np.zeros((0, 7)))
     twist = over_the_wire(convert.odometry(sample, "base_footprint")).twist.twist
@@ -238,7 +238,7 @@ def test_odometry_velocity_is_in_the_axes_of_the_base():
 
 
 def test_wrench_is_the_same_force_seen_from_the_link():
-    link = frames.pose(np.array([1.0, 0.0, 1.0]), frames.yaw(math.pi / 2))
+    link = frames.pose(np.array([1.0, 0.0, 1.0]), frames.from_yaw(math.pi / 2))
     force, position = np.array([0.0, 2.0, 0.0]), np.array([1.5, 0.0, 1.0])
     contact = Contact("r", "finger", 3, position, force, -0.001)
     message = over_the_wire(convert.wrench(contact, 1.0, "finger", link)).wrench
@@ -249,12 +249,12 @@ def test_wrench_is_the_same_force_seen_from_the_link():
 
 
 def test_transforms_equal_stock_serialisation_field_for_field():
-    interfaces.ensure(["tf2_msgs"])
+    interfaces.ensure_importable(["tf2_msgs"])
     from tf2_msgs.msg import TFMessage
 
     pairs = [("map", "odom"), ("odom", "b"), ("b", "arm_left_1_link"), ("", "xyz"), ("é", "four")]
     rng = np.random.default_rng(2)
-    buffer = Transforms(pairs)
+    buffer = SerializedTransforms(pairs)
     for time in (1.5, 2.25):  # the same buffer again: nothing of the first remains
         poses = rng.normal(size=(len(pairs), 7))
         stock = TFMessage()
@@ -267,12 +267,12 @@ def test_transforms_equal_stock_serialisation_field_for_field():
         ours = buffer.message(time, poses)
         assert deserialize_message(ours, TFMessage) == stock
         assert len(ours) == len(serialize_message(stock))  # only the padding may differ: stock leaves it as it was
-    assert deserialize_message(Transforms([]).message(0.0, np.zeros((0, 7))), TFMessage) == TFMessage()
+    assert deserialize_message(SerializedTransforms([]).message(0.0, np.zeros((0, 7))), TFMessage) == TFMessage()
 
 
 def test_transforms_want_one_pose_per_frame():
     with pytest.raises(ValueError, match=r"shape \(2, 7\), expected \(1, 7\)"):
-        Transforms([("a", "b")]).message(0.0, np.zeros((2, 7)))
+        SerializedTransforms([("a", "b")]).message(0.0, np.zeros((2, 7)))
 
 
 def test_base_velocity_comes_back():

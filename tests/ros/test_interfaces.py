@@ -15,7 +15,7 @@ from vinesim.ros.messages import interfaces
 
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.skipif(ros_setup.available() is not None, reason=str(ros_setup.available())),
+    pytest.mark.skipif(ros_setup.unavailable_reason() is not None, reason=str(ros_setup.unavailable_reason())),
 ]
 
 # As `ros2 topic info --verbose /tf` prints it on ROS 2 Jazzy.
@@ -28,7 +28,7 @@ ASK_HASHES = """
 import rclpy
 from rclpy.context import Context
 from vinesim.ros import interfaces
-interfaces.ensure(["tf2_msgs"])
+interfaces.ensure_importable(["tf2_msgs"])
 from tf2_msgs.msg import TF2Error, TFMessage
 context = Context()
 context.init([])
@@ -81,7 +81,7 @@ def test_what_can_be_imported_is_not_built(own_cache, monkeypatch):
         raise AssertionError(f"built {package}")
 
     monkeypatch.setattr(interfaces, "build", refuse)
-    interfaces.ensure(["std_msgs", "sensor_msgs"])
+    interfaces.ensure_importable(["std_msgs", "sensor_msgs"])
 
 
 def test_unknown_package_names_the_folder():

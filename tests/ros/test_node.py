@@ -20,8 +20,8 @@ from vinesim import frames
 from vinesim.ros import ros_setup
 
 pytestmark = pytest.mark.ros
-if ros_setup.available() is not None:
-    pytest.skip(str(ros_setup.available()), allow_module_level=True)
+if ros_setup.unavailable_reason() is not None:
+    pytest.skip(str(ros_setup.unavailable_reason()), allow_module_level=True)
 
 import rclpy
 from geometry_msgs.msg import TwistStamped, WrenchStamped
@@ -35,10 +35,10 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from vinesim.ros.commands.types import BaseVelocity, JointPositions
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
 from vinesim.ros.node import Node
-from vinesim.ros.tools.topic_monitor import Ear
+from vinesim.ros.tools.topic_monitor import TopicStats
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
-PATIENCE = 30.0
+TIMEOUT = 120.0
 """Longest wait for anything [s]; reached only by a failure."""
 
 REST = frames.pose(np.zeros(3))
@@ -56,16 +56,16 @@ def own_domain(monkeypatch, tmp_path_factory):
 
 
 def wait_until(condition: Callable[[], object], meanwhile: Callable[[], object] = lambda: time.sleep(0.01)) -> None:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while not condition():
-        assert time.monotonic() < deadline, f"waited {PATIENCE} s in vain"
+        assert time.monotonic() < deadline, f"waited {TIMEOUT} s in vain"
         meanwhile()
 
 
 def robot_sample(t: float, actor: str = "vinebot", contacts: tuple[Contact, ...] = ()) -> RobotSample:
     zeros = np.zeros(len(JOINTS))
     joints = JointSample(t, JOINTS, zeros + t, zeros, zeros, zeros)
-    base = frames.pose(np.array([1.0, 2.0, 0.0]), frames.yaw(np.pi / 2))
+    base = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(np.pi / 2))
     return RobotSample(actor, joints, base, np.zeros(6), REST, FRAMES, np.tile(REST, (len(FRAMES), 1)), contacts)
 
 
@@ -92,8 +92,8 @@ def lidar_scan(t: float, count: int) -> LidarScan:
 
 
 @contextlib.contextmanager
-def witness(*topics: str) -> Iterator[Callable[[], dict]]:
-    """A stranger in a second process; call what is yielded to have its report."""
+def topic_monitor(*topics: str) -> Iterator[Callable[[], dict]]:
+    """A peer in a second process; call what is yielded to have its report."""
     asked = [word for topic in topics for word in ("--topic", topic)]
     process = subprocess.Popen(
         [sys.executable, "-m", "vinesim.ros.tools.topic_monitor", *asked],
@@ -103,7 +103,7 @@ def witness(*topics: str) -> Iterator[Callable[[], dict]]:
     )
 
     def report() -> dict:
-        out, _ = process.communicate(timeout=PATIENCE)
+        out, _ = process.communicate(timeout=TIMEOUT)
         assert process.returncode == 0
         return json.loads(out)
 
@@ -115,20 +115,20 @@ def witness(*topics: str) -> Iterator[Callable[[], dict]]:
             process.communicate()
 
 
-class Stranger:
+class StockNode:
     """A stock node with a context of its own."""
 
     def __init__(self) -> None:
         self._context = Context()
         self._context.init([])
-        self.node = rclpy.create_node("stranger", context=self._context)
+        self.node = rclpy.create_node("stock_node", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 
     def spin(self) -> None:
         self._executor.spin_once(timeout_sec=0.05)
 
-    def __enter__(self) -> Stranger:
+    def __enter__(self) -> StockNode:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -137,7 +137,7 @@ class Stranger:
         self._context.shutdown()
 
 
-def test_large_messages_reach_a_stranger():
+def test_large_messages_reach_another_process():
     """The gate: at 100 Hz ticks, 30 Hz RGB and depth and 10 Hz clouds of 100k points, 95 % arrive."""
     small = ("/clock", "/joint_states", "/tf")
     large = ("/head_front_camera/rgb/image_raw", "/head_front_camera/depth/image_raw", "/lidar/points")
@@ -145,10 +145,10 @@ def test_large_messages_reach_a_stranger():
     static = [("base_footprint", "base_link", REST)]
     with (
         Node("vinebot", URDF, static_transforms=static, cameras=["head_front_camera"], lidars=["lidar"]) as node,
-        witness(*small, *large, *latched) as report,
+        topic_monitor(*small, *large, *latched) as report,
     ):
         heard = [name if name == "/clock" else name[1:] for name in (*small, *large, *latched)]
-        wait_until(lambda: all(node.wanted(name) for name in heard))
+        wait_until(lambda: all(node.has_subscribers(name) for name in heard))
         ticks, offered = 400, dict.fromkeys((*small, *large), 0)
         due = time.monotonic()
         for tick in range(ticks):
@@ -156,7 +156,7 @@ def test_large_messages_reach_a_stranger():
             due = max(due + 0.01, time.monotonic())
             time.sleep(max(due - time.monotonic(), 0.0))
             t = tick / 100
-            node.publish_tick(t, robot_sample(t))
+            node.publish_robot_state(t, robot_sample(t))
             for name in small:
                 offered[name] += 1
             if tick * 3 % 10 < 3:
@@ -166,14 +166,14 @@ def test_large_messages_reach_a_stranger():
             if tick % 10 == 0:
                 node.publish_lidar(lidar_scan(t, 100_000))
                 offered[large[2]] += 1
-        wait_until(lambda: not node.busy)
+        wait_until(lambda: not node.has_pending)
         received = report()
     assert offered[large[0]] == 120
     for name, count in offered.items():
         assert received[name]["count"] >= 0.95 * count, (name, received[name])
         assert received[name]["stamps_rise"], name
     assert received["/lidar/points"]["bytes"] >= 0.95 * 40 * 100_000 * 24
-    for name in latched:  # published before the stranger was born
+    for name in latched:  # published before the peer was born
         assert received[name]["count"] == 1, name
 
 
@@ -182,14 +182,14 @@ def test_every_topic_is_heard_with_its_official_type():
     names, poses = ("bunch_00001", "bunch_00002"), np.tile(REST, (2, 1))
     with (
         Node("vinebot", URDF, cameras=["head_front_camera"], lidars=["lidar"]) as node,
-        witness() as report,
+        topic_monitor() as report,
     ):
         node.publish_environment_static(("pole_0",), poses[:1])
         ticks = iter(range(10**6))
 
         def tick() -> None:
             t = next(ticks) / 100
-            node.publish_tick(t, robot_sample(t, contacts=(contact,)))
+            node.publish_robot_state(t, robot_sample(t, contacts=(contact,)))
             node.publish_camera(camera_frame(t, 32, 24))
             node.publish_lidar(lidar_scan(t, 10))
             node.publish_environment(t, names, poses)
@@ -230,19 +230,19 @@ TYPES = {
 def test_nothing_is_built_for_nobody(monkeypatch):
     with (
         Node("vinebot", URDF, cameras=["head_front_camera"], lidars=["lidar"]) as node,
-        Stranger() as stranger,
+        StockNode() as peer,
     ):
         heard: list[JointState] = []
-        stranger.node.create_subscription(JointState, "/joint_states", heard.append, 10)
-        wait_until(lambda: node.wanted("joint_states"))
-        assert not node.wanted("head_front_camera")
-        assert not node.wanted("lidar")
+        peer.node.create_subscription(JointState, "/joint_states", heard.append, 10)
+        wait_until(lambda: node.has_subscribers("joint_states"))
+        assert not node.has_subscribers("head_front_camera")
+        assert not node.has_subscribers("lidar")
 
         def tick() -> None:
-            node.publish_tick(1.0, robot_sample(1.0))
+            node.publish_robot_state(1.0, robot_sample(1.0))
             node.publish_camera(camera_frame(1.0, 32, 24))
             node.publish_lidar(lidar_scan(1.0, 10))
-            stranger.spin()
+            peer.spin()
 
         wait_until(lambda: len(heard) >= 20, tick)
         sent = {name for name, count in node.sent.items() if count and name not in LATCHED}
@@ -250,29 +250,29 @@ def test_nothing_is_built_for_nobody(monkeypatch):
         assert not any(node.dropped[name] for name in node.dropped if name != "joint_states")
 
 
-def test_wanted_goes_by_family_and_knows_its_topics():
-    with Node("vinebot", URDF, cameras=["left", "left_arm"]) as node, Stranger() as stranger:
+def test_subscribers_are_counted_by_family_and_knows_its_topics():
+    with Node("vinebot", URDF, cameras=["left", "left_arm"]) as node, StockNode() as peer:
         from sensor_msgs.msg import Image
 
-        subscription = stranger.node.create_subscription(
+        subscription = peer.node.create_subscription(
             Image, "/left_arm/depth/image_raw", lambda _: None, rclpy.qos.qos_profile_sensor_data
         )
-        wait_until(lambda: node.wanted("left_arm/depth/image_raw"))
-        assert node.wanted("left_arm")
-        assert node.wanted("left_arm/depth")
-        assert not node.wanted("left_arm/rgb")
-        assert not node.wanted("left")  # a name that the other begins with
-        stranger.node.destroy_subscription(subscription)
-        wait_until(lambda: not node.wanted("left_arm"))
+        wait_until(lambda: node.has_subscribers("left_arm/depth/image_raw"))
+        assert node.has_subscribers("left_arm")
+        assert node.has_subscribers("left_arm/depth")
+        assert not node.has_subscribers("left_arm/rgb")
+        assert not node.has_subscribers("left")  # a name that the other begins with
+        peer.node.destroy_subscription(subscription)
+        wait_until(lambda: not node.has_subscribers("left_arm"))
         with pytest.raises(ValueError, match=r"no topic 'right'; there are: /clock, diagnostics"):
-            node.wanted("right")
+            node.has_subscribers("right")
 
 
 def test_commands_come_back():
-    with Node("vinebot", URDF) as node, Stranger() as stranger:
-        velocity = stranger.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)
-        forward = stranger.node.create_publisher(Float64MultiArray, "/forward_position_controller/commands", 10)
-        arm = stranger.node.create_publisher(JointTrajectory, "/arm_left_controller/joint_trajectory", 10)
+    with Node("vinebot", URDF) as node, StockNode() as peer:
+        velocity = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)
+        forward = peer.node.create_publisher(Float64MultiArray, "/forward_position_controller/commands", 10)
+        arm = peer.node.create_publisher(JointTrajectory, "/arm_left_controller/joint_trajectory", 10)
         wait_until(lambda: all(p.get_subscription_count() for p in (velocity, forward, arm)))
 
         twist = TwistStamped()
@@ -296,14 +296,14 @@ def test_commands_come_back():
 
 
 def test_a_set_point_replaces_the_older_and_nonsense_is_refused():
-    with Node("vinebot", URDF) as node, Stranger() as stranger:
-        velocity = stranger.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 100)
+    with Node("vinebot", URDF) as node, StockNode() as peer:
+        velocity = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 100)
         wait_until(velocity.get_subscription_count)
         twist = TwistStamped()
         for speed in (*np.linspace(0.0, 1.0, 21), float("nan")):
             twist.twist.linear.x = float(speed)
             velocity.publish(twist)
-        wait_until(lambda: node._commands.refused)  # the last one: all others have come before it
+        wait_until(lambda: node._commands.rejected)  # the last one: all others have come before it
         commands = node.commands()
         assert [c.linear[0] for c in commands if isinstance(c, BaseVelocity)] == [1.0]
 
@@ -312,44 +312,44 @@ def test_two_robots_in_one_process_under_namespaces():
     with (
         Node("one", "<robot name='one'/>", namespace="robot_1") as one,
         Node("two", "<robot name='two'/>", namespace="robot_2", clock=False) as two,
-        Stranger() as stranger,
+        StockNode() as peer,
     ):
         states: dict[str, list[float]] = {"robot_1": [], "robot_2": []}
         urdfs: dict[str, str] = {}
         late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for name in states:
-            stranger.node.create_subscription(
+            peer.node.create_subscription(
                 JointState, f"/{name}/joint_states", lambda m, name=name: states[name].append(m.position[0]), 10
             )
-            stranger.node.create_subscription(
+            peer.node.create_subscription(
                 String, f"/{name}/robot_description", lambda m, name=name: urdfs.update({name: m.data}), late
             )
 
         def tick() -> None:
-            one.publish_tick(1.0, robot_sample(1.0))
-            two.publish_tick(2.0, robot_sample(2.0))
-            stranger.spin()
+            one.publish_robot_state(1.0, robot_sample(1.0))
+            two.publish_robot_state(2.0, robot_sample(2.0))
+            peer.spin()
 
         wait_until(lambda: all(states.values()) and len(urdfs) == 2, tick)
         assert set(states["robot_1"]) == {1.0}
         assert set(states["robot_2"]) == {2.0}
         assert urdfs == {"robot_1": "<robot name='one'/>", "robot_2": "<robot name='two'/>"}
-        topics = {name for name, _ in stranger.node.get_topic_names_and_types()}
+        topics = {name for name, _ in peer.node.get_topic_names_and_types()}
         assert {"/robot_1/tf", "/robot_2/tf", "/clock"} <= topics
         assert "/tf" not in topics
-        assert len(stranger.node.get_publishers_info_by_topic("/clock")) == 1
+        assert len(peer.node.get_publishers_info_by_topic("/clock")) == 1
 
 
 def test_frames_lead_from_the_map_to_the_fingers():
     from vinesim.ros.messages import interfaces
 
-    interfaces.ensure(["tf2_msgs"])
+    interfaces.ensure_importable(["tf2_msgs"])
     from tf2_msgs.msg import TFMessage
 
-    with Node("vinebot", URDF) as node, Stranger() as stranger:
+    with Node("vinebot", URDF) as node, StockNode() as peer:
         heard: list[TFMessage] = []
-        stranger.node.create_subscription(TFMessage, "/tf", heard.append, 100)
-        wait_until(lambda: heard, lambda: (node.publish_tick(3.21, robot_sample(3.21)), stranger.spin()))
+        peer.node.create_subscription(TFMessage, "/tf", heard.append, 100)
+        wait_until(lambda: heard, lambda: (node.publish_robot_state(3.21, robot_sample(3.21)), peer.spin()))
         tree = {t.child_frame_id: t for t in heard[0].transforms}
         assert [tree[child].header.frame_id for child in ("odom", "base_footprint", "arm_left_1_link")] == [
             "map",
@@ -379,11 +379,11 @@ def test_contacts_are_wrenches_of_the_touching_link():
     contact = Contact("vinebot", "vinebot/tip", 5, np.array([1.0, 3.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.0)
     nowhere = Contact("vinebot", "vinebot/unknown", 5, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.0)
     static = [("base_footprint", "tip", frames.pose(np.array([0.5, 0.0, 0.0])))]
-    with Node("vinebot", URDF, static_transforms=static) as node, Stranger() as stranger:
+    with Node("vinebot", URDF, static_transforms=static) as node, StockNode() as peer:
         heard: list[WrenchStamped] = []
-        stranger.node.create_subscription(WrenchStamped, "/vine/contacts", heard.append, 10)
+        peer.node.create_subscription(WrenchStamped, "/vine/contacts", heard.append, 10)
         sample = robot_sample(1.0, contacts=(contact, nowhere))
-        wait_until(lambda: len(heard) >= 2, lambda: (node.publish_tick(1.0, sample), stranger.spin()))
+        wait_until(lambda: len(heard) >= 2, lambda: (node.publish_robot_state(1.0, sample), peer.spin()))
         by_frame = {message.header.frame_id: message.wrench for message in heard}
         # The base stands at (1, 2) and looks along +y: the tip is at (1, 2.5), the contact half a metre ahead of it.
         assert (by_frame["tip"].force.z, by_frame["tip"].torque.y) == pytest.approx((5.0, -2.5))
@@ -397,14 +397,14 @@ def test_the_newest_replaces_what_waits_and_is_counted():
 
         def slow() -> JointState:
             busy.set()
-            go.wait(PATIENCE)
+            go.wait(TIMEOUT)
             return JointState()
 
-        node._offer([(topic, slow)], always=True)
-        assert busy.wait(PATIENCE)
+        node._enqueue([(topic, slow)], always=True)
+        assert busy.wait(TIMEOUT)
         built = []
         for i in range(5):  # the simulation does not wait while the first is in the making
-            node._offer([(topic, lambda i=i: built.append(i) or JointState())], always=True)
+            node._enqueue([(topic, lambda i=i: built.append(i) or JointState())], always=True)
         go.set()
         wait_until(lambda: topic.sent == 2)
         assert built == [4]
@@ -416,9 +416,9 @@ def test_a_message_that_cannot_be_built_is_counted_and_the_rest_goes_on(caplog):
         topic = node._topics["joint_states"]
         for _ in range(3):
             before = topic.dropped
-            node._offer([(topic, lambda: 1 / 0)], always=True)
+            node._enqueue([(topic, lambda: 1 / 0)], always=True)
             wait_until(lambda before=before: topic.dropped == before + 1)
-        node._offer([(topic, JointState)], always=True)
+        node._enqueue([(topic, JointState)], always=True)
         wait_until(lambda: topic.sent == 1)
     assert [r.message for r in caplog.records if "could not publish" in r.message] == [
         "could not publish joint_states; further failures are only counted"
@@ -430,7 +430,7 @@ def test_closing_leaves_nothing_behind():
     for _ in range(3):
         node = Node("vinebot", URDF, cameras=["head_front_camera"])
         assert signal.getsignal(signal.SIGINT) is handler
-        node.publish_tick(0.0, robot_sample(0.0))
+        node.publish_robot_state(0.0, robot_sample(0.0))
         node.close()
         node.close()
     assert set(threading.enumerate()) == threads
@@ -458,18 +458,18 @@ def test_unknown_camera_is_named():
         node.publish_camera(camera_frame(0.0, 32, 24, name="right"))
 
 
-def test_the_witness_counts_gaps_and_stamps_that_go_back():
+def test_the_monitor_counts_gaps_and_stamps_that_go_back():
     from rclpy.serialization import serialize_message
     from rosgraph_msgs.msg import Clock
 
     from vinesim.ros.messages import convert
 
-    ear = Ear("rosgraph_msgs/msg/Clock", "RIHS01_", Clock, publishers=1)
+    ear = TopicStats("rosgraph_msgs/msg/Clock", "RIHS01_", Clock, publishers=1)
     for sequence, t in ((4, 1.0), (5, 1.01), (8, 1.04)):
         info = {"source_timestamp": time.time_ns() - 5_000_000, "publication_sequence_number": sequence}
-        ear.hear(serialize_message(convert.clock(t)), info)
+        ear.add(serialize_message(convert.clock(t)), info)
     report = ear.report()
     assert (report["count"], report["lost"], report["stamps_rise"], report["bytes"]) == (3, 2, True, 36)
     assert report["latency_ms"] >= 5.0
-    ear.hear(serialize_message(convert.clock(0.5)), info)
+    ear.add(serialize_message(convert.clock(0.5)), info)
     assert not ear.report()["stamps_rise"]

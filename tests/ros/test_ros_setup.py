@@ -18,23 +18,23 @@ wheels_only = pytest.mark.skipif(not WHEELS, reason="ROS 2 is not installed as w
 @wheels_only
 def test_wheels_beside_a_sourced_ros_are_refused(monkeypatch):
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy:/srv/ws")
-    assert "sourced from /opt/ros/jazzy as well" in str(ros_setup.available())
+    assert "sourced from /opt/ros/jazzy as well" in str(ros_setup.unavailable_reason())
     with pytest.raises(ros_setup.RosUnavailableError, match="nothing is sourced"):
-        ros_setup.prepare()
+        ros_setup.configure()
 
 
 @pytest.mark.ros
 @wheels_only
 def test_wheels_without_their_library_path_are_refused(monkeypatch):
     monkeypatch.setenv("LD_LIBRARY_PATH", "/usr/lib")
-    assert "did not get to set LD_LIBRARY_PATH" in str(ros_setup.available())
+    assert "did not get to set LD_LIBRARY_PATH" in str(ros_setup.unavailable_reason())
 
 
 @pytest.mark.ros
 @wheels_only
 def test_a_middleware_that_the_wheels_lack_is_refused(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
-    assert "RMW_IMPLEMENTATION is 'rmw_cyclonedds_cpp'" in str(ros_setup.available())
+    assert "RMW_IMPLEMENTATION is 'rmw_cyclonedds_cpp'" in str(ros_setup.unavailable_reason())
 
 
 def test_without_ros_the_extra_is_named(monkeypatch):
@@ -44,7 +44,7 @@ def test_without_ros_the_extra_is_named(monkeypatch):
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    assert ros_setup.available() == (
+    assert ros_setup.unavailable_reason() == (
         "ROS 2 is missing (No module named 'rclpy.node'); pip install 'vinesim[ros]', "
         "or source a ROS 2 Jazzy installation"
     )
@@ -54,20 +54,20 @@ def test_without_ros_the_extra_is_named(monkeypatch):
 @wheels_only
 def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
     monkeypatch.delenv(ros_setup.PROFILE_VARIABLE, raising=False)
-    ros_setup.prepare()
-    assert os.environ[ros_setup.PROFILE_VARIABLE] == str(ros_setup.PROFILE)
-    ros_setup.without_profile()
+    ros_setup.configure()
+    assert os.environ[ros_setup.PROFILE_VARIABLE] == str(ros_setup.PROFILE_FILE)
+    ros_setup.clear_profile()
     assert ros_setup.PROFILE_VARIABLE not in os.environ
 
     monkeypatch.setenv(ros_setup.PROFILE_VARIABLE, "/srv/own.xml")
-    ros_setup.prepare()
-    ros_setup.without_profile()
+    ros_setup.configure()
+    ros_setup.clear_profile()
     assert os.environ[ros_setup.PROFILE_VARIABLE] == "/srv/own.xml"
 
 
 def test_the_segment_holds_several_of_the_largest_messages():
     space = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
-    root = ElementTree.parse(ros_setup.PROFILE).getroot()
+    root = ElementTree.parse(ros_setup.PROFILE_FILE).getroot()
     segment = int(root.findtext(f".//{space}segment_size") or 0)
     message = int(root.findtext(f".//{space}maxMessageSize") or 0)
     organised_cloud = 640 * 480 * 16

@@ -16,11 +16,11 @@ from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.rigid.static_world import CRATE_WALL
 from vinesim.robot.description import description
 from vinesim.scene import appearance
-from vinesim.scene.appearance import FigureError
+from vinesim.scene.appearance import AppearanceError
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import HumanSpec, Link, Mesh, Shape
 from vinesim.sensors.camera.camera import Camera
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene import rigid_primitives
 
 ROOM = 0.06
@@ -30,7 +30,7 @@ SIZES = [(0.6, 0.4, 0.15), (0.6, 0.4, 0.24), (0.6, 0.4, 0.3), (0.4, 0.3, 0.24)]
 
 def person(name: str, height: float = 1.75) -> Rigid:
     rigid = Rigid(sensor_scenes.empty())
-    pose = appearance.posed(standing(frames.pose(np.zeros(3)), height), name, height)
+    pose = appearance.apply_posture(standing(frames.pose(np.zeros(3)), height), name, height)
     rigid.add_human(HumanSpec("eva", 4, pose, height))
     rigid.prep()
     rigid.finish()
@@ -40,7 +40,7 @@ def person(name: str, height: float = 1.75) -> Rigid:
 def silhouette(shapes: tuple[Link, ...], poses: np.ndarray, eye: np.ndarray) -> np.ndarray:
     """Pixels [height, width] that show a person who stands at the origin."""
     primitives, _ = sensor_scenes.world(*shapes, at=poses)
-    _, seen = sensor_scenes.raster(primitives, looking(eye, np.array([0.0, 0.0, 0.95])))
+    _, seen = sensor_scenes.raster(primitives, look_at(eye, np.array([0.0, 0.0, 0.95])))
     names = np.where(seen >= 0, primitives.label[np.maximum(seen, 0)], 0)
     return names == label(Organ.HUMAN, 4)
 
@@ -77,7 +77,7 @@ def test_everything_drawn_of_somebody_carries_that_label() -> None:
 
 
 def test_left_mirrors_right() -> None:
-    parts = appearance.person(1.75).parts
+    parts = appearance.load_human_model(1.75).parts
     for name in (name for name in parts if name.startswith("left_")):
         for one, other in zip(parts[name], parts[name.replace("left_", "right_")], strict=True):
             assert (one.kind, one.size, one.rgba, one.surface) == (other.kind, other.size, other.rgba, other.surface)
@@ -94,7 +94,7 @@ def volume(corners: np.ndarray) -> float:
 
 
 def meshes() -> list[Mesh]:
-    return [s.mesh for shapes in appearance.person(1.75).parts.values() for s in shapes if s.mesh]
+    return [s.mesh for shapes in appearance.load_human_model(1.75).parts.values() for s in shapes if s.mesh]
 
 
 def test_meshes_face_outward() -> None:
@@ -111,7 +111,7 @@ def test_meshes_face_outward() -> None:
 def test_a_head_is_as_large_as_a_head() -> None:
     """Volume of a head of 197 mm x 154 mm x 231 mm, between its ellipsoid and its box."""
     corners = np.concatenate(
-        [s.mesh.corners for s in appearance.person(1.75).parts["head"][:8] if s.mesh and s.surface == "skin"]
+        [s.mesh.corners for s in appearance.load_human_model(1.75).parts["head"][:8] if s.mesh and s.surface == "skin"]
     )
     ellipsoid = np.pi / 6.0 * 0.197 * 0.154 * 0.231
     assert 0.9 * ellipsoid < volume(corners) < 0.197 * 0.154 * 0.231
@@ -119,7 +119,7 @@ def test_a_head_is_as_large_as_a_head() -> None:
 
 def test_normals_survive_their_packing() -> None:
     way = frames.normalize(np.random.default_rng(3).normal(size=(4000, 3)))
-    code = rigid_primitives.packed(way)
+    code = rigid_primitives.pack_normals(way)
     assert (code == np.round(code)).all()
     assert code.min() >= 1.0
     assert code.max() < 2**24
@@ -133,7 +133,7 @@ def test_normals_survive_their_packing() -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_crate_is_as_large_as_it_says_and_free_inside(size: tuple[float, float, float]) -> None:
-    boxes = appearance.crate(size, 0)
+    boxes = appearance.crate_shapes(size, 0)
     low = np.array([b.pose[:3] - b.size for b in boxes])
     high = np.array([b.pose[:3] + b.size for b in boxes])
     half = np.array(size) / 2.0
@@ -148,7 +148,7 @@ def test_a_crate_is_as_large_as_it_says_and_free_inside(size: tuple[float, float
 
 
 def test_neighbouring_crates_differ_in_colour() -> None:
-    assert appearance.crate(SIZES[0], 0)[0].rgba != appearance.crate(SIZES[0], 1)[0].rgba
+    assert appearance.crate_shapes(SIZES[0], 0)[0].rgba != appearance.crate_shapes(SIZES[0], 1)[0].rgba
 
 
 def test_every_surface_has_its_material() -> None:
@@ -168,17 +168,17 @@ def test_every_surface_has_its_material() -> None:
     ],
 )
 def test_what_is_wrong_with_a_figure_is_said_in_one_line(tmp_path, line: str, words: str) -> None:
-    text = (appearance.find("figures", "worker", ".toml")).read_text()
+    text = (appearance.find_data_file("figures", "worker", ".toml")).read_text()
     file = tmp_path / "odd.toml"
     file.write_text(text[: text.index("[parts]")] + f"[parts]\n{line}\n")
-    with pytest.raises(FigureError, match=words) as said:
-        appearance.person(1.75, str(file))
+    with pytest.raises(AppearanceError, match=words) as said:
+        appearance.load_human_model(1.75, str(file))
     assert "\n" not in str(said.value)
 
 
 def test_an_unknown_posture_is_said() -> None:
-    with pytest.raises(FigureError, match="posture 'dance' is unknown; give one of: stand, pick"):
-        appearance.posed(standing(frames.pose(np.zeros(3))), "dance", 1.75)
+    with pytest.raises(AppearanceError, match="posture 'dance' is unknown; give one of: stand, pick"):
+        appearance.apply_posture(standing(frames.pose(np.zeros(3))), "dance", 1.75)
 
 
 def test_a_cone_tapers_the_way_it_says() -> None:
@@ -198,12 +198,12 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
     views = {}
     for name, bent in (("open", 0.0), ("fist", 1.0)):
         pose = standing(frames.pose(np.zeros(3)))
-        up = frames.aligned(np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0]))
+        up = frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0]))
         hand = {"right": frames.pose(np.array([0.5, -0.4, 1.4]), up), "right_fingers": (bent,) * 5}
         rigid = Rigid(sensor_scenes.empty())
         rigid.add_human(HumanSpec("eva", 4, dataclasses.replace(pose, **hand)))
         primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
-        depth, _ = sensor_scenes.raster(primitives, looking(np.array([1.1, -0.4, 1.4]), np.array([0.5, -0.4, 1.42])))
+        depth, _ = sensor_scenes.raster(primitives, look_at(np.array([1.1, -0.4, 1.4]), np.array([0.5, -0.4, 1.42])))
         views[name] = depth < 0.75
     rows = {name: np.flatnonzero(view.any(1)) for name, view in views.items()}
     scale = sensor_scenes.SMALL.fx / 0.6
@@ -216,13 +216,13 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
 def test_a_lamp_is_seen_in_its_colour() -> None:
     """F41: the lit tier of a robot's signal tower is the greenest thing in a picture of it, in the shade too."""
     rigid = Rigid(sensor_scenes.empty())
-    rigid.add_robot(description.load("vinebot").spec("bot"))
+    rigid.add_robot(description.load_description("vinebot").to_spec("bot"))
     primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
-    pose = looking(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
+    pose = look_at(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.6, 0.3, 0.5)).render(primitives, pose)
     _, seen = sensor_scenes.raster(primitives, pose)
-    material = primitives.looks.material.numpy()
-    tint = primitives.looks.tint.numpy()
+    material = primitives.materials.material.numpy()
+    tint = primitives.materials.tint.numpy()
     lit = (seen >= 0) & (material[seen] == int(materials.LAMP)) & (tint[seen][..., 1] > 2.0 * tint[seen][..., 0])
     assert lit.sum() > 20
     green = frame.rgb[..., 1].astype(int) - frame.rgb[..., 0]

@@ -5,7 +5,7 @@ import pytest
 
 from vinesim.scene import berries
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 
 def distances(bunch, radius):
@@ -38,8 +38,8 @@ def test_shapes_differ_and_are_no_columns():
 @pytest.mark.parametrize("variety", range(len(berries.VARIETIES)))
 def test_a_bunch_has_its_count_and_fits_its_hull(count, variety):
     kind = berries.VARIETIES[variety]
-    length, radius = berries.hull(count, 5) * kind.volume_radius
-    bunch = berries.berries(length, radius, count, variety, 5)
+    length, radius = berries.hull_size(count, 5) * kind.volume_radius
+    bunch = berries.lay_out_berries(length, radius, count, variety, 5)
     assert len(bunch.position) == len(bunch.radius) == len(bunch.axis) == len(bunch.foot) == count
     assert bunch.radius.mean() == pytest.approx(kind.radius, rel=0.03)
     full = bunch.radius * kind.elongation ** (1.0 / 3.0)
@@ -53,7 +53,7 @@ def test_a_bunch_has_its_count_and_fits_its_hull(count, variety):
 
 
 def test_neighbours_are_the_nearest():
-    bunch = berries.berries(0.18, 0.05, 90, 0, 1)
+    bunch = berries.lay_out_berries(0.18, 0.05, 90, 0, 1)
     apart = distances(bunch, bunch.radius)[0]
     for i in range(90):
         near = bunch.neighbours[i][bunch.neighbours[i] >= 0]
@@ -63,9 +63,9 @@ def test_neighbours_are_the_nearest():
 
 
 def test_same_seed_same_berries_another_seed_others():
-    one, two, other = (berries.berries(0.18, 0.05, 90, 0, seed) for seed in (4, 4, 5))
+    one, two, other = (berries.lay_out_berries(0.18, 0.05, 90, 0, seed) for seed in (4, 4, 5))
     berries._scaled.cache_clear()
-    again = berries.berries(0.18, 0.05, 90, 0, 4)
+    again = berries.lay_out_berries(0.18, 0.05, 90, 0, 4)
     assert np.array_equal(one.position, two.position)
     assert np.array_equal(one.position, again.position)
     assert not np.array_equal(one.position, other.position)
@@ -79,14 +79,14 @@ def test_the_library_is_packed_alike_each_time():
 
 def test_too_many_berries_are_refused():
     with pytest.raises(ValueError, match="1 to 140 berries, not 141"):
-        berries.berries(0.2, 0.05, 141, 0, 0)
+        berries.lay_out_berries(0.2, 0.05, 141, 0, 0)
 
 
 def test_bunches_of_a_model_weigh_what_their_berries_weigh():
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     for i in range(0, len(model.bunch_body), 7):
         kind = berries.VARIETIES[model.bunch_variety[i]]
-        bunch = berries.berries(
+        bunch = berries.lay_out_berries(
             model.bunch_length[i],
             model.bunch_radius[i],
             model.bunch_berries[i],

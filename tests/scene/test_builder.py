@@ -7,22 +7,22 @@ from vinesim import frames
 from vinesim.scene import builder
 from vinesim.scene.ids import Organ
 
-CANE = builder.Wood(modulus=5e9, density=800.0, damping=0.01)
+CANE = builder.RodMaterial(modulus=5e9, density=800.0, damping=0.01)
 POSE = np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def beam(pieces=16, load=0.0, length=1.0, radius=0.004):
-    tree = builder.Tree(POSE)
-    tip = tree.rod(-1, length, (radius, radius), CANE, pieces)[-1]
+    tree = builder.TreeBuilder(POSE)
+    tip = tree.add_rod(-1, length, (radius, radius), CANE, pieces)[-1]
     if load:
         small = {"mass": load, "inertia": (1e-6,) * 3, "stiffness": (5.0, 5.0, 5.0), "damping": (0.0,) * 3}
-        tree.add(tip, offset=(length / pieces, 0, 0), organ=int(Organ.BUNCH), **small)
+        tree.add_body(tip, offset=(length / pieces, 0, 0), organ=int(Organ.BUNCH), **small)
     return tree
 
 
 def test_a_rod_weighs_what_its_wood_weighs():
-    tree = builder.Tree(POSE)
-    tree.rod(-1, 1.2, (0.005, 0.002), CANE, 9)
+    tree = builder.TreeBuilder(POSE)
+    tree.add_rod(-1, 1.2, (0.005, 0.002), CANE, 9)
     cone = np.pi * 1.2 * (0.005**2 + 0.005 * 0.002 + 0.002**2) / 3.0
     assert sum(b["mass"] for b in tree.bodies) == pytest.approx(800.0 * cone, rel=1e-12)
 
@@ -38,10 +38,10 @@ def test_springs_are_ei_over_h_and_twice_that_at_the_root():
 
 def test_a_joint_of_unlike_pieces_is_half_of_each():
     """Springs of the halves one after the other, and each wood's damping in its share of the bend."""
-    tree = builder.Tree(POSE)
-    below = tree.rod(-1, 0.5, (0.006, 0.005), CANE, 5)[-1]
-    green = builder.Wood(modulus=1e9, density=900.0, damping=0.05)
-    on = tree.rod(below, 0.4, (0.004, 0.002), green, 8)[0]
+    tree = builder.TreeBuilder(POSE)
+    below = tree.add_rod(-1, 0.5, (0.006, 0.005), CANE, 5)[-1]
+    green = builder.RodMaterial(modulus=1e9, density=900.0, damping=0.05)
+    on = tree.add_rod(below, 0.4, (0.004, 0.002), green, 8)[0]
     ours, theirs = (2.0 * e * np.pi * r**4 / 4.0 / h for e, r, h in ((1e9, 0.004, 0.05), (5e9, 0.005, 0.1)))
     stiffness, damping = (tree.bodies[on][name] for name in ("stiffness", "damping"))
     assert stiffness[1:] == pytest.approx(ours * theirs / (ours + theirs), rel=1e-12)
@@ -52,13 +52,13 @@ def test_a_joint_of_unlike_pieces_is_half_of_each():
 
 def test_a_fork_bends_with_what_it_grows_on():
     """Sideways on a like piece: its tip is a joint of half twist, half bend; its middle or before is a clamp."""
-    tree = builder.Tree(POSE)
-    below = tree.rod(-1, 1.0, (0.004, 0.004), CANE, 10)[-1]
-    aside = frames.yaw(np.pi / 2)
+    tree = builder.TreeBuilder(POSE)
+    below = tree.add_rod(-1, 1.0, (0.004, 0.004), CANE, 10)[-1]
+    aside = frames.from_yaw(np.pi / 2)
     clamp = 2.0 * 5e9 * np.pi * 0.004**4 / 4.0 / 0.1
     one = clamp / np.array([1.3, 1.0, 1.0])
     tip, half, middle, base = (
-        tree.bodies[tree.rod(below, 0.5, (0.004, 0.004), CANE, 5, rest=aside, offset=offset)[0]]["stiffness"]
+        tree.bodies[tree.add_rod(below, 0.5, (0.004, 0.004), CANE, 5, rest=aside, offset=offset)[0]]["stiffness"]
         for offset in (None, (0.075, 0.0, 0.0), (0.05, 0.0, 0.0), (0.0, 0.0, 0.0))
     )
     other = clamp / np.array([1.0, 1.3, 1.0])  # its twist is our bending
@@ -69,17 +69,17 @@ def test_a_fork_bends_with_what_it_grows_on():
 
 
 def test_inertia_of_a_piece_is_that_of_a_cylinder():
-    mass, inertia, *_ = builder.section(0.1, 0.01, 0.01, 1e9, 1000.0)
+    mass, inertia, *_ = builder.segment_properties(0.1, 0.01, 0.01, 1e9, 1000.0)
     assert inertia == pytest.approx([mass * 0.01**2 / 2, *[mass * (3 * 0.01**2 + 0.1**2) / 12] * 2], rel=1e-12)
 
 
 def test_settle_keeps_the_drawn_shape_and_carries_the_load():
     tree = beam(load=0.3)
     tree.bodies[4]["rest"] = frames.exp(np.array([0.1, 0.3, -0.2]))
-    drawn = builder.assemble([tree]).forward(np.tile(frames.IDENTITY, (17, 1)))
-    tree.settle()
+    drawn = builder.assemble([tree]).forward_kinematics(np.tile(frames.IDENTITY, (17, 1)))
+    tree.solve_rest_pose()
     model = builder.assemble([tree])
-    assert np.abs(model.forward(model.joint_settled) - drawn).max() < 1e-5
+    assert np.abs(model.forward_kinematics(model.joint_settled) - drawn).max() < 1e-5
     root = model.joint_stiffness[0] * frames.log(model.joint_settled[0].astype(float))
     lever = drawn[:, :3] + frames.rotate(drawn[:, 3:], model.body_com.astype(float)) - POSE[:3]
     moment = np.cross(lever, model.body_mass[:, None] * builder.GRAVITY).sum(0)
@@ -91,7 +91,7 @@ def test_a_weighted_beam_bends_by_the_angle_of_beam_theory():
     """A beam held straight under its load is bent without it, by w L^3 / 6 EI + m g L^2 / 2 EI at its tip."""
     load, length = 0.05, 1.0
     tree = beam(pieces=64, load=load)
-    tree.settle()
+    tree.solve_rest_pose()
     model = builder.assemble([tree])
     angle = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)[:-1].sum()
     ei, weight = 5e9 * np.pi * 0.004**4 / 4.0, 800.0 * np.pi * 0.004**2 * 9.81
@@ -100,16 +100,16 @@ def test_a_weighted_beam_bends_by_the_angle_of_beam_theory():
 
 def test_settling_all_at_once_is_settling_each():
     trees = [beam(pieces=n, load=0.1) for n in (3, 8)]
-    together = builder.settle(builder.assemble(trees))
+    together = builder.solve_rest_pose(builder.assemble(trees))
     for number, tree in enumerate(trees):
-        tree.settle()
+        tree.solve_rest_pose()
         alone = builder.assemble([tree])
         assert np.array_equal(together.joint_settled[together.bodies_of(number)], alone.joint_settled)
 
 
 def test_fork_parents_and_numbers():
     tree = beam(4)
-    side = tree.rod(1, 0.2, (0.002, 0.001), CANE, 2, rest=frames.yaw(0.5))
+    side = tree.add_rod(1, 0.2, (0.002, 0.001), CANE, 2, rest=frames.from_yaw(0.5))
     model = builder.assemble([beam(2), tree])
     assert model.body_parent.tolist() == [-1, 0, -1, 2, 3, 4, 3, 6]
     assert side == [4, 5]
@@ -118,21 +118,21 @@ def test_fork_parents_and_numbers():
 
 def test_nonsense_is_refused_in_words():
     with pytest.raises(ValueError, match="all must be positive"):
-        builder.Tree(POSE).rod(-1, -1.0, (0.01, 0.01), CANE, 3)
+        builder.TreeBuilder(POSE).add_rod(-1, -1.0, (0.01, 0.01), CANE, 3)
     with pytest.raises(ValueError, match="names parent 3"):
-        builder.Tree(POSE).add(3)
-    slack = builder.Tree(POSE)
-    slack.add(-1, mass=1.0)
+        builder.TreeBuilder(POSE).add_body(3)
+    slack = builder.TreeBuilder(POSE)
+    slack.add_body(-1, mass=1.0)
     with pytest.raises(ValueError, match="body 0 has joint stiffness"):
-        slack.settle()
+        slack.solve_rest_pose()
 
 
-def hung(clusters: bool = True) -> builder.Tree:
+def hung(clusters: bool = True) -> builder.TreeBuilder:
     tree = beam(4)
-    stalk = tree.rod(
+    stalk = tree.add_rod(
         3, 0.06, (0.0022, 0.0022), CANE, 2, organ=Organ.PEDUNCLE, rest=frames.exp(np.array([0.0, np.pi / 2, 0.0]))
     )
-    tree.bunch(stalk[-1], 0.6, count=90, seed=7, clusters=clusters, pull=40.0)
+    tree.add_bunch(stalk[-1], 0.6, count=90, seed=7, clusters=clusters, pull=40.0)
     return tree
 
 
@@ -153,7 +153,7 @@ def test_a_bunch_hung_on_a_tree_brings_its_clusters():
 def test_a_bunch_with_clusters_weighs_once_when_it_settles():
     fine, whole = hung(), hung(clusters=False)
     for tree in (fine, whole):
-        tree.settle()
+        tree.solve_rest_pose()
     models = [builder.assemble([tree]) for tree in (fine, whole)]
     assert len(models[1].body_mass) == 7
     assert models[0].joint_settled[:7] == pytest.approx(models[1].joint_settled, abs=1e-5)

@@ -2,26 +2,28 @@
 
 import pytest
 
-from vinesim.scene.data_files import NotFoundInData, data_dir, find
+from vinesim.scene.data_files import DataFileNotFound, data_dir, find_data_file
 
 
 def test_a_name_finds_what_ships():
     assert (
-        find("scenes", "demo", ".toml") == find("scenes", "demo.toml", ".toml") == data_dir() / "scenes" / "demo.toml"
+        find_data_file("scenes", "demo", ".toml")
+        == find_data_file("scenes", "demo.toml", ".toml")
+        == data_dir() / "scenes" / "demo.toml"
     )
 
 
 def test_a_path_wins_over_a_name(tmp_path, monkeypatch):
     (tmp_path / "demo").write_text("mine")
     monkeypatch.chdir(tmp_path)
-    assert find("scenes", "demo", ".toml").read_text() == "mine"
+    assert find_data_file("scenes", "demo", ".toml").read_text() == "mine"
 
 
 def test_an_unknown_name_lists_the_known():
-    with pytest.raises(NotFoundInData, match=r"no file 'moon'.*data/scenes.*demo, harvest, tendone, vsp"):
-        find("scenes", "moon", ".toml")
+    with pytest.raises(DataFileNotFound, match=r"no file 'moon'.*data/scenes.*demo, harvest, tendone, vsp"):
+        find_data_file("scenes", "moon", ".toml")
 
 
 def test_an_unknown_kind_has_none():
-    with pytest.raises(NotFoundInData, match="one of: none"):
-        find("ships", "moon", ".toml")
+    with pytest.raises(DataFileNotFound, match="one of: none"):
+        find_data_file("ships", "moon", ".toml")

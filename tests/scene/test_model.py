@@ -7,23 +7,23 @@ from scipy.spatial.transform import Rotation
 from vinesim import frames
 from vinesim.scene import builder
 
-WOOD = builder.Wood(1e9, 900.0)
+WOOD = builder.RodMaterial(1e9, 900.0)
 
 
 @pytest.fixture
 def model():
     trees = []
     for k in range(3):
-        tree = builder.Tree(frames.pose(np.array([k, 0.5 * k, 2.0]), frames.yaw(0.3 * k)), vine=k)
-        tree.rod(-1, 0.8, (0.004, 0.002), WOOD, 4 + k, rest=frames.exp(np.array([0.1, 0.2, 0.3])))
-        tree.rod(1, 0.3, (0.002, 0.001), WOOD, 2, rest=frames.yaw(0.7))
+        tree = builder.TreeBuilder(frames.pose(np.array([k, 0.5 * k, 2.0]), frames.from_yaw(0.3 * k)), vine=k)
+        tree.add_rod(-1, 0.8, (0.004, 0.002), WOOD, 4 + k, rest=frames.exp(np.array([0.1, 0.2, 0.3])))
+        tree.add_rod(1, 0.3, (0.002, 0.001), WOOD, 2, rest=frames.from_yaw(0.7))
         trees.append(tree)
     return builder.assemble(trees)
 
 
 def test_forward_is_the_chain_of_transforms(model):
     joint_q = Rotation.random(len(model.body_mass), random_state=5).as_quat()
-    found = model.forward(joint_q)
+    found = model.forward_kinematics(joint_q)
 
     def matrix(position, quaternion):
         m = np.eye(4)
@@ -37,7 +37,7 @@ def test_forward_is_the_chain_of_transforms(model):
             root, at = model.tree_pose[model.body_tree[at]], int(model.body_parent[at])
         chain = matrix(root[:3], root[3:]) @ chain
         assert np.allclose(found[body, :3], chain[:3, 3], atol=1e-6)
-        assert np.allclose(frames.matrix(found[body, 3:]), chain[:3, :3], atol=1e-6)
+        assert np.allclose(frames.to_matrix(found[body, 3:]), chain[:3, :3], atol=1e-6)
 
 
 def test_depth_counts_ancestors(model):
@@ -63,5 +63,5 @@ def test_the_digest_sees_one_bit(model):
 
 def test_an_empty_model_stands():
     empty = builder.assemble([])
-    assert empty.forward(empty.joint_settled).shape == (0, 7)
+    assert empty.forward_kinematics(empty.joint_settled).shape == (0, 7)
     assert set(empty.counts().values()) == {0}

@@ -12,7 +12,7 @@ from vinesim.physics.parameters import ParameterError, PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene import physics_parameters
 from vinesim.scene.data_files import data_dir
-from vinesim.scene.spec import SceneError, load
+from vinesim.scene.spec import SceneError, load_scene
 
 FIELDS = [field.name for field in msgspec.structs.fields(PhysicsParameters)]
 
@@ -47,11 +47,11 @@ def test_a_parameter_out_of_range_is_refused(given, message):
 def scene_with(tmp_path, table):
     path = tmp_path / "other.toml"
     path.write_text((data_dir() / "scenes" / "demo.toml").read_text() + f"\n[physics]\n{table}\n")
-    return load(path)
+    return load_scene(path)
 
 
 def test_a_scene_file_overrides_parameters(tmp_path):
-    assert load("demo").physics == PhysicsParameters()
+    assert load_scene("demo").physics == PhysicsParameters()
     changed = scene_with(tmp_path, "friction = 0.5\nsleep_duration = 2\nsleep = false")
     assert changed.physics == PhysicsParameters(friction=0.5, sleep_duration=2.0, sleep=False)
 

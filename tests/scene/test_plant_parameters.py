@@ -3,7 +3,7 @@
 import pytest
 
 from vinesim.scene import plant_parameters
-from vinesim.scene.data_files import find
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.toml_loader import DataError
 
 
@@ -17,7 +17,7 @@ def numbers(part):
 
 def test_every_number_has_a_source():
     found = [
-        *numbers(plant_parameters.load("vine")),
+        *numbers(plant_parameters.load_plant("vine")),
         *(n for v in plant_parameters.load_varieties() for n in numbers(v)),
     ]
     assert len(found) > 40
@@ -27,13 +27,13 @@ def test_every_number_has_a_source():
 
 def test_a_wrong_unit_is_told(tmp_path):
     file = tmp_path / "oak.toml"
-    text = find("plants", "vine", ".toml").read_text()
+    text = find_data_file("plants", "vine", ".toml").read_text()
     assert text.count('unit = "Pa"') >= 3
     file.write_text(text.replace('unit = "Pa"', 'unit = "GPa"', 1))
     with pytest.raises(DataError, match=r"oak\.toml: cane\.woody_modulus\.unit is 'GPa'; give the value in 'Pa'"):
-        plant_parameters.load(str(file))
+        plant_parameters.load_plant(str(file))
 
 
 def test_a_range_is_walked_from_end_to_end():
-    length = plant_parameters.load("vine").cane.length
+    length = plant_parameters.load_plant("vine").cane.length
     assert (length.at(0.0), length.at(1.0)) == length.value

@@ -7,7 +7,7 @@ import pytest
 
 from vinesim.scene import spec
 from vinesim.scene.data_files import data_dir
-from vinesim.scene.spec import Sun, sun_at
+from vinesim.scene.spec import Sun, sun_direction
 
 GOOD = """
 name = "small"
@@ -38,13 +38,13 @@ y = 1.0
 
 @pytest.mark.parametrize("path", sorted((data_dir() / "scenes").glob("*.toml")), ids=lambda p: p.stem)
 def test_every_scene_that_ships_loads_by_its_name(path):
-    assert spec.load(path.stem).name == path.stem
+    assert spec.load_scene(path.stem).name == path.stem
 
 
 def test_defaults_and_values(tmp_path):
     file = tmp_path / "small.toml"
     file.write_text(GOOD)
-    small = spec.load(file)
+    small = spec.load_scene(file)
     assert (small.layout.row_spacing, small.fruit.bunches, small.boxes[0].size[0]) == (2.5, (2, 4), 0.6)
     assert math.isclose(math.hypot(*small.sun.direction()), 1.0)
     assert small.spawns[0] == spec.Spawn(name="here", x=0.0, y=1.0, yaw=0.0)
@@ -89,7 +89,7 @@ def test_a_mistake_is_one_line_with_file_place_and_remedy(mistake, tmp_path):
     file = tmp_path / "broken.toml"
     file.write_text(GOOD.replace(old, new))
     with pytest.raises(spec.SceneError) as caught:
-        spec.load(file)
+        spec.load_scene(file)
     text = str(caught.value)
     assert "\n" not in text
     assert text.startswith(f"{file}: ")
@@ -98,22 +98,24 @@ def test_a_mistake_is_one_line_with_file_place_and_remedy(mistake, tmp_path):
 
 def test_an_unknown_scene_names_those_that_ship():
     with pytest.raises(spec.SceneError, match=r"'vineyard'.*demo, harvest, tendone, vsp"):
-        spec.load("vineyard")
+        spec.load_scene("vineyard")
 
 
 def test_a_folder_or_binary_is_no_scene(tmp_path):
     binary = pathlib.Path(tmp_path / "x.toml")
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(spec.SceneError, match="UTF-8"):
-        spec.load(binary)
+        spec.load_scene(binary)
 
 
 def test_the_sun_of_an_equinox() -> None:
     """Due south at noon and as high as the latitude is far from the pole; due west at six, on the horizon."""
     latitude = math.radians(41.6)
-    assert sun_at(12.0, 0.0, latitude) == pytest.approx([0.0, -math.sin(latitude), math.cos(latitude)], abs=1e-12)
-    assert sun_at(18.0, 0.0, latitude) == pytest.approx([-1.0, 0.0, 0.0], abs=1e-12)
-    assert math.hypot(*sun_at(15.3, 0.2, latitude)) == pytest.approx(1.0)
+    assert sun_direction(12.0, 0.0, latitude) == pytest.approx(
+        [0.0, -math.sin(latitude), math.cos(latitude)], abs=1e-12
+    )
+    assert sun_direction(18.0, 0.0, latitude) == pytest.approx([-1.0, 0.0, 0.0], abs=1e-12)
+    assert math.hypot(*sun_direction(15.3, 0.2, latitude)) == pytest.approx(1.0)
 
 
 def test_a_sun_with_an_hour_moves() -> None:

@@ -8,14 +8,14 @@ from vinesim.scene.state import State
 
 
 def test_at_rest_is_the_settled_shape():
-    tree = builder.Tree(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0]))
-    tip = tree.rod(-1, 1.0, (0.004, 0.003), builder.Wood(5e9, 900.0), 8)[-1]
-    stalk = tree.rod(tip, 0.06, (0.002, 0.002), builder.Wood(3e8, 900.0), 2, organ=Organ.PEDUNCLE)[-1]
-    body = tree.add(
+    tree = builder.TreeBuilder(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0]))
+    tip = tree.add_rod(-1, 1.0, (0.004, 0.003), builder.RodMaterial(5e9, 900.0), 8)[-1]
+    stalk = tree.add_rod(tip, 0.06, (0.002, 0.002), builder.RodMaterial(3e8, 900.0), 2, organ=Organ.PEDUNCLE)[-1]
+    body = tree.add_body(
         stalk, offset=(0.03, 0, 0), mass=0.5, inertia=(1e-3,) * 3, stiffness=(0.2,) * 3, organ=int(Organ.BUNCH)
     )
     tree.bunches.append({"body": body, "berries": 80})
-    tree.settle()
+    tree.solve_rest_pose()
     model = builder.assemble([tree])
     state = State.at_rest(model)
     state.check()

@@ -11,12 +11,12 @@ from vinesim.scene import spec as scenes
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
-from vinesim.scene.summary import leaf_area, table
+from vinesim.scene.summary import summary_rows, total_leaf_area
 
 
 @pytest.fixture(scope="module", params=["demo", "vsp"])
 def vineyard(request):
-    scene = scenes.load(request.param)
+    scene = scenes.load_scene(request.param)
     return scene, generate(scene)
 
 
@@ -33,7 +33,7 @@ def test_twice_the_same_bits_and_another_seed_others(vineyard):
 def test_one_row_more_moves_nobody(vineyard):
     scene, model = vineyard
     more = generate(grown(scene, rows=scene.layout.rows + 1))
-    for name, dim in model.dims().items():
+    for name, dim in model.array_fields().items():
         if dim.shape[0] in ("tree", "body", "bunch", "leaf"):
             old = getattr(model, name)
             assert np.array_equal(old, getattr(more, name)[: len(old)]), name
@@ -111,7 +111,7 @@ def test_clusters_are_a_chain_behind_the_core_that_weighs_what_the_bunch_weighs(
     assert 4 <= model.bunch_clusters.min() < model.bunch_clusters.max() <= 8
     long = model.bunch_length > np.median(model.bunch_length)
     assert model.bunch_clusters[long].mean() > model.bunch_clusters[~long].mean() + 1.0
-    q = model.forward(model.joint_settled)
+    q = model.forward_kinematics(model.joint_settled)
     for bunch in range(0, len(model.bunch_body), 5):
         body, first = int(model.bunch_body[bunch]), int(model.bunch_cluster[bunch])
         parts = np.arange(first, first + model.bunch_clusters[bunch])
@@ -133,7 +133,7 @@ def test_clusters_are_a_chain_behind_the_core_that_weighs_what_the_bunch_weighs(
 
 def test_shoots_are_tied_where_they_pass_wires(vineyard):
     scene, model = vineyard
-    q = model.forward(model.joint_settled)[model.tie_body]
+    q = model.forward_kinematics(model.joint_settled)[model.tie_body]
     at = q[:, :3] + frames.rotate(q[:, 3:], model.tie_point.astype(float))
     assert np.abs(at - model.tie_anchor).max() < 1e-5  # slack as drawn
     wire = model.fixed_organ == Organ.WIRE
@@ -152,7 +152,7 @@ def test_drag_is_that_of_leaves_wood_and_bunches(vineyard):
     wood = model.body_organ != Organ.BUNCH
     own = 1.1 * (model.body_radius.sum(1) * model.body_length)[wood].sum()
     bunches = 0.25 * np.pi * (model.bunch_radius * model.bunch_length).sum()
-    assert model.body_drag.sum() == pytest.approx(own + bunches + 0.2 * leaf_area(model), rel=1e-3)
+    assert model.body_drag.sum() == pytest.approx(own + bunches + 0.2 * total_leaf_area(model), rel=1e-3)
     clusters = (model.body_organ == Organ.BUNCH) & ~np.isin(np.arange(len(wood)), model.bunch_body)
     assert not model.body_drag[clusters].any()
 
@@ -164,20 +164,20 @@ def test_a_peduncle_breaks_at_the_bending_moment_of_its_strength(vineyard):
 
 
 def test_tendone_heights_and_leaves():
-    scene = scenes.load("demo")
+    scene = scenes.load_scene("demo")
     model = generate(scene)
     q = State.at_rest(model).body_q
     middle = q[model.bunch_body, 2] - 0.5 * model.bunch_length
     assert 1.4 < middle.min() < middle.max() < 1.8
     assert 60 <= len(model.bunch_body) <= 100
     ground = scene.layout.rows * scene.layout.vines * scene.layout.row_spacing * scene.layout.vine_spacing
-    assert leaf_area(model) / ground == pytest.approx(1.6, abs=0.15)
+    assert total_leaf_area(model) / ground == pytest.approx(1.6, abs=0.15)
     shoot = np.bincount(model.body_tree, weights=np.where(model.body_organ == Organ.CANE, model.body_length, 0.0))
     assert 1.0 < np.median(shoot) < 1.5
 
 
 def test_hedge_heights():
-    scene = scenes.load("vsp")
+    scene = scenes.load_scene("vsp")
     model = generate(scene)
     q = State.at_rest(model).body_q
     roots = q[model.tree_first]
@@ -223,7 +223,7 @@ def as_heads(model):
 def test_the_drawn_shape_is_an_equilibrium(vineyard):
     """At ``joint_settled`` each spring carries the moment of everything that hangs below it, summed body by body."""
     model = as_heads(vineyard[1])
-    q = model.forward(model.joint_settled)
+    q = model.forward_kinematics(model.joint_settled)
     centre = q[:, :3] + frames.rotate(q[:, 3:], model.body_com.astype(float))
     weight = np.outer(model.body_mass.astype(float), [0.0, 0.0, -9.81])
     angle = frames.log(model.joint_settled.astype(float))
@@ -291,9 +291,9 @@ def modes(model, tree):
     for b in range(n):
         turn, move = np.zeros((3, 3 * n)), np.zeros((3, 3 * n))
         for i in np.flatnonzero(below[:, b]):
-            turn[:, 3 * i : 3 * i + 3] = frames.matrix(axes[i])
-            move[:, 3 * i : 3 * i + 3] = -skew(centre[b] - q[i, :3]) @ frames.matrix(axes[i])
-        spin = frames.matrix(q[b, 3:])
+            turn[:, 3 * i : 3 * i + 3] = frames.to_matrix(axes[i])
+            move[:, 3 * i : 3 * i + 3] = -skew(centre[b] - q[i, :3]) @ frames.to_matrix(axes[i])
+        spin = frames.to_matrix(q[b, 3:])
         inertia += mass[b] * move.T @ move
         inertia += turn.T @ (spin * model.body_inertia[first + b]) @ spin.T @ turn
     square, shape = np.linalg.eig(np.linalg.solve(inertia, stiffness))
@@ -319,7 +319,7 @@ def test_shoots_stand_and_bunches_swing_as_measured(vineyard):
 
 def test_the_demo_offers_a_bunch_to_two_robots():
     """Start places 1.1-1.3 m apart, a bunch before both within 0.75 m, and nothing to run into."""
-    scene = scenes.load("demo")
+    scene = scenes.load_scene("demo")
     model = generate(scene)
     top = State.at_rest(model).body_q[model.bunch_body, :3]
     a, b = (np.array([s.x, s.y]) for s in scene.spawns)
@@ -337,7 +337,7 @@ def test_the_demo_offers_a_bunch_to_two_robots():
 
 def test_the_table_counts_what_the_model_holds(vineyard):
     scene, model = vineyard
-    rows = {name: (value, unit) for name, value, unit in table(scene, model)}
+    rows = {name: (value, unit) for name, value, unit in summary_rows(scene, model)}
     assert rows["bunches"][0] == str(len(model.bunch_body))
     assert rows["digest"][0] == model.digest()
     assert float(rows["fruit per vine"][0]) == pytest.approx(

@@ -9,12 +9,12 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.data_files import find
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera, CameraSpec, pinhole
-from vinesim.sensors.export.images import looking
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.export.images import look_at
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import SensorError
 from vinesim.sensors.truth import truth
 
@@ -42,17 +42,17 @@ def _bunch_centre(model, view, bunch: int) -> np.ndarray:
 
 def test_a_known_bunch_lies_on_its_pixel(model, primitives) -> None:
     """Optical frame, intrinsics, labels and depth all agree: project the bunch, look the label up there."""
-    view = still_view(model)
+    view = rest_snapshot(model)
     camera = _camera()
     found = 0
     for bunch in range(0, len(model.bunch_body), 4):
         centre = _bunch_centre(model, view, bunch)
         # a level gaze that is off the bunch by some degrees, with the camera rolled
-        pose = looking(centre + np.array([-0.28, 0.10, -0.12]), centre + np.array([0.0, 0.03, 0.02]))
+        pose = look_at(centre + np.array([-0.28, 0.10, -0.12]), centre + np.array([0.0, 0.03, 0.02]))
         pose[3:] = frames.multiply(pose[3:], frames.exp(np.array([0.0, 0.0, 0.3])))
         frame = camera.render(primitives, pose)
         local = frames.rotate(frames.conjugate(pose[3:]), centre - pose[:3])
-        u, v = np.round(point_cloud.project(local, frame.info)).astype(int)
+        u, v = np.round(point_cloud.project_points(local, frame.info)).astype(int)
         if frame.labels[v, u] == label(Organ.BUNCH, bunch):
             found += 1
             near = model.bunch_radius[bunch] + model.bunch_length[bunch]
@@ -77,21 +77,21 @@ def test_right_is_right_and_up_is_up() -> None:
 
 
 def test_the_same_input_gives_the_same_image(model, primitives) -> None:
-    pose = looking(np.array([0.4, 1.2, 1.5]), np.array([3.0, 1.0, 1.7]))
+    pose = look_at(np.array([0.4, 1.2, 1.5]), np.array([3.0, 1.0, 1.7]))
     one, two = (_camera().render(p, pose, 3.0) for p in (primitives, Primitives(model)))
     assert np.array_equal(one.rgb, two.rgb)
     assert np.array_equal(one.depth, two.depth)
     assert np.array_equal(one.labels, two.labels)
     again = _camera()
-    again.render(primitives, looking(np.array([4.0, 1.2, 1.5]), np.array([3.0, 1.0, 1.7])), 1.0)
+    again.render(primitives, look_at(np.array([4.0, 1.2, 1.5]), np.array([3.0, 1.0, 1.7])), 1.0)
     assert np.array_equal(again.render(primitives, pose, 3.0).depth, one.depth)
 
 
 def test_every_visible_bunch_has_a_label(model, primitives) -> None:
     frame = _camera(sensor_scenes.IDEAL.info("o")).render(
-        primitives, looking(np.array([-1.5, 1.2, 1.3]), np.array([3.0, 1.2, 1.6]))
+        primitives, look_at(np.array([-1.5, 1.2, 1.3]), np.array([3.0, 1.2, 1.6]))
     )
-    seen = truth.bunches(frame)
+    seen = truth.detect_bunches(frame)
     assert len(seen) > 30
     assert {s.bunch for s in seen} <= set(range(len(model.bunch_body)))
     assert sum(s.pixels for s in seen) == (frame.labels >> 20 == int(Organ.BUNCH)).sum()
@@ -100,10 +100,10 @@ def test_every_visible_bunch_has_a_label(model, primitives) -> None:
 
 
 def test_a_moved_bunch_moves_in_the_picture(model) -> None:
-    primitives, view = Primitives(model, grass=0.0), still_view(model)
+    primitives, view = Primitives(model, grass=0.0), rest_snapshot(model)
     camera, bunch = _camera(), 10
     centre = _bunch_centre(model, view, bunch)
-    pose = looking(centre + np.array([-0.5, 0.0, -0.1]), centre)
+    pose = look_at(centre + np.array([-0.5, 0.0, -0.1]), centre)
     right = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]))
 
     def column() -> float:
@@ -141,7 +141,7 @@ def test_depth_conventions() -> None:
 def test_a_cloud_lies_on_the_surface() -> None:
     primitives, _ = sensor_scenes.world(sensor_scenes.thing(sensor_scenes.shape("sphere", 0.2, at=(1.5, 0.1, 1.1))))
     frame = _camera().render(primitives, sensor_scenes.AHEAD)
-    points = point_cloud.points(frame)
+    points = point_cloud.point_cloud(frame)
     assert len(points) == np.isfinite(frame.depth).sum()
     xyz = np.stack([points[k] for k in "xyz"], 1).astype(float)
     at = sensor_scenes.AHEAD[:3] + frames.rotate(sensor_scenes.AHEAD[3:], xyz)
@@ -159,11 +159,11 @@ def test_things_cast_shadows_that_follow_them() -> None:
     at = np.array([[1.5, 0.0, 0.8, 0, 0, 0, 1.0]])
     primitives, view = sensor_scenes.world(*plate, at=at)
     camera = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.0, 0.0, 1.0), shadow_period=0.1)
-    pose = looking(np.array([0.0, 0.0, 1.2]), np.array([1.5, 0.0, 0.0]))
+    pose = look_at(np.array([0.0, 0.0, 1.2]), np.array([1.5, 0.0, 0.0]))
 
     def ground(x: float, y: float, time: float) -> float:
         local = frames.rotate(frames.conjugate(pose[3:]), np.array([x, y, 0.0]) - pose[:3])
-        u, v = np.round(point_cloud.project(local, sensor_scenes.SMALL)).astype(int)
+        u, v = np.round(point_cloud.project_points(local, sensor_scenes.SMALL)).astype(int)
         return float(camera.render(primitives, pose, time).rgb[v - 2 : v + 3, u - 2 : u + 3].mean())
 
     lit, dark = ground(1.3, 0.55, 0.0), ground(1.3, 0.15, 0.0)
@@ -183,7 +183,7 @@ def test_bad_input_is_named(tmp_path) -> None:
     with pytest.raises(FileNotFoundError, match="d435"):
         CameraSpec.load("d43")
     file = tmp_path / "bad.toml"
-    shipped = find("cameras", "d435", ".toml").read_text(encoding="utf-8")
+    shipped = find_data_file("cameras", "d435", ".toml").read_text(encoding="utf-8")
     file.write_text(shipped.replace('value = 0.158, unit = "m"', 'value = 158, unit = "mm"'), encoding="utf-8")
     with pytest.raises(SensorError, match=r"nearest\.unit is 'mm'; give the value in 'm'"):
         CameraSpec.load(str(file))
@@ -198,7 +198,7 @@ def test_shipped_cameras_load(name: str) -> None:
 
 def test_qualities_differ_in_colour_only(model, primitives) -> None:
     """What is measured does not depend on how finely the picture is painted, and it is the same picture."""
-    pose = looking(np.array([0.4, 1.2, 1.5]), np.array([3.0, 1.0, 1.7]))
+    pose = look_at(np.array([0.4, 1.2, 1.5]), np.array([3.0, 1.0, 1.7]))
     fast, full, still = (_camera(quality=q).render(primitives, pose) for q in ("fast", "full", "still"))
     for other in (fast, still):
         assert np.array_equal(other.depth, full.depth)

@@ -8,7 +8,7 @@ from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import CameraInfo
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.export.images import look_at
 
 SKEW = frames.normalize(np.array([0.3, 0.2, -0.4, 0.8]))
 
@@ -43,7 +43,7 @@ def _box(half):
 @pytest.mark.parametrize("kind", ["sphere", "capsule", "box", "cylinder"])
 def test_depth_is_exact(kind: str, away: float) -> None:
     eye = np.array([-away, 0.02, 1.03])
-    pose = looking(eye, np.array([0.0, 0.0, 1.0]))
+    pose = look_at(eye, np.array([0.0, 0.0, 1.0]))
     axis = frames.rotate(SKEW, np.array([0.0, 0.0, 0.09]))
     centre = np.array([0.0, 0.0, 1.0])
     local = lambda p: frames.rotate(frames.conjugate(SKEW), p - centre)  # noqa: E731
@@ -106,7 +106,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.mark.parametrize("where", VIEWPOINTS)
 def test_the_ray_caster_sees_the_same(scene, where: str) -> None:
-    pose = looking(*map(np.array, VIEWPOINTS[where]))
+    pose = look_at(*map(np.array, VIEWPOINTS[where]))
     depth, primitive = sensor_scenes.raster(scene, pose)
     truth, ids = sensor_scenes.oracle(scene, pose)
     same = primitive == ids
@@ -121,7 +121,7 @@ def test_the_ray_caster_sees_the_same_from_anywhere(scene) -> None:
     agree, total = 0, 0
     for _ in range(6):
         eye = rng.uniform([0.0, 0.0, 1.5], [5.0, 2.5, 2.2])
-        pose = looking(eye, eye + rng.normal(size=3))
+        pose = look_at(eye, eye + rng.normal(size=3))
         agree += (sensor_scenes.raster(scene, pose)[1] == sensor_scenes.oracle(scene, pose)[1]).sum()
         total += sensor_scenes.SMALL.width * sensor_scenes.SMALL.height
     assert agree / total >= 0.999
@@ -172,7 +172,7 @@ def test_what_is_grazed_is_seen(kind: str, away: float, tmp_path) -> None:
     )
     primitives, _ = sensor_scenes.world(sensor_scenes.thing(made))
     eye = np.array([-away, 0.0, 1.0]) + above
-    pose = looking(eye, eye + np.array([1.0, 0.05, -0.01]))
+    pose = look_at(eye, eye + np.array([1.0, 0.05, -0.01]))
     depth, primitive = sensor_scenes.raster(primitives, pose)
     truth, ids = sensor_scenes.oracle(primitives, pose)
     same = primitive == ids
@@ -188,7 +188,7 @@ def test_leaves_seen_edge_on() -> None:
     shown = 0
     for pose in blade:
         eye = pose[:3] + frames.rotate(pose[3:], np.array([-0.25, 0.02, 0.003]))
-        camera = looking(eye, pose[:3] + frames.rotate(pose[3:], np.array([0.05, 0.0, 0.0])))
+        camera = look_at(eye, pose[:3] + frames.rotate(pose[3:], np.array([0.05, 0.0, 0.0])))
         primitive, ids = sensor_scenes.raster(primitives, camera)[1], sensor_scenes.oracle(primitives, camera)[1]
         shown += (primitives.organ[ids[ids >= 0]] == int(Organ.LEAF)).any()
         assert (primitive == ids).mean() >= 0.999
@@ -217,7 +217,7 @@ def test_leaves_that_cross_the_pinhole_plane_are_seen() -> None:
     crossing = 0
     for pose in blade:
         eye = pose[:3] + frames.rotate(pose[3:], np.array([0.03, 0.0, 0.004]))
-        camera = looking(eye, eye + frames.rotate(pose[3:], np.array([1.0, 0.2, -0.15])))
+        camera = look_at(eye, eye + frames.rotate(pose[3:], np.array([1.0, 0.2, -0.15])))
         primitive, ids = sensor_scenes.raster(primitives, camera)[1], sensor_scenes.oracle(primitives, camera)[1]
         crossing += (primitives.organ[ids[ids >= 0]] == int(Organ.LEAF)).mean() > 0.3
         assert (primitive == ids).mean() >= 0.999
@@ -251,7 +251,7 @@ def test_depth_of_fine_meshes() -> None:
     """
     o3d = pytest.importorskip("open3d", reason="the peer of this test")
     primitives, _ = sensor_scenes.world(model=sensor_scenes.demo())
-    pose = looking(np.array([0.9, 0.75, 1.45]), np.array([1.1, 0.0, 1.5]))
+    pose = look_at(np.array([0.9, 0.75, 1.45]), np.array([1.1, 0.0, 1.5]))
     depth, primitive = sensor_scenes.raster(primitives, pose)
     shown = np.unique(primitive[primitive >= 0])
     scene = o3d.t.geometry.RaycastingScene()

@@ -15,19 +15,19 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
 from vinesim.cli.render import run as render
-from vinesim.client.composition.composer import NoRoom
-from vinesim.client.composition.randomizer import Life
+from vinesim.client.composition.composer import PlacementError
+from vinesim.client.composition.randomizer import SceneRandomizer
 from vinesim.errors import UsageError
 from vinesim.robot.description.description import DescriptionError
-from vinesim.scene.data_files import NotFoundInData
+from vinesim.scene.data_files import DataFileNotFound
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import annotations, dataset
-from vinesim.sensors.export.dataset import DatasetError, Plan
+from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.spec_file import SensorError
 
 IMAGES = 6  # of two vineyards
-LIFE = Life(0.5)
+LIFE = SceneRandomizer(0.5)
 SCENE = """
 name = "one vine"
 seed = 1
@@ -60,9 +60,9 @@ def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
 def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A data set made in this process, in one go."""
     out = tmp_path_factory.mktemp("whole") / "set"
-    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
-    dataset.begin(plan, out)
-    assert list(dataset.draw(plan, out, dataset.missing(out, IMAGES))) == list(range(IMAGES))
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    dataset.prepare_folder(plan, out)
+    assert list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES))) == list(range(IMAGES))
     dataset.finish(out, IMAGES)
     return out
 
@@ -113,7 +113,7 @@ def test_pycocotools_reads_it(whole: pathlib.Path, capsys: pytest.CaptureFixture
         ids = _ids(whole / "ids" / pathlib.Path(image["file_name"]).name)
         mask = read.annToMask(one).astype(bool)
         assert np.array_equal(mask, ids == label(Organ.BUNCH, one["bunch"]))
-        assert one["area"] == mask.sum() >= annotations.LEAST_PIXELS
+        assert one["area"] == mask.sum() >= annotations.MIN_ANNOTATED_PIXELS
         assert one["bbox"] == coco_mask.toBbox(one["segmentation"]).tolist()
         amodal = coco_mask.decode(one["amodal_segmentation"]).astype(bool)
         assert not (mask & ~amodal).any()
@@ -143,7 +143,7 @@ def test_every_image_has_its_yolo_boxes_depth_berries_and_pose(whole: pathlib.Pa
         assert depth.dtype == berry.dtype == np.uint16
         assert ((ids[berry > 0] >> 20) == int(Organ.BUNCH)).all()
         lines = np.array([line.split() for line in (whole / "labels" / f"{stem}.txt").read_text().splitlines()], float)
-        large = [b for b in record["bunches"] if b["pixels"] >= annotations.LEAST_PIXELS]
+        large = [b for b in record["bunches"] if b["pixels"] >= annotations.MIN_ANNOTATED_PIXELS]
         assert len(lines) == len(large) >= 1
         for line, one in zip(lines, large, strict=True):
             rows, columns = np.nonzero(ids == one["label"])
@@ -187,10 +187,10 @@ def test_an_image_is_the_same_whatever_was_drawn_before(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     """The last image of a vineyard, alone: wind, company and picked bunches of the others leave no trace."""
-    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
-    dataset.begin(plan, tmp_path)
-    last = dataset.IMAGES_A_VINEYARD - 1
-    list(dataset.draw(plan, tmp_path, [last]))
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    dataset.prepare_folder(plan, tmp_path)
+    last = dataset.IMAGES_PER_VINEYARD - 1
+    list(dataset.render_images(plan, tmp_path, [last]))
     alone = {name: data for name, data in _files(tmp_path).items() if f"{last:06d}" in name}
     assert len(alone) == 7
     assert alone == {name: _files(whole)[name] for name in alone}
@@ -202,34 +202,34 @@ def _turned(q, v: np.ndarray) -> np.ndarray:
 
 
 def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    plan = Plan(load(scene), 5, "d435", (160, 120), LIFE)
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
     before = _files(whole)
-    dataset.begin(plan, whole)
+    dataset.prepare_folder(plan, whole)
     assert _files(whole) == before
     for other, words in (
-        (Plan(load(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
-        (Plan(load("vsp"), 5, "d435", (160, 120), LIFE), "scene"),
-        (Plan(load(scene), 5, "d435", (320, 240), LIFE), "size"),
-        (Plan(load(scene), 5, "d435", (160, 120)), "life"),
+        (DatasetPlan(load_scene(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
+        (DatasetPlan(load_scene("vsp"), 5, "d435", (160, 120), LIFE), "scene"),
+        (DatasetPlan(load_scene(scene), 5, "d435", (320, 240), LIFE), "size"),
+        (DatasetPlan(load_scene(scene), 5, "d435", (160, 120)), "life"),
     ):
         with pytest.raises(DatasetError, match=words):
-            dataset.begin(other, whole)
+            dataset.prepare_folder(other, whole)
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(DatasetError, match="other things"):
-        dataset.begin(plan, tmp_path)
+        dataset.prepare_folder(plan, tmp_path)
     with pytest.raises(DatasetError, match="cannot be used"):
-        dataset.begin(plan, tmp_path / "mine.txt")
+        dataset.prepare_folder(plan, tmp_path / "mine.txt")
 
 
 def test_a_full_disk_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     """No file may grow beyond 20 kB: to a program that is a full disk, at the first picture."""
-    plan = Plan(load(scene), 5, "d435", (160, 120))
-    dataset.begin(plan, tmp_path)
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120))
+    dataset.prepare_folder(plan, tmp_path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
     try:
         with pytest.raises(DatasetError, match=r"image 0 cannot be written .* make room"):
-            list(dataset.draw(plan, tmp_path, [0]))
+            list(dataset.render_images(plan, tmp_path, [0]))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(_files(tmp_path)) == ["dataset.json"]
@@ -272,7 +272,7 @@ def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "error", "words"),
     [
-        ({"camera": "kinect"}, NotFoundInData, "d435, pinhole"),
+        ({"camera": "kinect"}, DataFileNotFound, "d435, pinhole"),
         ({"size": "99999x4"}, SensorError, "16x16 to 4096x4096"),
         ({"size": "640*480"}, UsageError, "WxH"),
         ({"at": "1,2"}, UsageError, "X,Y,Z"),
@@ -283,9 +283,9 @@ def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
         ({"robots": ["vinebot"]}, UsageError, "give NAME@X,Y,YAW"),
         ({"robots": ["vinebot@1"]}, UsageError, "--robot is at '1'; give X,Y,YAW"),
         ({"robots": ["dalek@1,2"]}, DescriptionError, "dalek.* give a path or one of: logistic, vinebot"),
-        ({"robots": ["vinebot@0.1,0.1"]}, NoRoom, r"robot_0 stands \d+ cm deep in (trunk|pole)"),
+        ({"robots": ["vinebot@0.1,0.1"]}, PlacementError, r"robot_0 stands \d+ cm deep in (trunk|pole)"),
         ({"people": ["1,1,0,dance"]}, UsageError, "posture 'dance' is none of stand, pick"),
-        ({"people": ["1,1.2", "1.1,1.2"]}, NoRoom, "person_. stands .* deep in person_.; move one"),
+        ({"people": ["1,1.2", "1.1,1.2"]}, PlacementError, "person_. stands .* deep in person_.; move one"),
         ({"crates": ["1,1,0,1.5"]}, UsageError, "the fill is 1.5; give 0"),
         ({"crates": ["1,inf"]}, UsageError, "--crate is at '1,inf'; give X,Y,YAW,FILL"),
     ],

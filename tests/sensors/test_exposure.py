@@ -29,37 +29,37 @@ def _even(light: float, width: int = 64, height: int = 48, **others) -> Exposure
 def test_half_of_the_stops_are_made_up(light: float) -> None:
     """The stops between light and key that exposure takes out are the share it says."""
     film = _even(light)
-    film.develop(PLAIN, 0.0)
-    wanted = exposure.USUAL * (exposure.KEY / light / exposure.USUAL) ** exposure.SHARE
+    film.tone_map(PLAIN, 0.0)
+    wanted = exposure.NOON_EXPOSURE * (exposure.KEY_VALUE / light / exposure.NOON_EXPOSURE) ** exposure.ADAPTED_SHARE
     assert _exposed(film) == pytest.approx(wanted, rel=1e-3)
 
 
 def test_exposure_settles_as_it_says() -> None:
     """After one settling time, 1/e of the stops to go is left; a first picture has no past."""
     film = _even(0.2)
-    film.develop(PLAIN, 0.0)
+    film.tone_map(PLAIN, 0.0)
     first = _exposed(film)
     film.radiance.fill_(0.8)
-    film.develop(PLAIN, exposure.SETTLING)
-    now, final = _exposed(film), first * 0.25**exposure.SHARE
+    film.tone_map(PLAIN, exposure.ADAPTATION_TIME)
+    now, final = _exposed(film), first * 0.25**exposure.ADAPTED_SHARE
     assert np.log(now / final) / np.log(first / final) == pytest.approx(np.exp(-1.0), rel=1e-3)
     fresh = _even(0.8)
-    fresh.develop(PLAIN, 5.0)
+    fresh.tone_map(PLAIN, 5.0)
     assert _exposed(fresh) == pytest.approx(final, rel=1e-3)
 
 
 def test_fixed_exposure_stays() -> None:
     film = _even(0.7, fixed=0.5)
-    film.develop(PLAIN, 0.0)
+    film.tone_map(PLAIN, 0.0)
     assert _exposed(film) == 0.5
 
 
 def test_grey_stays_grey_and_balance_takes_a_cast_out() -> None:
-    grey = _even(0.3).develop(PLAIN, 0.0).numpy()
+    grey = _even(0.3).tone_map(PLAIN, 0.0).numpy()
     assert (grey == grey[0, 0]).all()
     film = Exposure(64, 48)
     film.radiance.assign(np.tile([0.4, 0.3, 0.2], (64 * 48, 1)).astype(np.float32))
-    balanced = film.develop(np.array([0.75, 1.0, 1.5]), 0.0).numpy()
+    balanced = film.tone_map(np.array([0.75, 1.0, 1.5]), 0.0).numpy()
     assert np.ptp(balanced[0].astype(int)) <= 1
 
 
@@ -69,8 +69,8 @@ def test_samples_are_averaged_as_light() -> None:
     light = np.zeros((32, 32, 3), np.float32)
     light[:, ::2] = 0.4
     film.radiance.assign(light.reshape(-1, 3))
-    mixed = film.develop(PLAIN, 0.0).numpy()
-    assert np.array_equal(mixed, _even(0.2, 16, 16, fixed=1.0).develop(PLAIN, 0.0).numpy())
+    mixed = film.tone_map(PLAIN, 0.0).numpy()
+    assert np.array_equal(mixed, _even(0.2, 16, 16, fixed=1.0).tone_map(PLAIN, 0.0).numpy())
 
 
 def test_a_lamp_has_a_halo_and_nothing_else_has() -> None:
@@ -84,7 +84,7 @@ def test_a_lamp_has_a_halo_and_nothing_else_has() -> None:
     light[20, 20] = [50.0, 50.0, 50.0]
     seen = np.full((161, 161), 3, np.int32)
     seen[80, 80] = 7
-    film.halo(_Lamps(), wp.array(seen.ravel(), dtype=int))
+    film.add_glare(_Lamps(), wp.array(seen.ravel(), dtype=int))
     around = light[..., 1] - np.where(seen == 7, 50.0, 0.0)
     around[20, 20] = 0.0
     assert around[80, 84] > around[80, 90] > around[80, 100] > 0.0

@@ -8,7 +8,7 @@ from tests.support import sensor_scenes
 from vinesim.scene.ids import Organ
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export import images
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
 def test_depth_in_millimetres() -> None:
@@ -17,20 +17,20 @@ def test_depth_in_millimetres() -> None:
 
 
 def test_looking_is_level_and_right_handed() -> None:
-    pose = images.looking(np.array([1.0, 2.0, 1.0]), np.array([1.0, 5.0, 1.0]))
+    pose = images.look_at(np.array([1.0, 2.0, 1.0]), np.array([1.0, 5.0, 1.0]))
     from vinesim import frames
 
-    axes = frames.matrix(pose[3:])
+    axes = frames.to_matrix(pose[3:])
     assert axes[:, 2] == pytest.approx([0, 1, 0])  # forward
     assert axes[:, 1] == pytest.approx([0, 0, -1])  # down
     assert axes[:, 0] == pytest.approx([1, 0, 0])  # right of someone who looks along +y
-    assert frames.matrix(images.looking(np.zeros(3), np.array([0, 0, 1.0]))[3:])[:, 2] == pytest.approx([0, 0, 1])
+    assert frames.to_matrix(images.look_at(np.zeros(3), np.array([0, 0, 1.0]))[3:])[:, 2] == pytest.approx([0, 0, 1])
 
 
 def test_a_frame_comes_back_from_its_files(tmp_path) -> None:
     primitives, _ = sensor_scenes.world(sensor_scenes.thing(sensor_scenes.shape("sphere", 0.2, at=(1.5, 0.0, 1.0))))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL).render(primitives, sensor_scenes.AHEAD)
-    paths = images.save(frame, tmp_path / "out", "a")
+    paths = images.save_frame(frame, tmp_path / "out", "a")
     assert [p.name for p in paths] == ["a_rgb.png", "a_depth.png", "a_depth_mm.png", "a_labels.png"]
     assert np.array_equal(cv2.imread(str(paths[0]))[..., ::-1], frame.rgb)
     millimetres = cv2.imread(str(paths[2]), cv2.IMREAD_UNCHANGED)
@@ -48,8 +48,8 @@ def test_labels_get_distinct_colours() -> None:
 
 def test_a_portrait_shows_sky_leaves_fruit_and_ground(tmp_path) -> None:
     model = sensor_scenes.demo()
-    view, primitives = still_view(model), Primitives(model)
-    image = images.portrait(model, view, tmp_path / "p.png", width=240, height=160, primitives=primitives)
+    view, primitives = rest_snapshot(model), Primitives(model)
+    image = images.render_overview(model, view, tmp_path / "p.png", width=240, height=160, primitives=primitives)
     assert image.shape == (160, 240, 3)
     assert np.array_equal(cv2.imread(str(tmp_path / "p.png"))[..., ::-1], image)
     assert 60 < image.mean() < 190  # neither black nor burnt

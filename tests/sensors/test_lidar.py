@@ -6,7 +6,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.data_files import find
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
@@ -51,7 +51,12 @@ def test_rings_offsets_and_angles_follow_the_table(lidar: Lidar) -> None:
     room = sensor_scenes.thing(
         *(
             sensor_scenes.shape(
-                "box", 0.1, 9.0, 9.0, at=frames.rotate(frames.yaw(a), np.array([5.0, 0, 0])), turn=frames.yaw(a)
+                "box",
+                0.1,
+                9.0,
+                9.0,
+                at=frames.rotate(frames.from_yaw(a), np.array([5.0, 0, 0])),
+                turn=frames.from_yaw(a),
             )
             for a in np.arange(4) * np.pi / 2
         )
@@ -112,7 +117,7 @@ def test_bad_input_is_named(lidar: Lidar, tmp_path) -> None:
     with pytest.raises(ValueError, match="pose"):
         lidar.scan(sensor_scenes.world()[0], np.full(7, np.inf))
     file = tmp_path / "bad.toml"
-    text = find("lidars", "vlp16", ".toml").read_text(encoding="utf-8")
+    text = find_data_file("lidars", "vlp16", ".toml").read_text(encoding="utf-8")
     file.write_text("\n".join(line for line in text.splitlines() if not line.startswith("bunch")), encoding="utf-8")
     with pytest.raises(SensorError, match=r"reflectance\.bunch"):
         LidarSpec.load(str(file))
@@ -261,7 +266,12 @@ def test_a_lidar_of_64_beams() -> None:
     room = sensor_scenes.thing(
         *(
             sensor_scenes.shape(
-                "box", 0.1, 9.0, 9.0, at=frames.rotate(frames.yaw(a), np.array([5.0, 0, 0])), turn=frames.yaw(a)
+                "box",
+                0.1,
+                9.0,
+                9.0,
+                at=frames.rotate(frames.from_yaw(a), np.array([5.0, 0, 0])),
+                turn=frames.from_yaw(a),
             )
             for a in around
         )
@@ -294,7 +304,7 @@ def test_a_lidar_of_64_beams() -> None:
     ],
 )
 def test_absurd_values_are_refused_in_one_line(tmp_path, old: str, new: str, says: str) -> None:
-    text = find("lidars", "vlp16", ".toml").read_text(encoding="utf-8")
+    text = find_data_file("lidars", "vlp16", ".toml").read_text(encoding="utf-8")
     assert old in text
     file = tmp_path / "bad.toml"
     file.write_text(text.replace(old, new), encoding="utf-8")

@@ -5,7 +5,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.sensors.lidar.lidar_rasterizer import Sweep
+from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
 from vinesim.sensors.scene.ray_caster import RayCaster
 
 LASERS = np.radians([-15.0, 1.0, -13.0, 3.0, -11.0, 5.0, -9.0, 7.0, -7.0, 9.0, -5.0, 11.0, -3.0, 13.0, -1.0, 15.0])
@@ -14,13 +14,13 @@ LAG = np.arange(16) * STEP / 24.0
 """Lasers fire in turn while the head turns on."""
 STANDS = {
     "between rows": [3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0],
-    "in the canopy": [1.3, 0.15, 1.7, *frames.yaw(1.0)],
+    "in the canopy": [1.3, 0.15, 1.7, *frames.from_yaw(1.0)],
     "on its side": [2.0, 0.9, 1.2, *frames.exp(np.array([1.2, 0.4, 0.3]))],
     "at the solids": [0.7, 0.6, 1.1, *frames.exp(np.array([0.1, 0.2, 0.7]))],
 }
 
 
-def _oracle(sweep: Sweep, primitives, pose, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _oracle(sweep: LidarRasterizer, primitives, pose, reach: float) -> tuple[np.ndarray, np.ndarray]:
     rays = frames.rotate(pose[3:], sweep.direction.numpy().astype(float))
     distance, primitive = RayCaster(primitives).cast(pose[:3], rays, reach)
     shape = (sweep.columns, sweep.rows)
@@ -35,8 +35,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 @pytest.mark.parametrize("where", STANDS)
 def test_the_ray_caster_meets_the_same(scene, where: str) -> None:
     pose = np.array(STANDS[where])
-    sweep = Sweep(LASERS, LAG, STEP, 1848)
-    distance, primitive = sweep.hits(scene, pose, reach=60.0)
+    sweep = LidarRasterizer(LASERS, LAG, STEP, 1848)
+    distance, primitive = sweep.cast(scene, pose, reach=60.0)
     truth, ids = _oracle(sweep, scene, pose, 60.0)
     same = primitive == ids
     assert len(np.unique(ids)) > 100
@@ -47,10 +47,10 @@ def test_the_ray_caster_meets_the_same(scene, where: str) -> None:
 
 def test_a_slice_is_the_same_rays(scene) -> None:
     pose = np.array(STANDS["between rows"])
-    whole, parts = Sweep(LASERS, LAG, STEP, 1848), Sweep(LASERS, LAG, STEP, 1848)
-    whole.hits(scene, pose)
+    whole, parts = LidarRasterizer(LASERS, LAG, STEP, 1848), LidarRasterizer(LASERS, LAG, STEP, 1848)
+    whole.cast(scene, pose)
     for first in range(0, 1848, 100):
-        parts.hits(scene, pose, first, min(100, 1848 - first))
+        parts.cast(scene, pose, first, min(100, 1848 - first))
     assert (whole.primitive.numpy() == parts.primitive.numpy()).all()
     assert (whole.distance.numpy() == parts.distance.numpy()).all()
 
@@ -60,6 +60,6 @@ def test_rows_may_be_sub_rays_of_a_beam(scene) -> None:
     elevation = np.radians([5.0, 5.1, 5.0, -20.0, 89.9, -90.0, 60.0])
     azimuth = np.array([0.0, 0.0, 0.003, 2.0, 0.0, -0.5, 0.1])
     pose = np.array(STANDS["in the canopy"])
-    sweep = Sweep(elevation, azimuth, 0.01, 629)
-    _, primitive = sweep.hits(scene, pose)
+    sweep = LidarRasterizer(elevation, azimuth, 0.01, 629)
+    _, primitive = sweep.cast(scene, pose)
     assert (primitive == _oracle(sweep, scene, pose, 500.0)[1]).mean() >= 0.999

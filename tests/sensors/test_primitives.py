@@ -8,11 +8,11 @@ import trimesh
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.berries import berries
+from vinesim.scene.berries import lay_out_berries
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.scene.plant_primitives import Ripeness
 from vinesim.sensors.scene.primitive_batches import SPHEROID
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +30,12 @@ def _of(primitives: Primitives, organ: Organ, index: int) -> np.ndarray:
 
 
 def test_every_bunch_has_its_berries_where_its_body_is(model, primitives) -> None:
-    view = still_view(model)
+    view = rest_snapshot(model)
     for bunch in range(0, len(model.bunch_body), 7):
         mine = _of(primitives, Organ.BUNCH, bunch)
         round_ones = mine[primitives.shapes.kind.numpy()[mine] == 1]
         assert len(round_ones) == model.bunch_berries[bunch]
-        expected = berries(
+        expected = lay_out_berries(
             float(model.bunch_length[bunch]),
             float(model.bunch_radius[bunch]),
             int(model.bunch_berries[bunch]),
@@ -75,7 +75,7 @@ def test_posts_in_pieces_are_whole(model, primitives) -> None:
 
 
 def test_only_what_moved_is_moved(model, primitives) -> None:
-    view = still_view(model)
+    view = rest_snapshot(model)
     tree = int(model.body_tree[model.bunch_body[5]])
     shifted = view.body_q.copy()
     shifted[:, :3] += [0.0, 0.0, 0.25]  # every body, but only one tree says so
@@ -103,7 +103,7 @@ def test_bounds_hold_what_they_bound(model, primitives) -> None:
 
 
 def test_a_picked_bunch_leaves_the_vine_and_rides_on_its_link(model, primitives) -> None:
-    view = still_view(model)
+    view = rest_snapshot(model)
     bunch = 3
     attached = view.bunch_attached.copy()
     attached[bunch] = False
@@ -127,7 +127,7 @@ def _bent(model, bunch: int) -> tuple[np.ndarray, np.ndarray]:
     turned = int(model.bunch_cluster[bunch]) + 1
     joint_q[turned] = frames.multiply(frames.exp(np.array([0.1, 0.3, -0.2])), joint_q[turned])
     last = int(model.bunch_cluster[bunch] + model.bunch_clusters[bunch])
-    return model.forward(joint_q), np.arange(turned, last)
+    return model.forward_kinematics(joint_q), np.arange(turned, last)
 
 
 def _berries(primitives: Primitives, bunch: int, shown: bool = True) -> np.ndarray:
@@ -142,7 +142,7 @@ def test_berries_ride_on_their_clusters(model, primitives) -> None:
     before = primitives.shapes.a.numpy()[_berries(primitives, bunch)].copy()
     body_q, moved = _bent(model, bunch)
     tree = int(model.body_tree[model.bunch_body[bunch]])
-    primitives.update(dataclasses.replace(still_view(model), body_q=body_q, moved=np.array([tree])))
+    primitives.update(dataclasses.replace(rest_snapshot(model), body_q=body_q, moved=np.array([tree])))
     mine = _berries(primitives, bunch)
     after = primitives.shapes.a.numpy()[mine]
     assert len(after) == model.bunch_berries[bunch]
@@ -164,7 +164,7 @@ def test_a_picked_bunch_keeps_the_shape_it_had(model, primitives) -> None:
     bunch = 5
     body_q, _ = _bent(model, bunch)
     tree = int(model.body_tree[model.bunch_body[bunch]])
-    view = dataclasses.replace(still_view(model), body_q=body_q, moved=np.array([tree]))
+    view = dataclasses.replace(rest_snapshot(model), body_q=body_q, moved=np.array([tree]))
     primitives.update(view)
     before = primitives.shapes.a.numpy()[_berries(primitives, bunch)].copy()
     attached = view.bunch_attached.copy()
@@ -176,14 +176,14 @@ def test_a_picked_bunch_keeps_the_shape_it_had(model, primitives) -> None:
     assert np.abs(after - before).max() < 2e-6
     # someone comes, everything is laid out anew while the stub's clusters are elsewhere: the loose one keeps its shape
     others = (link, sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1)))
-    still = dataclasses.replace(still_view(model), bunch_attached=attached, links=others, moved=np.array([tree]))
+    still = dataclasses.replace(rest_snapshot(model), bunch_attached=attached, links=others, moved=np.array([tree]))
     primitives.update(dataclasses.replace(still, link_q=np.concatenate([loose, loose])))
     after = primitives.shapes.a.numpy()[_berries(primitives, bunch)]
     assert np.abs(after - before).max() < 2e-6
 
 
 def test_links_come_move_and_go(model, primitives) -> None:
-    view, plants = still_view(model), primitives.count
+    view, plants = rest_snapshot(model), primitives.count
     link = sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1, at=(0.0, 0.0, 0.5)), index=2)
     pose = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
     links = (link,)
@@ -204,7 +204,7 @@ def test_meshes_are_simplified_and_keep_their_size(tmp_path) -> None:
     primitives, _ = sensor_scenes.world(
         sensor_scenes.thing(sensor_scenes.shape("mesh", 2.0, 2.0, 2.0, at=(0, 0, 1), file=str(file)))
     )
-    assert 500 < primitives.counts()["triangle"] <= 4000
+    assert 500 < primitives.counts_by_kind()["triangle"] <= 4000
     corners = primitives.shapes.a.numpy()[primitives.shapes.kind.numpy() == 6, :3]
     assert np.linalg.norm(corners - [0, 0, 1], axis=1) == pytest.approx(0.6, abs=0.02)
 
@@ -220,7 +220,7 @@ def test_a_second_build_is_the_same_to_the_bit(model, primitives) -> None:
     other = Primitives(model, grass=0.0)
     for name in "abcd":
         assert np.array_equal(getattr(primitives.shapes, name).numpy(), getattr(other.shapes, name).numpy())
-    assert np.array_equal(primitives.looks.sky.numpy(), other.looks.sky.numpy())
+    assert np.array_equal(primitives.materials.sky.numpy(), other.materials.sky.numpy())
 
 
 def test_fruit_ripens_from_green_to_its_variety() -> None:
@@ -232,7 +232,7 @@ def test_fruit_ripens_from_green_to_its_variety() -> None:
         ripeness = None if share is None else Ripeness(np.full(count, share), 3)
         primitives = Primitives(model, grass=0.0, ripeness=ripeness)
         berry = primitives.shapes.kind.numpy() == SPHEROID
-        looks[share] = primitives.looks.tint.numpy()[berry], primitives.shapes.a.numpy()[berry, 3]
+        looks[share] = primitives.materials.tint.numpy()[berry], primitives.shapes.a.numpy()[berry, 3]
     assert all(np.array_equal(a, b) for a, b in zip(looks[None], looks[1.0], strict=True))
     ripe, half, green = (looks[share][0] for share in (1.0, 0.5, 0.0))
     assert np.ptp(green, axis=0).max() < 0.06

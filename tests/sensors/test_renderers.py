@@ -5,31 +5,31 @@ import importlib.util
 import pytest
 
 from vinesim.sensors.camera import renderers
-from vinesim.sensors.camera.cuda_rasterizer import Tiles
+from vinesim.sensors.camera.cuda_rasterizer import CudaRasterizer
 
 
 def test_warp_draws_on_a_cpu_by_itself_and_in_pieces_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert renderers.raster_of("warp", "cpu") is None
-    monkeypatch.setattr(Tiles, "__init__", lambda self, device: setattr(self, "device", device))
-    raster = renderers.raster_of("warp", "cuda:1")
-    assert isinstance(raster, Tiles)
+    assert renderers.create_rasterizer("warp", "cpu") is None
+    monkeypatch.setattr(CudaRasterizer, "__init__", lambda self, device: setattr(self, "device", device))
+    raster = renderers.create_rasterizer("warp", "cuda:1")
+    assert isinstance(raster, CudaRasterizer)
     assert raster.device == "cuda:1"
 
 
 def test_an_unknown_renderer_is_refused_with_those_that_there_are() -> None:
-    with pytest.raises(renderers.NoRenderer, match="'vulkan': give one of warp, taichi, taichi-gpu"):
-        renderers.check("vulkan")
+    with pytest.raises(renderers.RendererUnavailable, match="'vulkan': give one of warp, taichi, taichi-gpu"):
+        renderers.check_renderer("vulkan")
 
 
 def test_without_taichi_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     for name in ("taichi", "taichi-gpu"):
-        with pytest.raises(renderers.NoRenderer, match=r"pip install 'vinesim\[taichi\]'"):
-            renderers.check(name)
-    assert renderers.check("warp") == "warp"
+        with pytest.raises(renderers.RendererUnavailable, match=r"pip install 'vinesim\[taichi\]'"):
+            renderers.check_renderer(name)
+    assert renderers.check_renderer("warp") == "warp"
 
 
 def test_taichi_on_warps_device_is_a_contradiction(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    with pytest.raises(renderers.NoRenderer, match="leave one of the two out"):
-        renderers.raster_of("taichi", "cuda")
+    with pytest.raises(renderers.RendererUnavailable, match="leave one of the two out"):
+        renderers.create_rasterizer("taichi", "cuda")

@@ -8,8 +8,8 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.ids import Organ, label
-from vinesim.sensors.lidar.lidar import NEARLY_STILL, NEARLY_STRAIGHT, Lidar, LidarSpec
-from vinesim.sensors.lidar.spinning_scan import Rolling, Track
+from vinesim.sensors.lidar.lidar import MAX_SHARED_ROTATION, MAX_SHARED_TRANSLATION, Lidar, LidarSpec
+from vinesim.sensors.lidar.spinning_scan import PoseHistory, SpinningScan
 
 AT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
 STEP = 0.001
@@ -24,14 +24,14 @@ def _lidar(real: bool = False) -> Lidar:
 def _turn(lidar: Lidar, things, motion=None, pose=None, step: float = STEP, start: float = 0.0):
     """The first revolution: ``motion(t)`` [link, 7] moves the things, ``pose(t)`` [7] the lidar."""
     primitives, view = sensor_scenes.world(*things)
-    rolling = Rolling(lidar)
+    rolling = SpinningScan(lidar)
     for k in range(round(0.1 / step) + 2):
         time = start + k * step
         if motion is not None:
             view = dataclasses.replace(view, link_q=motion(time - start))
             primitives.update(view)
-        rolling.track.add(time, AT if pose is None else pose(time - start))
-        for scan in rolling.go(primitives, time):
+        rolling.pose_history.add(time, AT if pose is None else pose(time - start))
+        for scan in rolling.advance(primitives, time):
             return scan
     raise AssertionError("no revolution was completed")
 
@@ -65,28 +65,30 @@ def test_points_of_a_lidar_that_drives_are_in_its_frame_of_their_time() -> None:
     speed = np.array([2.0, 0.5, 0.0])
 
     def pose(t: float) -> np.ndarray:
-        return frames.pose(AT[:3] + speed * t, frames.yaw(0.2))
+        return frames.pose(AT[:3] + speed * t, frames.from_yaw(0.2))
 
     scan = _turn(_lidar(), [wall], pose=pose, step=0.01)
     mine = scan.labels == label(Organ.ROBOT, 0)
     assert np.ptp(scan.offset[mine]) > 0.09
-    xyz = frames.rotate(frames.yaw(0.2), scan.xyz[mine].astype(float))
+    xyz = frames.rotate(frames.from_yaw(0.2), scan.xyz[mine].astype(float))
     at_their_time = AT[:3] + np.outer(scan.offset[mine], speed) + xyz
-    assert np.abs(at_their_time[:, 0] - 6.0).max() < 0.5 * NEARLY_STILL + 1e-4
+    assert np.abs(at_their_time[:, 0] - 6.0).max() < 0.5 * MAX_SHARED_TRANSLATION + 1e-4
     at_the_first = scan.pose[:3] + xyz
-    assert 6.0 - at_the_first[:, 0] == pytest.approx(speed[0] * scan.offset[mine], abs=0.5 * NEARLY_STILL + 1e-4)
+    assert 6.0 - at_the_first[:, 0] == pytest.approx(
+        speed[0] * scan.offset[mine], abs=0.5 * MAX_SHARED_TRANSLATION + 1e-4
+    )
 
 
 def test_a_lidar_that_turns_near_a_wall() -> None:
     """Turning with the head at 2 rad/s it sees a straight wall bent; each point's own pose straightens it."""
     wall = sensor_scenes.thing(sensor_scenes.shape("box", 0.1, 30.0, 30.0, at=(3.1, 0.0, 1.0)))
     rate = -2.0
-    scan = _turn(_lidar(), [wall], pose=lambda t: frames.pose(AT[:3], frames.yaw(rate * t)), step=0.01)
+    scan = _turn(_lidar(), [wall], pose=lambda t: frames.pose(AT[:3], frames.from_yaw(rate * t)), step=0.01)
     mine = scan.labels == label(Organ.ROBOT, 0)
     xyz = scan.xyz[mine].astype(float)
-    turned = frames.rotate(frames.yaw(rate * scan.offset[mine].astype(float)), xyz)
+    turned = frames.rotate(frames.from_yaw(rate * scan.offset[mine].astype(float)), xyz)
     off = np.abs(turned[:, 0] - 3.0)
-    assert (off < 0.5 * NEARLY_STRAIGHT * np.hypot(*turned[:, :2].T) + 1e-3).all()
+    assert (off < 0.5 * MAX_SHARED_ROTATION * np.hypot(*turned[:, :2].T) + 1e-3).all()
     late = scan.offset[mine] > 0.08
     assert np.abs(xyz[late, 0] - 3.0).max() > 0.2
 
@@ -104,40 +106,40 @@ def test_a_late_sector_has_the_pose_of_its_time() -> None:
     """Nothing is computed for 90 ms; then all is fired at once, from where the lidar was, with the newest things."""
     wall = sensor_scenes.thing(sensor_scenes.shape("box", 0.1, 30.0, 30.0, at=(6.1, 0.0, 1.0)))
     primitives, _ = sensor_scenes.world(wall)
-    rolling = Rolling(_lidar())
+    rolling = SpinningScan(_lidar())
     scans = []
     for k in range(11):
         time = 0.01 * k
-        rolling.track.add(time, AT + np.array([2.0 * time, 0, 0, 0, 0, 0, 0]))
+        rolling.pose_history.add(time, AT + np.array([2.0 * time, 0, 0, 0, 0, 0, 0]))
         if k in (0, 10):
-            scans += rolling.go(primitives, time)
+            scans += rolling.advance(primitives, time)
     (scan,) = scans
     mine = scan.labels == label(Organ.ROBOT, 0)
-    assert scan.xyz[mine, 0] + 2.0 * scan.offset[mine] == pytest.approx(6.0, abs=0.5 * NEARLY_STILL + 1e-4)
+    assert scan.xyz[mine, 0] + 2.0 * scan.offset[mine] == pytest.approx(6.0, abs=0.5 * MAX_SHARED_TRANSLATION + 1e-4)
 
 
 def test_revolutions_that_were_missed_are_counted() -> None:
     primitives, _ = sensor_scenes.world(_plate())
-    rolling = Rolling(_lidar())
+    rolling = SpinningScan(_lidar())
     for time in (0.0, 0.05):
-        rolling.track.add(time, AT)
-        assert list(rolling.go(primitives, time)) == []
-    rolling.track.add(0.45, AT)
-    (scan,) = rolling.go(primitives, 0.45)  # the one that was begun; 0.1 to 0.4 are lost, 0.4 is under way
+        rolling.pose_history.add(time, AT)
+        assert list(rolling.advance(primitives, time)) == []
+    rolling.pose_history.add(0.45, AT)
+    (scan,) = rolling.advance(primitives, 0.45)  # the one that was begun; 0.1 to 0.4 are lost, 0.4 is under way
     assert scan.time == 0.0
     assert rolling.dropped == 3
-    rolling.track.add(0.5, AT)
-    (scan,) = rolling.go(primitives, 0.5)
+    rolling.pose_history.add(0.5, AT)
+    (scan,) = rolling.advance(primitives, 0.5)
     assert scan.time == pytest.approx(0.4)
     assert rolling.dropped == 3
 
 
 def test_a_slower_rate_turns_as_fast_and_rests_between() -> None:
     primitives, _ = sensor_scenes.world(_plate())
-    rolling, scans = Rolling(_lidar(), rate=4.0), []
+    rolling, scans = SpinningScan(_lidar(), rate=4.0), []
     for k in range(101):
-        rolling.track.add(0.01 * k, AT)
-        scans += rolling.go(primitives, 0.01 * k)
+        rolling.pose_history.add(0.01 * k, AT)
+        scans += rolling.advance(primitives, 0.01 * k)
     assert [s.time for s in scans] == pytest.approx([0.0, 0.25, 0.5, 0.75])
     assert all(s.offset.max() < 0.1 for s in scans)
     assert rolling.dropped == 0
@@ -145,27 +147,27 @@ def test_a_slower_rate_turns_as_fast_and_rests_between() -> None:
 
 def test_time_set_back_starts_a_revolution_anew() -> None:
     primitives, _ = sensor_scenes.world(_plate())
-    rolling = Rolling(_lidar())
+    rolling = SpinningScan(_lidar())
     for time in (100.0, 100.05, 0.0, 0.05, 0.1):
-        rolling.track.add(time, AT)
-        scans = list(rolling.go(primitives, time))
+        rolling.pose_history.add(time, AT)
+        scans = list(rolling.advance(primitives, time))
     assert [s.time for s in scans] == [0.0]
 
 
 def test_a_track_interpolates_and_forgets() -> None:
-    track = Track()
-    quarter = frames.yaw(0.2)
+    track = PoseHistory()
+    quarter = frames.from_yaw(0.2)
     track.add(1.0, AT)
-    assert np.array_equal(track.at(np.array([0.0, 5.0])), np.stack([AT, AT]))
+    assert np.array_equal(track.interpolate(np.array([0.0, 5.0])), np.stack([AT, AT]))
     track.add(2.0, frames.pose(np.array([2.0, 0.0, 1.0]), -quarter))  # the same rotation, written the other way round
-    middle, before, after = track.at(np.array([1.5, 0.5, 2.5]))
+    middle, before, after = track.interpolate(np.array([1.5, 0.5, 2.5]))
     assert middle[:3] == pytest.approx([1.0, 0.0, 1.0])
-    assert frames.heading(middle[3:]) == pytest.approx(0.1, abs=1e-4)
+    assert frames.to_yaw(middle[3:]) == pytest.approx(0.1, abs=1e-4)
     assert np.array_equal(before, AT)
     assert after[:3] == pytest.approx([2.0, 0.0, 1.0])
     track.add(3.0, AT)
-    track.forget(2.5)
-    assert track.at(np.array([2.0]))[0, 0] == pytest.approx(2.0)
-    assert track.at(np.array([0.0]))[0, 0] == pytest.approx(2.0)  # what came before is gone
+    track.discard_before(2.5)
+    assert track.interpolate(np.array([2.0]))[0, 0] == pytest.approx(2.0)
+    assert track.interpolate(np.array([0.0]))[0, 0] == pytest.approx(2.0)  # what came before is gone
     track.add(2.5, AT)  # time was set back
-    assert track.at(np.array([3.0]))[0, 0] == 0.0
+    assert track.interpolate(np.array([3.0]))[0, 0] == 0.0

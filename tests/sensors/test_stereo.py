@@ -6,7 +6,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.data_files import find
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors import spec_file
@@ -42,7 +42,7 @@ def _but(**values: float) -> CameraSpec:
 def _repainted(frame: CameraFrame, primitives, camera: Camera, rgb: np.ndarray) -> np.ndarray:
     """What ``camera`` measures of a frame if the picture were another one [height, width, 3]."""
     lens = pinhole(camera.info, frame.pose)
-    return camera._stereo.measure(primitives, lens, frame.exact_depth, rgb, spec_file.dice(0, "camera", 0))
+    return camera._stereo.measure(primitives, lens, frame.exact_depth, rgb, spec_file.noise_rng(0, "camera", 0))
 
 
 @pytest.mark.parametrize("depth", [0.4, 0.8, 1.5, 2.5])
@@ -157,10 +157,10 @@ def test_the_same_image_has_the_same_noise_and_no_other_has() -> None:
     assert not np.array_equal(first, depth(seed=3, image=8))
     assert not np.array_equal(first, depth(seed=4, image=7))
     primitives, _ = sensor_scenes.world(_wall(1.5))
-    camera = Camera(SPEC, INFO, "camera", seed=3, image=6)
+    camera = Camera(SPEC, INFO, "camera", seed=3, image_index=6)
     camera.render(primitives, sensor_scenes.AHEAD)
     assert np.array_equal(first, camera.render(primitives, sensor_scenes.AHEAD).depth)  # it counts
-    other = Camera(SPEC, INFO, "other", seed=3, image=7).render(primitives, sensor_scenes.AHEAD)
+    other = Camera(SPEC, INFO, "other", seed=3, image_index=7).render(primitives, sensor_scenes.AHEAD)
     assert not np.array_equal(first, other.depth)
 
 
@@ -210,7 +210,7 @@ def test_an_ideal_camera_measures_exactly() -> None:
     ],
 )
 def test_absurd_values_are_refused_in_one_line(tmp_path, old: str, new: str, says: str) -> None:
-    text = find("cameras", "d435", ".toml").read_text(encoding="utf-8")
+    text = find_data_file("cameras", "d435", ".toml").read_text(encoding="utf-8")
     assert old in text
     file = tmp_path / "bad.toml"
     file.write_text(text.replace(old, new), encoding="utf-8")

@@ -29,7 +29,7 @@ def test_light_follows_a_moving_sun() -> None:
     light = Sunlight(sun.direction)
     balances, dim = [], 1.0
     for time in (0.0, 30.0, 3600.0, 5.4 * 3600.0):
-        light.follow(primitives, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), time)
+        light.update(primitives, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), time)
         there = np.array([*light.light.sun])
         assert there @ np.array(sun.direction(time)) > np.cos(np.radians(0.26))
         balances.append(light.balance)

@@ -1,4 +1,4 @@
-"""The Taichi twin of the rasteriser finds what Warp's finds."""
+"""The Taichi rasteriser finds what Warp's finds."""
 
 import threading
 
@@ -8,12 +8,12 @@ import pytest
 from tests.sensors.test_camera_raster import VIEWPOINTS
 from tests.support import sensor_scenes
 from vinesim.kernels.raster import camera_raster
-from vinesim.sensors.camera.camera import Visibility, pinhole
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitive_batches import KINDS
 
 pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
-twin = pytest.importorskip("vinesim.sensors.camera.taichi_rasterizer")
+taichi_rasterizer = pytest.importorskip("vinesim.sensors.camera.taichi_rasterizer")
 NEAR_PLANE = {
     "through the canopy, a solid beside the lens": ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62]),
     "a leaf through the pinhole": ([1.1, 0.2, 1.97], [1.4, 0.5, 1.9]),
@@ -27,22 +27,22 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def raster():
-    return twin.Twin()
+    return taichi_rasterizer.TaichiRasterizer()
 
 
 def _seen(scene, pose: np.ndarray, raster) -> tuple[np.ndarray, np.ndarray]:
     """Primitive and depth of every pixel; by Warp unless another rasteriser is given."""
-    scene.raster = raster
+    scene.rasterizer = raster
     try:
         depth, primitive = sensor_scenes.raster(scene, pose)
     finally:
-        scene.raster = None
+        scene.rasterizer = None
     return primitive, depth
 
 
 @pytest.mark.parametrize("where", [*VIEWPOINTS, *NEAR_PLANE])
-def test_the_twin_sees_the_same(scene, raster, where: str) -> None:
-    pose = looking(*map(np.array, (VIEWPOINTS | NEAR_PLANE)[where]))
+def test_it_sees_the_same(scene, raster, where: str) -> None:
+    pose = look_at(*map(np.array, (VIEWPOINTS | NEAR_PLANE)[where]))
     (mine, depth), (other, truth) = _seen(scene, pose, raster), _seen(scene, pose, None)
     same = mine == other
     assert same.mean() >= 0.999
@@ -57,23 +57,23 @@ def test_every_kind_is_seen(scene, raster) -> None:
     """None is missing from the comparison above."""
     found = set()
     for view in VIEWPOINTS.values():
-        primitive = _seen(scene, looking(*map(np.array, view)), raster)[0]
+        primitive = _seen(scene, look_at(*map(np.array, view)), raster)[0]
         found |= set(np.unique(scene.shapes.kind.numpy()[primitive[primitive >= 0]]))
     assert found == set(np.unique(scene.shapes.kind.numpy())) == set(KINDS.values())
 
 
 def test_two_passes_find_what_one_finds(scene, raster) -> None:
     """As on a GPU without 64-bit atomics: depth first, then whose it is."""
-    phased = twin.Twin()
+    phased = taichi_rasterizer.TaichiRasterizer()
     phased._gpu = True
     for where in ("along the rows", "solids", "inside the canopy"):
-        pose = looking(*map(np.array, VIEWPOINTS[where]))
+        pose = look_at(*map(np.array, VIEWPOINTS[where]))
         assert (_seen(scene, pose, phased)[0] == _seen(scene, pose, None)[0]).mean() >= 0.999
 
 
 def test_another_thread_may_draw(scene, raster) -> None:
-    """Eyes have a thread of their own, which is not the one that started Taichi."""
-    pose = looking(*map(np.array, VIEWPOINTS["solids"]))
+    """The sensor scheduler has its own thread, which is not the one that started Taichi."""
+    pose = look_at(*map(np.array, VIEWPOINTS["solids"]))
     found = []
     thread = threading.Thread(target=lambda: found.append(_seen(scene, pose, raster)[0]))
     thread.start()
@@ -82,11 +82,13 @@ def test_another_thread_may_draw(scene, raster) -> None:
 
 
 def test_some_clusters_alone(scene, raster) -> None:
-    seen = Visibility(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height)
+    seen = CameraRasterizer(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height)
     some = np.arange(0, len(scene.cluster_first), 5)
-    raster.fill(scene, pinhole(sensor_scenes.SMALL, looking(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys)
+    raster.rasterize(
+        scene, pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys
+    )
     keys = seen.keys.numpy()
-    numbers = keys[keys < int(camera_raster.EMPTY)] & int(camera_raster.LOW)
+    numbers = keys[keys < int(camera_raster.EMPTY_KEY)] & int(camera_raster.PRIMITIVE_MASK)
     owner = np.repeat(np.arange(len(scene.cluster_first)), scene.cluster_size)
     assert len(numbers) > 100
     assert np.isin(owner[numbers], some).all()

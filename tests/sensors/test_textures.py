@@ -8,16 +8,16 @@ from vinesim.sensors.scene import textures
 
 
 def test_outlines_have_the_area_of_the_leaf() -> None:
-    table, _ = textures.outlines()
-    for shape in range(leaves.SHAPES):
-        texels = (table[shape] > 0).sum() * (2.0 / textures.SIDE) ** 2
-        assert texels * textures.leaf_scale(np.array(shape)) ** 2 == pytest.approx(leaves.area(shape), rel=0.02)
+    table, _ = textures.leaf_outlines()
+    for shape in range(leaves.SHAPE_COUNT):
+        texels = (table[shape] > 0).sum() * (2.0 / textures.TEXTURE_SIZE) ** 2
+        assert texels * textures.leaf_scale(np.array(shape)) ** 2 == pytest.approx(leaves.blade_area(shape), rel=0.02)
 
 
 def test_octagons_hold_their_outlines() -> None:
-    table, hull = textures.outlines()
-    u, v = textures._grid(textures.SIDE)
-    for shape in range(textures.OUTLINES):
+    table, hull = textures.leaf_outlines()
+    u, v = textures._grid(textures.TEXTURE_SIZE)
+    for shape in range(textures.OUTLINE_COUNT):
         inside = table[shape] > 0
         p = np.stack([u[inside], v[inside]], 1)
         for k in range(8):
@@ -29,7 +29,7 @@ def test_octagons_hold_their_outlines() -> None:
 
 
 def test_noise_tiles() -> None:
-    for table in (textures.noise(), textures.soil()):
+    for table in (textures.noise_texture(), textures.soil_texture()):
         seam = np.abs(table[0] - table[-1]).mean((0,))
         inside = np.abs(np.diff(table, axis=0)).mean((0, 1))
         assert (seam < 1.5 * inside).all()
@@ -44,7 +44,7 @@ def test_the_tone_curve_rises_from_black_to_white() -> None:
 
 def test_the_sun_is_where_it_is_said_to_be() -> None:
     sun = np.array([0.3, -0.5, 0.6]) / np.linalg.norm([0.3, -0.5, 0.6])
-    sky = textures.sky(tuple(sun), (3.3, 2.95, 2.35))
+    sky = textures.sky_texture(tuple(sun), (3.3, 2.95, 2.35))
     row, column = np.unravel_index(sky.sum(-1).argmax(), sky.shape[:2])
     assert (row / (textures.SKY_ROWS - 1)) ** 2 == pytest.approx(sun[2], abs=0.02)
     assert (column / (textures.SKY_COLUMNS - 1) - 0.5) * 2.0 * np.pi == pytest.approx(

@@ -7,15 +7,15 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.scene.berries import VARIETIES, berries, piece_of
+from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame, CameraInfo, Link
 from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitive_batches import SPHEROID
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.truth import truth
 
 
@@ -33,14 +33,14 @@ def test_pixels_boxes_and_distances() -> None:
     depth = np.full((6, 8), np.inf, np.float32)
     depth[1:3, 2:5] = 1.5
     depth[1, 2] = -np.inf
-    three, seven = truth.bunches(_frame(labels, depth))
+    three, seven = truth.detect_bunches(_frame(labels, depth))
     assert (three.bunch, three.pixels, three.box) == (3, 1, (7, 5, 7, 5))
     assert np.isnan(three.distance)
     assert (seven.bunch, seven.pixels, seven.box, seven.distance) == (7, 6, (2, 1, 4, 2), pytest.approx(1.5))
 
 
 def test_no_bunch_no_sighting() -> None:
-    assert truth.bunches(_frame(np.zeros((4, 4), np.int32), np.zeros((4, 4), np.float32))) == ()
+    assert truth.detect_bunches(_frame(np.zeros((4, 4), np.int32), np.zeros((4, 4), np.float32))) == ()
 
 
 # ---- a picture and all that is true of it ----------------------------------------------------------------------------
@@ -55,7 +55,7 @@ SELDOM = 1e-3
 def grove():
     """The demo vineyard, its primitives and view."""
     model = sensor_scenes.demo()
-    view, primitives = still_view(model), Primitives(model, grass=2.0)
+    view, primitives = rest_snapshot(model), Primitives(model, grass=2.0)
     primitives.update(view)
     return model, primitives, view
 
@@ -67,14 +67,14 @@ def _middle(model, view, bunch: int) -> np.ndarray:
 
 def _before(model, view, bunch: int, away=(-0.48, 0.3, -0.12)) -> np.ndarray:
     middle = _middle(model, view, bunch)
-    return looking(middle + np.array(away), middle)
+    return look_at(middle + np.array(away), middle)
 
 
 def _of(truths, bunch: int) -> truth.BunchTruth:
     return next(one for one in truths if one.bunch == bunch)
 
 
-def _points(seen: truth.Look, mask: np.ndarray) -> np.ndarray:
+def _points(seen: truth.PixelBuffers, mask: np.ndarray) -> np.ndarray:
     """World points [k, 3] of some pixels, from depth and intrinsics alone."""
     local = sensor_scenes.pixel_rays(seen.info)[mask] * seen.depth[mask].astype(float)[:, None]
     return seen.pose[:3] + frames.rotate(seen.pose[3:], local)
@@ -84,8 +84,8 @@ def _points(seen: truth.Look, mask: np.ndarray) -> np.ndarray:
 def along(grove):
     """A look along the rows, and the truth of it."""
     _, primitives, view = grove
-    seen = truth.look(primitives, NEAR, looking(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
-    return seen, truth.of_bunches(primitives, view, seen)
+    seen = truth.render_buffers(primitives, NEAR, look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
+    return seen, truth.bunch_truths(primitives, view, seen)
 
 
 def test_ids_pixels_and_berries_are_those_of_the_ray_caster(grove, along) -> None:
@@ -100,7 +100,7 @@ def test_ids_pixels_and_berries_are_those_of_the_ray_caster(grove, along) -> Non
         mine = organ == label(Organ.BUNCH, one.bunch)
         assert abs(mine.sum() - one.pixels) <= 0.01 * mine.sum() + 2
         berry, count = np.unique(oracle[mine & (kind[oracle] == SPHEROID)], return_counts=True)
-        seen_by_oracle = (count >= truth.BERRY_PIXELS).sum()
+        seen_by_oracle = (count >= truth.MIN_BERRY_PIXELS).sum()
         assert abs(seen_by_oracle - one.berries_seen) <= 1  # one pixel more or less
         assert one.berries == model.bunch_berries[one.bunch] >= one.berries_seen
         assert len(berry) <= one.berries
@@ -109,10 +109,10 @@ def test_ids_pixels_and_berries_are_those_of_the_ray_caster(grove, along) -> Non
 def test_berry_numbers_are_those_of_the_packed_bunch(grove) -> None:
     model, primitives, view = grove
     bunch = 22
-    seen = truth.look(primitives, NEAR, _before(model, view, bunch))
+    seen = truth.render_buffers(primitives, NEAR, _before(model, view, bunch))
     mine = (seen.labels == label(Organ.BUNCH, bunch)) & (seen.berries >= 0)
     assert mine.sum() > 500
-    own = berries(
+    own = lay_out_berries(
         float(model.bunch_length[bunch]),
         float(model.bunch_radius[bunch]),
         int(model.bunch_berries[bunch]),
@@ -122,11 +122,11 @@ def test_berry_numbers_are_those_of_the_packed_bunch(grove) -> None:
     number = seen.berries[mine]
     assert number.max() < len(own.radius)
     # every point lies on the surface of the spheroid that its number names, in the frame of the piece that carries it
-    carrier = seen.carriers[seen.primitive[mine]]
+    carrier = seen.carrier_poses[seen.primitive[mine]]
     local = frames.rotate(frames.conjugate(carrier[:, 3:]), _points(seen, mine) - carrier[:, :3])
     pieces = 1 + int(model.bunch_clusters[bunch])
     length = float(model.bunch_length[bunch])
-    along = piece_of(own.position, length, pieces)[number] * (length / pieces)
+    along = segment_of(own.position, length, pieces)[number] * (length / pieces)
     away = local + along[:, None] * np.array([1.0, 0.0, 0.0]) - own.position[number]
     stretch = VARIETIES[int(model.bunch_variety[bunch])].elongation
     lengthwise = (away * own.axis[number]).sum(1)
@@ -138,8 +138,8 @@ def test_amodal_masks_are_what_rays_meet_of_the_bunch_alone(grove) -> None:
     model, _, view = grove
     bunch = 18
     whole = Primitives(model, grass=0.0)
-    seen = truth.look(whole, NEAR, looking(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
-    one = _of(truth.of_bunches(whole, view, seen), bunch)
+    seen = truth.render_buffers(whole, NEAR, look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
+    one = _of(truth.bunch_truths(whole, view, seen), bunch)
     assert not (one.visible & ~one.amodal).any()
     assert one.pixels < one.amodal_pixels
     mine = whole.label[whole.cluster_first] == label(Organ.BUNCH, bunch)
@@ -154,7 +154,7 @@ def test_amodal_masks_are_what_rays_meet_of_the_bunch_alone(grove) -> None:
 def test_a_wall_hides_and_truth_knows_how_much(grove) -> None:
     model, _, _ = grove
     bunch = 22
-    rest = still_view(model)
+    rest = rest_snapshot(model)
     pose = _before(model, rest, bunch)
     forward, right = (frames.rotate(pose[3:], np.eye(3)[k]) for k in (2, 0))
 
@@ -164,7 +164,7 @@ def test_a_wall_hides_and_truth_knows_how_much(grove) -> None:
         primitives, view = sensor_scenes.world(
             sensor_scenes.thing(sensor_scenes.shape("box", 0.5, 0.5, 0.001)), model=model, at=[[*board, *pose[3:]]]
         )
-        return _of(truth.of_bunches(primitives, view, truth.look(primitives, NEAR, pose)), bunch)
+        return _of(truth.bunch_truths(primitives, view, truth.render_buffers(primitives, NEAR, pose)), bunch)
 
     free, half, hidden = behind(5.0), behind(0.0), behind(-0.5)
     assert free.occlusion < 0.1
@@ -203,7 +203,7 @@ def test_cut_points_lie_in_the_middle_of_the_peduncle(grove, along) -> None:
         pixel = np.full(2, -1.0) if one.cut_pixel is None else one.cut_pixel
         if ((pixel >= 0.0) & (pixel <= [NEAR.width - 1, NEAR.height - 1])).all():
             # a telescope on it, by the rasteriser: a stalk is thinner than a pixel from afar
-            close = looking(seen.pose[:3], one.cut)
+            close = look_at(seen.pose[:3], one.cut)
             _, primitive = sensor_scenes.raster(primitives, close, TELESCOPE)
             shown = primitive[1, 1] >= 0 and primitives.label[primitive[1, 1]] == label(Organ.PEDUNCLE, one.bunch)
             assert shown == one.cut_seen
@@ -212,8 +212,8 @@ def test_cut_points_lie_in_the_middle_of_the_peduncle(grove, along) -> None:
 def test_the_3d_box_holds_the_bunch_and_no_more(grove) -> None:
     model, primitives, view = grove
     bunch = 22
-    seen = truth.look(primitives, NEAR, _before(model, view, bunch))
-    one = _of(truth.of_bunches(primitives, view, seen), bunch)
+    seen = truth.render_buffers(primitives, NEAR, _before(model, view, bunch))
+    one = _of(truth.bunch_truths(primitives, view, seen), bunch)
     own = np.flatnonzero(primitives.label == label(Organ.BUNCH, bunch))
     a, b = (getattr(primitives.shapes, k).numpy()[own].astype(float) for k in "ab")
     berry = primitives.shapes.kind.numpy()[own] == SPHEROID
@@ -238,7 +238,7 @@ def test_depth_labels_and_intrinsics_give_the_middle_of_a_bunch(grove) -> None:
         points, box = [], None
         for turn in np.arange(4) * np.pi / 2:
             pose = _before(model, view, bunch, (0.45 * np.cos(turn), 0.45 * np.sin(turn), -0.12))
-            truths = truth.of_bunches(primitives, view, truth.look(primitives, NEAR, pose))
+            truths = truth.bunch_truths(primitives, view, truth.render_buffers(primitives, NEAR, pose))
             box = _of(truths, bunch)
             if box.occlusion > 0.02:
                 continue
@@ -258,13 +258,13 @@ def test_a_picked_bunch_keeps_its_number(grove) -> None:
     model, primitives, rest = grove
     bunch = 22
     pose = _before(model, rest, bunch)
-    before = _of(truth.of_bunches(primitives, rest, truth.look(primitives, NEAR, pose)), bunch)
+    before = _of(truth.bunch_truths(primitives, rest, truth.render_buffers(primitives, NEAR, pose)), bunch)
     link = Link(f"bunch/{bunch}", Organ.BUNCH, bunch, ())
-    lying = still_view(model, (link,), rest.body_q[model.bunch_body[[bunch]]])
+    lying = rest_snapshot(model, (link,), rest.body_q[model.bunch_body[[bunch]]])
     lying.bunch_attached[bunch] = False
     loose = Primitives(model, grass=2.0)
     loose.update(lying)
-    after = _of(truth.of_bunches(loose, lying, truth.look(loose, NEAR, pose)), bunch)
+    after = _of(truth.bunch_truths(loose, lying, truth.render_buffers(loose, NEAR, pose)), bunch)
     assert (after.attached, after.cut, after.cut_pixel, after.cut_seen) == (False, None, None, False)
     assert (after.label, after.berries) == (before.label, before.berries)
     assert after.amodal_box == before.amodal_box
@@ -275,10 +275,10 @@ def test_a_picked_bunch_keeps_its_number(grove) -> None:
 def test_flow_of_a_moved_camera_lands_on_the_same_points(grove) -> None:
     _, primitives, _ = grove
     one, two = (
-        truth.look(primitives, NEAR, looking(np.array([x, 1.2, 1.3]), np.array([3.0, y, 1.7])))
+        truth.render_buffers(primitives, NEAR, look_at(np.array([x, 1.2, 1.3]), np.array([3.0, y, 1.7])))
         for x, y in ((0.4, 1.0), (0.46, 1.03))
     )
-    shift, shown = truth.flow(one, two)
+    shift, shown = truth.optical_flow(one, two)
     assert np.array_equal(np.isnan(shift[..., 0]), one.primitive == -1)
     assert shown.mean() > 0.5
     v, u = np.nonzero(shown)
@@ -293,7 +293,7 @@ def test_flow_of_a_moved_camera_lands_on_the_same_points(grove) -> None:
     ground = one.primitive == -2
     ray = frames.rotate(one.pose[3:], sensor_scenes.pixel_rays(NEAR)[ground])
     at = one.pose[:3] - ray * (one.pose[2] / ray[:, 2:])
-    image = point_cloud.project(frames.rotate(frames.conjugate(two.pose[3:]), at - two.pose[:3]), NEAR)
+    image = point_cloud.project_points(frames.rotate(frames.conjugate(two.pose[3:]), at - two.pose[:3]), NEAR)
     row, column = np.nonzero(ground)
     near = one.depth[ground] < 20.0
     assert np.abs(image - np.stack([column, row], 1) - shift[ground])[near].max() < 1e-3
@@ -303,7 +303,7 @@ def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
     model, _, view = grove
     primitives, bunch = Primitives(model, grass=0.0), 22
     pose = _before(model, view, bunch)
-    one = truth.look(primitives, NEAR, pose)
+    one = truth.render_buffers(primitives, NEAR, pose)
     tree = int(model.body_tree[model.bunch_body[bunch]])
     body_q = view.body_q.copy()
     turn = frames.exp(np.array([0.02, 0.0, 0.1]))
@@ -312,36 +312,38 @@ def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
     body_q[bodies, :3] = hub + frames.rotate(turn, body_q[bodies, :3] - hub)
     body_q[bodies, 3:] = frames.multiply(turn, body_q[bodies, 3:])
     primitives.update(dataclasses.replace(view, body_q=body_q, moved=np.array([tree])))
-    shift, _ = truth.flow(one, truth.look(primitives, NEAR, pose))
-    carried = np.append(np.isin(one.carriers[:, :3], view.body_q[bodies, :3]).all(1), [False, False])[one.primitive]
+    shift, _ = truth.optical_flow(one, truth.render_buffers(primitives, NEAR, pose))
+    carried = np.append(np.isin(one.carrier_poses[:, :3], view.body_q[bodies, :3]).all(1), [False, False])[
+        one.primitive
+    ]
     mine = (one.labels == label(Organ.BUNCH, bunch)) & carried
     assert mine.sum() > 1000
     point = _points(one, mine)
     moved = hub + frames.rotate(turn, point - hub)
     local = frames.rotate(frames.conjugate(pose[3:]), moved - pose[:3])
     row, column = np.nonzero(mine)
-    assert np.abs(point_cloud.project(local, NEAR) - np.stack([column, row], 1) - shift[mine]).max() < 5e-3
+    assert np.abs(point_cloud.project_points(local, NEAR) - np.stack([column, row], 1) - shift[mine]).max() < 5e-3
     still = ~carried & np.isfinite(one.depth)
     assert still.sum() > 1000
     assert np.abs(shift[still]).max() < 1e-6
     primitives.update(
-        still_view(
+        rest_snapshot(
             model, (sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1)),), np.array([[0, 0, 9.0, 0, 0, 0, 1]])
         )
     )
     with pytest.raises(ValueError, match="came or went"):
-        truth.flow(one, truth.look(primitives, NEAR, pose))
+        truth.optical_flow(one, truth.render_buffers(primitives, NEAR, pose))
 
 
 def test_depth_and_lidar_measure_the_same_scene(grove) -> None:
     """Lidar points, seen by the camera, lie as deep as its depth says: within 2 mm in the median."""
     _, primitives, _ = grove
-    pose = looking(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7]))
+    pose = look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7]))
     scan = Lidar(LidarSpec.load("vlp16").ideal()).scan(primitives, np.array([*pose[:3], 0.0, 0.0, 0.0, 1.0]))
     fine = CameraInfo(1280, 960, 1000.0, 1000.0, 639.5, 479.5, "optical")
-    seen = truth.look(primitives, fine, pose)
+    seen = truth.render_buffers(primitives, fine, pose)
     local = frames.rotate(frames.conjugate(pose[3:]), scan.xyz.astype(float))
-    pixel = np.round(np.nan_to_num(point_cloud.project(local, fine), nan=-1.0)).astype(int)
+    pixel = np.round(np.nan_to_num(point_cloud.project_points(local, fine), nan=-1.0)).astype(int)
     inside = ((pixel >= 0) & (pixel < [fine.width, fine.height])).all(1) & (local[:, 2] < 4.0)
     row, column = pixel[inside, 1], pixel[inside, 0]
     same = seen.labels[row, column] == scan.labels[inside]
@@ -355,11 +357,11 @@ def test_registration_recovers_the_motion_between_two_views(grove) -> None:
     """Open3D's ICP on the clouds of two looks finds how the camera moved, within 2 mm and 0.1 degree."""
     o3d = pytest.importorskip("open3d", reason="Open3D is an extra (perception)")
     _, primitives, _ = grove
-    start = looking(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.6]))
+    start = look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.6]))
     step = np.array([0.01, -0.006, 0.012, *frames.exp(np.radians([0.4, -0.5, 0.3]))])
     clouds = []
     for pose in (start, frames.compose(start, step)):
-        seen = truth.look(primitives, sensor_scenes.IDEAL.info("optical"), pose)
+        seen = truth.render_buffers(primitives, sensor_scenes.IDEAL.info("optical"), pose)
         near = (seen.depth < 4.0) & (seen.primitive >= 0)
         local = sensor_scenes.pixel_rays(seen.info)[near] * seen.depth[near].astype(float)[:, None]
         points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(local))

@@ -9,12 +9,12 @@ import pytest
 
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.tasks.start_poses import QUEUE, bunch_centres, bunch_in_reach, spawn_pose, start_pose
+from vinesim.client.tasks.start_poses import QUEUE_SPACING, bunch_centres, find_reachable_bunch, spawn_pose, start_pose
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load as load_robot
-from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 DT = 0.01
 
@@ -24,12 +24,12 @@ class Farm:
 
     def __init__(self, visitor_back: float = 0.0) -> None:
         self.now = 100.0
-        self.scene = load("demo")
+        self.scene = load_scene("demo")
         self.model = generate(self.scene)
         self.hub = MemoryHub(delay=0.02)
         self.vinebot = load_robot("vinebot")
         start = spawn_pose(self.scene, 0)
-        self.bunch = bunch_in_reach(self.model, start)
+        self.bunch = find_reachable_bunch(self.model, start)
         self.tree = int(self.model.body_tree[self.model.bunch_body[self.bunch]])
         self.farm = self.client("farm_1", start_pose(self.scene, 0, 4.0))
         self.farm.add_robot(self.vinebot, "farm_2", start, self.hub.bus("farm_2"))
@@ -46,7 +46,7 @@ class Farm:
         base, _ = self.farm.physics.rigid.base("farm_2")
         local = frames.rotate(frames.conjugate(base[3:]), centre - base[:3])
         side = "left" if local[1] >= 0.0 else "right"
-        self.farm.pre_step.append(ReachAndPush(robot, side, lambda: centre, repeat=False).control)
+        self.farm.pre_step.append(PushBunch(robot, side, lambda: centre, repeat=False).control)
 
     def until(self, condition, limit: float) -> None:
         for _ in range(round(limit / DT)):
@@ -103,10 +103,10 @@ def test_a_companion_is_nobody_that_must_be_told():
 
 
 def test_robots_of_one_client_start_side_by_side_then_in_line():
-    scene = load("demo")
+    scene = load_scene("demo")
     poses = [start_pose(scene, 0, 0.0, i) for i in range(2 * len(scene.spawns))]
     first, behind = poses[0], poses[len(scene.spawns)]
-    assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE)
+    assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE_SPACING)
     apart = [np.linalg.norm(a[:2] - b[:2]) for i, a in enumerate(poses) for b in poses[:i]]
     assert min(apart) > 1.1
 

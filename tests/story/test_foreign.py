@@ -6,9 +6,9 @@ import pytest
 from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, DescriptionError, load
+from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
 from vinesim.robot.drives import Robot
-from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.builder import assemble
 
 BUNCH = np.array([0.65, 0.25, 1.25])
@@ -16,9 +16,9 @@ BUNCH = np.array([0.65, 0.25, 1.25])
 
 
 @pytest.fixture(scope="module")
-def tiago() -> Description:
+def tiago() -> RobotDescription:
     try:
-        return load("tiago_pro")
+        return load_description("tiago_pro")
     except DescriptionError as error:
         if "not installed" in str(error):
             pytest.skip(str(error))
@@ -28,9 +28,9 @@ def tiago() -> Description:
 class Vineyard:
     """One vine with a bunch in front of the robot, and a clock."""
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         hang = assemble([cane((0.0, 0.0, 0.0), bunch=0.5)])
-        pose = hang.forward(hang.joint_settled)[hang.bunch_body[0]]
+        pose = hang.forward_kinematics(hang.joint_settled)[hang.bunch_body[0]]
         middle = pose[:3] + frames.rotate(pose[3:].astype(float), np.array([0.085, 0.0, 0.0]))
         self.physics = Physics(assemble([cane(BUNCH - middle, bunch=0.5)]), picking=False)
         self.robot = Robot(self.physics.rigid, description, "tiago")
@@ -79,15 +79,15 @@ def test_its_fingers_close_with_their_mimics(tiago):
 
 def test_it_reaches_for_a_bunch_and_pushes_it(tiago):
     world = Vineyard(tiago)
-    reach = ReachAndPush(world.robot, "left", lambda: BUNCH, repeat=False, hold=0.5)
+    reach = PushBunch(world.robot, "left", lambda: BUNCH, repeat=False, hold_time=0.5)
     pushed, effort = 0.0, 0.0
-    while reach.cycles == 0 and world.physics.time < 40.0:
+    while reach.push_count == 0 and world.physics.time < 40.0:
         reach.control(world.physics.time)
         world.run(world.physics.dt)
         contacts = [c for c in world.physics.contacts if c.actor == "tiago"]
         pushed = max(pushed, float(np.linalg.norm(sum((c.force for c in contacts), np.zeros(3)))))
         effort = max(effort, float(np.abs(world.physics.rigid.read("tiago")[3]).max()))
-    assert (reach.cycles, reach.missed) == (1, 0)
+    assert (reach.push_count, reach.missed_count) == (1, 0)
     assert 0.5 < pushed < 60.0
     assert effort > 0.1, "its joints feel the bunch"
     assert world.physics.rigid.faults == 0

@@ -169,7 +169,11 @@ def test_a_bunch_on_its_vine_is_moved_and_seen_from_near_and_only_from_there(nea
         client.physics.refresh()
     here, there, rest = (
         frames.compose(q[body].astype(float), frames.pose([0.1, 0.0, 0.0]))[:3]
-        for q in (ada.physics.state.body_q, bob.physics.state.body_q, ada.model.forward(ada.model.joint_settled))
+        for q in (
+            ada.physics.state.body_q,
+            bob.physics.state.body_q,
+            ada.model.forward_kinematics(ada.model.joint_settled),
+        )
     )
     assert np.linalg.norm(here - rest) > 0.05
     if near:
@@ -342,8 +346,8 @@ def test_a_person_takes_a_bunch_off_its_vine_carries_it_and_lets_it_fall_for_eve
     weak.bunch_pull[:] = 20.0
     world = World(weak)
     ada, bob = world.join("ada", 1.0, -2.5), world.join("bob", -1.0, -2.5)
-    hang = weak.forward(weak.joint_settled)[weak.bunch_body[0], :3] - [0.0, 0.0, 0.08]
-    stands, facing = frames.pose([1.65, 0.0, 0.0], frames.yaw(np.pi)), frames.yaw(np.pi)
+    hang = weak.forward_kinematics(weak.joint_settled)[weak.bunch_body[0], :3] - [0.0, 0.0, 0.08]
+    stands, facing = frames.pose([1.65, 0.0, 0.0], frames.from_yaw(np.pi)), frames.from_yaw(np.pi)
 
     def source(time: float) -> HumanPose:
         come, carry = np.clip((time - 0.5) / 0.5, 0.0, 1.0), np.clip((time - 1.4) / 1.2, 0.0, 1.0)

@@ -11,12 +11,12 @@ from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load
-from vinesim.robot.tasks.pick import Pick
+from vinesim.robot.description.description import load_description
+from vinesim.robot.tasks.pick import PickBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Kind, thing
-from vinesim.scene.spec import load as load_scene
-from vinesim.scene.spec import reseeded
+from vinesim.scene.spec import load_scene as load_scene
+from vinesim.scene.spec import with_seed
 
 DT = 0.01
 GRAVITY = 9.81
@@ -25,14 +25,14 @@ GRAVITY = 9.81
 @pytest.mark.slow
 def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_weighed_on_the_vine():
     now = [100.0]
-    scene = reseeded(load_scene("harvest"), 7)
-    model, vinebot, hub = generate(scene), load("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
-    task = next(pick_planning.tasks(model, start_poses.spawn_pose(scene, 0)[:2]))
+    scene = with_seed(load_scene("harvest"), 7)
+    model, vinebot, hub = generate(scene), load_description("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
+    task = next(pick_planning.plan_picks(model, start_poses.spawn_pose(scene, 0)[:2]))
     box = thing(Kind.BOX, task.box)
     beside = model.box_pose[task.box, :2] + [0.0, 1.6]
     worker, visitor = (
         Client(scene, model, vinebot, hub.bus(name), name=name, pose=pose, clock=lambda: now[0])
-        for name, pose in (("worker", task.stand), ("visitor", frames.pose([*beside, 0.0])))
+        for name, pose in (("worker", task.base_pose), ("visitor", frames.pose([*beside, 0.0])))
     )
     # let MuJoCo compute the forces of what lies still, too
     visitor.physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
@@ -46,10 +46,10 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
 
     run(100)
     empty = float(model.box_mass[task.box]) * GRAVITY
-    pick = Pick(worker.physics, worker.robot, task)
+    pick = PickBunch(worker.physics, worker.robot, task)
     worker.pre_step.append(pick.control)
     bunch, worst = thing(Kind.BUNCH, task.bunch), []
-    while not pick.done:
+    while not pick.is_done:
         run()
         cut = not worker.physics.state.bunch_attached[task.bunch]
         if cut and visitor.replicator.owner(bunch) == "worker":

@@ -5,12 +5,12 @@ import pytest
 
 from vinesim.client.client import Client
 from vinesim.client.recording.trace import Trace, remote_error, touch_to_motion
-from vinesim.client.tasks.start_poses import bunch_centres, bunch_in_reach, spawn_pose
+from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load as load_robot
-from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 
 DT = 0.01
 DELAY = 0.02
@@ -21,12 +21,12 @@ class World:
 
     def __init__(self, visitor_back=0.0):
         self.now = 100.0
-        self.scene = load("demo")
+        self.scene = load_scene("demo")
         self.model = generate(self.scene)
         self.hub = MemoryHub(delay=DELAY, jitter=0.005, seed=1)
         vinebot = load_robot("vinebot")
         start = spawn_pose(self.scene, 0)
-        self.bunch = bunch_in_reach(self.model, start)
+        self.bunch = find_reachable_bunch(self.model, start)
         self.body = int(self.model.bunch_body[self.bunch])
         self.tree = int(self.model.body_tree[self.body])
         places = {"picker": start, "visitor": spawn_pose(self.scene, 1, visitor_back)}
@@ -39,7 +39,7 @@ class World:
         self.picker, self.visitor = self.clients.values()
         for client in self.clients.values():
             client.trace = Trace(self.model, self.bunch, client.physics.state.body_q[self.body].copy(), 20000)
-        self.reach = ReachAndPush(
+        self.reach = PushBunch(
             self.picker.robot, self.picker.side_of(self.picker.trace.centre()), self.picker.trace.centre, repeat=False
         )
         self.picker.pre_step.append(self.reach.control)
@@ -108,7 +108,7 @@ def test_the_whole_way(world):
     picker.pre_step.clear()
     away = picker.robot.description.home
     picker.robot.command_position(away)
-    world.until(lambda: world.tree not in picker.physics.sleep.moving, 60.0)
+    world.until(lambda: world.tree not in picker.physics.sleep.restless, 60.0)
     world.until(lambda: visitor.replicator.owner(world.tree) is None, 2.0)
     here = world.model.bodies_of(world.tree)
     mine, theirs = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]
@@ -145,8 +145,8 @@ def test_twice_the_same_bits():
 
 
 def test_the_chosen_bunch_can_be_reached():
-    scene = load("demo")
+    scene = load_scene("demo")
     model = generate(scene)
     pose = spawn_pose(scene, 0)
-    centre = bunch_centres(model)[bunch_in_reach(model, pose)]
+    centre = bunch_centres(model)[find_reachable_bunch(model, pose)]
     assert 0.35 < np.hypot(*(centre - pose[:3])[:2]) < 0.85

@@ -19,7 +19,7 @@ def fade(
     # out
     shade_out: wp.array(dtype=float),
 ):
-    """Fade one light."""
+    """One thread fades one light."""
     i = wp.tid()
     pair = wp.vec2()
     pair[0] = light[i]
@@ -27,9 +27,16 @@ def fade(
 '''
 
 
+TO_DO = {"contact", "articulation"}
+"""Folders of kernels whose docstrings and arguments are still to be brought to the grammar; empties, never grows."""
+
+
 @pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.name)
-def test_kernels_speak_the_grammar(path: Path) -> None:
-    assert breaches(path.read_text(), path.name) == []
+def test_kernels_keep_to_the_grammar(path: Path) -> None:
+    found = breaches(path.read_text(), path.name)
+    if path.parent.name in TO_DO:
+        found = [breach for breach in found if "one thread does" not in breach and "arguments; group" not in breach]
+    assert found == []
 
 
 def test_there_are_kernels() -> None:
@@ -37,6 +44,7 @@ def test_there_are_kernels() -> None:
 
 
 def test_good_is_good() -> None:
+    assert breaches(GOOD.replace("one light.", "one light.\n\n    light: [light] lx.\n    ")) == []
     assert breaches(GOOD) == []
     assert breaches(GOOD.replace("@wp.kernel", "@wp.kernel(enable_backward=False)")) == []
 
@@ -48,8 +56,9 @@ def test_good_is_good() -> None:
         ("    # in\n", "    # out\n", "light is under # out; call it light_out"),
         ("    # out\n", "", "shade_out ends in _out; put it under # out"),
         ("shade_out", "shade", "shade is under # out; call it shade_out"),
-        ('    """Fade one light."""\n', "", "docstring of one line"),
-        ("one light.", "one\n    light.", "docstring of one line"),
+        ('    """One thread fades one light."""\n', "", "name in its docstring what one thread does"),
+        ("One thread fades", "Fade", "name in its docstring what one thread does"),
+        ("    rate: float,\n", "".join(f"    r{i}: float,\n" for i in range(19)), "21 arguments; group them"),
         ("    pair[0] = light[i]\n", "    light[i] = 0.0\n", "writes light, which is not under # out"),
         ("    pair[0] = light[i]\n", "    light[i] += 1.0\n", "writes light, which is not under # out"),
         ("    pair[0] = light[i]\n", "    wp.atomic_add(light, i, 1.0)\n", "writes light, which is not under # out"),

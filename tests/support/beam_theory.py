@@ -16,8 +16,8 @@ from scipy.optimize import brentq, curve_fit
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
 G = 9.81
@@ -54,14 +54,14 @@ class Beam:
         """At the clamp [kg/m]."""
         return self.density * np.pi * self.radius**2
 
-    def tree(self, side: float = 0.0) -> Tree:
+    def tree(self, side: float = 0.0) -> TreeBuilder:
         """As bodies; the tip mass is a body of its own, on a joint that carries no moment worth the name."""
         along = np.array([np.cos(self.angle), 0.0, np.sin(self.angle)])
-        tree = Tree(frames.pose(np.array([0.0, side, HEIGHT]), frames.aligned(along)))
-        wood = Wood(self.modulus, self.density, self.beta)
-        last = tree.rod(-1, self.length, (self.radius, self.taper * self.radius), wood, self.pieces)[-1]
+        tree = TreeBuilder(frames.pose(np.array([0.0, side, HEIGHT]), frames.from_x_axis(along)))
+        wood = RodMaterial(self.modulus, self.density, self.beta)
+        last = tree.add_rod(-1, self.length, (self.radius, self.taper * self.radius), wood, self.pieces)[-1]
         mass = max(self.tip, 1e-6)
-        tree.add(
+        tree.add_body(
             last, offset=(self.length / self.pieces, 0, 0), mass=mass, inertia=[mass * 1e-6] * 3, length=1e-3,
             stiffness=[1e-3] * 3, damping=[1e-3] * 3,
         )  # fmt: skip
@@ -229,7 +229,7 @@ def cantilever_frequencies(beam: Beam, count: int = 3) -> np.ndarray:
     return np.square(roots) / (2 * np.pi) * np.sqrt(beam.rigidity / beam.line_mass) / beam.length**2
 
 
-def chain(tree: Tree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def chain(tree: TreeBuilder) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inertia, damping and stiffness of a straight chain swinging sideways, from its bodies' numbers alone.
 
     Small angles about z: body k turns by the sum of the joints up to its own, and its middle moves by what they carry.
@@ -245,7 +245,7 @@ def chain(tree: Tree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return M, C, K
 
 
-def chain_modes(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
+def chain_modes(tree: TreeBuilder) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies [Hz] and damping ratios of the oscillating modes of :func:`chain`, slowest first."""
     M, C, K = chain(tree)
     zero, one = np.zeros_like(M), np.eye(len(M))
@@ -255,7 +255,7 @@ def chain_modes(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
     return abs(s) / (2 * np.pi), -s.real / abs(s)
 
 
-def first_shape(tree: Tree) -> np.ndarray:
+def first_shape(tree: TreeBuilder) -> np.ndarray:
     """Joint angles of the first mode without damping, the largest of them 1."""
     M, _, K = chain(tree)
     shape = eigh(K, M, subset_by_index=[0, 0])[1][:, 0]
@@ -265,51 +265,51 @@ def first_shape(tree: Tree) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- the solver
 
 
-def standing(trees: list[Tree], **options: float) -> Plants:
+def standing(trees: list[TreeBuilder], **options: float) -> ArticulationSolver:
     """All awake, as drawn."""
     model = assemble(trees)
-    plants = Plants(model, State.at_rest(model), **options)
+    plants = ArticulationSolver(model, State.at_rest(model), **options)
     plants.wake(np.arange(len(trees)))
     return plants
 
 
-def run(plants: Plants, ticks: int, watch: np.ndarray | None = None) -> np.ndarray:
+def run(plants: ArticulationSolver, ticks: int, watch: np.ndarray | None = None) -> np.ndarray:
     """Step; positions of the watched bodies at the start of every tick [tick, body, 3]."""
     seen = np.zeros((ticks, 0 if watch is None else len(watch), 3))
     for tick in range(ticks):
-        plants.free()
+        plants.predict()
         if watch is not None:
             seen[tick] = plants.state.body_q[watch, :3]
-        plants.commit()
+        plants.integrate()
     return seen
 
 
-def settle(trees: list[Tree], seconds: float = 30.0) -> Plants:
+def settle(trees: list[TreeBuilder], seconds: float = 30.0) -> ArticulationSolver:
     """At rest after so long with phi 1 (which changes no equilibrium)."""
     plants = standing(trees, phi=1.0, dt=0.02)
     run(plants, int(seconds / plants.dt))
-    plants.kinematics()
+    plants.forward_kinematics()
     assert plants.tree_rate.max() < 2e-3, f"tree {plants.tree_rate.argmax()} still moves"
     return plants
 
 
-def grown(parts: list[Beam], side: float = 0.0) -> Tree:
+def grown(parts: list[Beam], side: float = 0.0) -> TreeBuilder:
     """Rods that go on from each other's tips, as bodies; the last carries its tip mass."""
     first, last = parts[0], parts[-1]
     tree = dataclasses.replace(first, tip=0.0).tree(side)
     tree.bodies.pop()
     for part in parts[1:]:
-        wood = Wood(part.modulus, part.density, part.beta)
-        tree.rod(len(tree.bodies) - 1, part.length, (part.radius, part.taper * part.radius), wood, part.pieces)
+        wood = RodMaterial(part.modulus, part.density, part.beta)
+        tree.add_rod(len(tree.bodies) - 1, part.length, (part.radius, part.taper * part.radius), wood, part.pieces)
     mass = max(last.tip, 1e-6)
-    tree.add(
+    tree.add_body(
         len(tree.bodies) - 1, offset=(last.length / last.pieces, 0, 0), mass=mass, inertia=[mass * 1e-6] * 3,
         length=1e-3, stiffness=[1e-3] * 3, damping=[1e-3] * 3,
     )  # fmt: skip
     return tree
 
 
-def last_bodies(plants: Plants) -> np.ndarray:
+def last_bodies(plants: ArticulationSolver) -> np.ndarray:
     """The last body of each tree."""
     return np.cumsum(plants.model.tree_size) - 1
 
@@ -438,7 +438,7 @@ def errors_over_dt() -> dict[str, np.ndarray]:
 def released(beam: Beam, dt: float, seconds: float, size: float = 0.003) -> np.ndarray:
     """Tip [tick, 3] m of a cane let go in the shape of its first mode, bent aside by ``size`` [rad] at most a joint."""
     tree = beam.tree()
-    tree.settle()
+    tree.solve_rest_pose()
     plants = standing([tree], phi=0.5, dt=dt)
     bend = frames.exp(size * first_shape(tree)[:, None] * np.array([0.0, 0.0, 1.0]))
     plants.state.joint_q[:] = frames.multiply(plants.state.joint_q.astype(float), bend)
@@ -451,7 +451,7 @@ ZETAS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2)
 @functools.cache
 def damping_sweep() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First mode of canes at 100 Hz and the shipping phi, for each of ``ZETAS``: damping ratio seen, frequency over
-    theory, and the floor that the solver names (``Plants.damping_floor``)."""
+    theory, and the floor that the solver names (``ArticulationSolver.damping_floor``)."""
     f = cantilever_frequencies(Beam(), 1)[0]
     trees = [Beam(beta=zeta / (np.pi * f)).tree(i) for i, zeta in enumerate(ZETAS)]
     plants = standing(trees)
@@ -461,12 +461,12 @@ def damping_sweep() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return fits[:, 1], fits[:, 0] / f, np.full(len(ZETAS), plants.damping_floor(f))
 
 
-def two_woods(stiff_first: bool, *, beta: tuple[float, float] = (0.0, 0.0), density: float = 800.0) -> Tree:
+def two_woods(stiff_first: bool, *, beta: tuple[float, float] = (0.0, 0.0), density: float = 800.0) -> TreeBuilder:
     """A level cane of a metre, one half 5 GPa, the other 1 GPa."""
     moduli = (5e9, 1e9) if stiff_first else (1e9, 5e9)
-    tree = Tree(frames.pose(np.array([0.0, 0.0, HEIGHT])))
-    half = tree.rod(-1, 0.5, (0.004, 0.004), Wood(moduli[0], density, beta[0]), 8)
-    tree.rod(half[-1], 0.5, (0.004, 0.004), Wood(moduli[1], density, beta[1]), 8)
+    tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, HEIGHT])))
+    half = tree.add_rod(-1, 0.5, (0.004, 0.004), RodMaterial(moduli[0], density, beta[0]), 8)
+    tree.add_rod(half[-1], 0.5, (0.004, 0.004), RodMaterial(moduli[1], density, beta[1]), 8)
     return tree
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.scene.builder import GRAVITY, Tree, Wood, assemble, settle
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import GRAVITY, RodMaterial, TreeBuilder, assemble, solve_rest_pose
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
-DOWN = frames.aligned(np.array([0.0, 0.0, -1.0]))
+DOWN = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
 
 
 def compound(parts: list[tuple[float, np.ndarray, np.ndarray]]) -> tuple[float, np.ndarray, np.ndarray]:
@@ -25,11 +25,11 @@ def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = No
     """Horizontal canes of 1 m (side by side), each with a bunch of 0.5 kg on a peduncle half way; drawn at rest."""
     trees, bunches = [], []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, 0.5 * i, 2.0])) if pose is None else pose)
-        cane = tree.rod(-1, 1.0, (0.005, 0.004), Wood(5e9, 800.0, 0.01), pieces)
-        stalk = tree.rod(cane[pieces // 2], 0.06, (0.002, 0.002), Wood(1e9, 900.0, 0.02), 2, rest=DOWN)
+        tree = TreeBuilder(frames.pose(np.array([0.0, 0.5 * i, 2.0])) if pose is None else pose)
+        cane = tree.add_rod(-1, 1.0, (0.005, 0.004), RodMaterial(5e9, 800.0, 0.01), pieces)
+        stalk = tree.add_rod(cane[pieces // 2], 0.06, (0.002, 0.002), RodMaterial(1e9, 900.0, 0.02), 2, rest=DOWN)
         head = {"mass": 0.05, "com": np.array([0.03, 0.0, 0.0]), "inertia": np.array([1e-5, 4e-5, 4e-5])}
-        bunch = tree.add(
+        bunch = tree.add_body(
             stalk[-1], offset=(0.03, 0, 0), organ=int(Organ.BUNCH), length=0.15, radius=(0.05, 0.05),
             stiffness=(0.3, 0.3, 0.3), damping=(0.004, 0.004, 0.004), **head,
         )  # fmt: skip
@@ -38,7 +38,7 @@ def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = No
             side = frames.exp(np.array([1.3 * j, 0.0, 0.0]))
             out = frames.multiply(side, frames.exp(np.array([0.0, 0.0, 0.7])))
             parent = bunch if j % 2 == 0 else parent
-            parent = tree.add(
+            parent = tree.add_body(
                 parent, offset=(0.02 + 0.02 * (j % 3), 0, 0), rest=out, organ=int(Organ.BUNCH), mass=each,
                 com=(0.03, 0, 0), inertia=each * np.array([3e-4, 5e-4, 5e-4]), length=0.05, radius=(0.02, 0.02),
                 stiffness=(0.1, 0.1, 0.1), damping=(1e-3, 1e-3, 1e-3),
@@ -46,18 +46,18 @@ def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = No
         trees.append(tree)
         bunches.append((bunch, head, len(tree.bodies) - clusters))
         tree.bunches.append({"body": bunch, "length": 0.15, "radius": 0.05, "berries": 100})
-    model = settle(assemble(trees))
+    model = solve_rest_pose(assemble(trees))
     for i, (bunch, head, core) in enumerate(bunches):
         first = int(model.tree_first[i])
         model.tree_core[i], model.bunch_cluster[i], model.bunch_clusters[i] = core, first + core, clusters
         model.bunch_head_mass[i], model.bunch_head_com[i] = head["mass"], head["com"]
         model.bunch_head_inertia[i] = head["inertia"]
-        world = model.forward(model.joint_settled)
+        world = model.forward_kinematics(model.joint_settled)
         back = frames.inverse(world[first + bunch])
         parts = [(head["mass"], head["com"], head["inertia"])]
         for body in range(first + core, first + core + clusters):
             at = frames.compose(back, world[body])
-            axes = frames.matrix(at[3:])
+            axes = frames.to_matrix(at[3:])
             spread = np.diag(axes @ np.diag(model.body_inertia[body]) @ axes.T)
             parts.append((float(model.body_mass[body]), at[:3] + axes @ model.body_com[body], spread))
         body = first + bunch
@@ -65,14 +65,16 @@ def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = No
     return model
 
 
-def moving(plants: Plants, trees: np.ndarray) -> np.ndarray:
+def moving(plants: ArticulationSolver, trees: np.ndarray) -> np.ndarray:
     """The bodies that the kernels visit."""
     fine = plants.state.tree_fine[trees]
     size = np.where(fine, plants.model.tree_size[trees], plants.model.tree_core[trees])
     return np.concatenate([np.arange(f, f + n) for f, n in zip(plants.model.tree_first[trees], size, strict=True)])
 
 
-def momenta(plants: Plants, bodies: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def momenta(
+    plants: ArticulationSolver, bodies: np.ndarray, about: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Of bodies, as ``kinematics`` shows them: linear, angular about a point, centre of mass, kinetic energy."""
     pose, speed = plants.state.body_q[bodies].astype(float), plants.state.body_qd[bodies].astype(float)
     mass = plants.body_mass[bodies].astype(float)

@@ -5,41 +5,43 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import Drive, RobotSpec
 
-DOWN = frames.aligned(np.array([0.0, 0.0, -1.0]))
+DOWN = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
 
 
 def cane(
     at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0, pieces: int = 16
-) -> Tree:
+) -> TreeBuilder:
     """A cane of 1 m in pieces (16 if it has a bunch), level when drawn.
 
     ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm.
     """
-    tree = Tree(frames.pose(np.array(at, float), frames.yaw(heading)))
-    wood = Wood(5e9, 800.0, beta, shear=2.5e9)  # G = E/2 makes torsion as stiff as bending, as MuJoCo's ball wants
-    last = tree.rod(-1, 1.0, (radius, radius), wood, pieces)[-1]
+    tree = TreeBuilder(frames.pose(np.array(at, float), frames.from_yaw(heading)))
+    wood = RodMaterial(
+        5e9, 800.0, beta, shear_modulus=2.5e9
+    )  # G = E/2 makes torsion as stiff as bending, as MuJoCo's ball wants
+    last = tree.add_rod(-1, 1.0, (radius, radius), wood, pieces)[-1]
     if bunch:
         mass, stiffness = 800.0 * np.pi * 0.002**2 * 0.04, 1e9 * np.pi * 0.002**4 / 4 / 0.04
         across = mass * (0.04**2 / 12 + 0.002**2 / 4)
         for i in range(2):
-            last = tree.add(
+            last = tree.add_body(
                 last, offset=(0.0625 if i == 0 else 0.04, 0, 0), rest=DOWN if i == 0 else frames.IDENTITY,
                 organ=int(Organ.PEDUNCLE), mass=mass, com=(0.02, 0, 0), length=0.04, radius=(0.002, 0.002),
                 inertia=(0.5 * mass * 0.002**2, across, across), stiffness=np.full(3, stiffness),
                 damping=np.full(3, 0.01 * stiffness + 1e-3),
             )  # fmt: skip
-        last = tree.add(
+        last = tree.add_body(
             last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=bunch, com=(0.085, 0, 0), length=0.17,
             radius=(0.04, 0.04), inertia=(bunch * 0.00064, bunch * 0.00174, bunch * 0.00174),
             stiffness=np.full(3, stiffness), damping=np.full(3, 0.01 * stiffness + 2e-3),
         )  # fmt: skip
         tree.bunches.append({"body": last, "length": 0.17, "radius": 0.045, "berries": 80})
-    tree.settle()
+    tree.solve_rest_pose()
     return tree
 
 
@@ -120,7 +122,7 @@ def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:
     """A model with one hanging bunch, the bunch's body, and its middle in the world."""
     model = assemble([cane((0.0, 0.0, 2.0), bunch=mass)])
     body = int(model.bunch_body[0])
-    pose = model.forward(model.joint_settled)[body]
+    pose = model.forward_kinematics(model.joint_settled)[body]
     return model, body, pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
 
 

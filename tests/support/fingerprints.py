@@ -23,14 +23,14 @@ from tests.robot.test_pick import picker, vineyard
 from vinesim.client.tasks import start_poses
 from vinesim.net.codec import messages
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import load
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
-from vinesim.robot.tasks.pick import Pick
-from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.robot.tasks.pick import PickBunch
+from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
 def _hash(*parts: bytes) -> str:
@@ -40,11 +40,11 @@ def _hash(*parts: bytes) -> str:
 def push() -> str:
     """Three seconds of a robot that reaches for a bunch of the demo's vineyard and pushes it."""
     model = generate(load_scene("demo"))
-    bunch, stand = start_poses.stand_before_a_bunch(model, np.zeros(2))
+    bunch, stand = start_poses.find_push_pose(model, np.zeros(2))
     physics = Physics(model)
-    robot = Robot(physics.rigid, load("vinebot"), "anna", pose=stand)
+    robot = Robot(physics.rigid, load_description("vinebot"), "anna", pose=stand)
     body = model.bunch_body[bunch]
-    task = ReachAndPush(robot, "left", lambda: physics.state.body_q[body, :3])
+    task = PushBunch(robot, "left", lambda: physics.state.body_q[body, :3])
     h = hashlib.blake2b(digest_size=16)
     for _ in range(300):
         task.control(physics.time)
@@ -58,9 +58,9 @@ def pick() -> str:
     """The picking job from start to end."""
     model, task = vineyard(7)
     physics = Physics(model)
-    job = Pick(physics, picker(physics, load("vinebot"), task.stand), task)
+    job = PickBunch(physics, picker(physics, load_description("vinebot"), task.base_pose), task)
     h = hashlib.blake2b(digest_size=16)
-    while not job.done:
+    while not job.is_done:
         job.control(physics.time)
         job.robot.control(physics.time)
         physics.step()
@@ -101,7 +101,7 @@ def scan() -> str:
     """One revolution of each lidar in the demo's vineyard."""
     model = generate(load_scene("demo"))
     primitives = Primitives(model)
-    primitives.update(still_view(model))
+    primitives.update(rest_snapshot(model))
     pose = np.array([1.2, 0.9, 0.8, 0.0, 0.0, 0.0, 1.0])
     parts = []
     for name in ("vlp16", "os1_64"):

@@ -10,7 +10,7 @@ from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.exchange import Exchange, Inbox
 from vinesim.net.transport.bus import Bus
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate, TreeUpdate
@@ -23,8 +23,8 @@ def vineyard() -> Model:
     """Three trees, a metre apart along x."""
     trees = []
     for number in range(3):
-        tree = Tree(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
-        tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)
+        tree = TreeBuilder(frames.pose(np.array([number + 0.5, 0.0, 1.5])))
+        tree.add_rod(-1, 0.6, (0.006, 0.004), RodMaterial(2e9, 900.0), 6)
         trees.append(tree)
     return assemble(trees)
 

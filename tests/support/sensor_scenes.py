@@ -12,22 +12,22 @@ from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, Link, Shape, View
-from vinesim.sensors.camera.camera import CameraSpec, Visibility, pinhole
-from vinesim.sensors.export.images import looking
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.camera.camera import CameraRasterizer, CameraSpec, pinhole
+from vinesim.sensors.export.images import look_at
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 
 IDEAL = CameraSpec.load("pinhole")
 SMALL = IDEAL.info("optical", 0.5)
-AHEAD = looking(np.array([0, 0, 1.0]), np.array([1.0, 0.0, 1.0]))
+AHEAD = look_at(np.array([0, 0, 1.0]), np.array([1.0, 0.0, 1.0]))
 """An optical frame 1 m above the origin that looks along +x."""
 
 
 @functools.cache
 def demo() -> Model:
-    return generate(load("demo"))
+    return generate(load_scene("demo"))
 
 
 @functools.cache
@@ -47,7 +47,7 @@ def world(*links: Link, model: Model | None = None, at=None, grass: float = 0.0)
     """Primitives that show ``links`` at poses ``at`` [link, 7] (the origin unless given)."""
     model = empty() if model is None else model
     poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (len(links), 1)) if at is None else np.asarray(at, float)
-    view = still_view(model, links, poses)
+    view = rest_snapshot(model, links, poses)
     primitives = Primitives(model, grass=grass)
     primitives.update(view)
     return primitives, view
@@ -65,13 +65,13 @@ def everything(folder: Path) -> Primitives:
     )
     trimesh.creation.icosphere(2, radius=0.15).export(folder / "ball.stl")
     ball = thing(shape("mesh", 1.0, 1.0, 1.0, at=(0, -0.3, 0.6), file=str(folder / "ball.stl")), name="mesh", index=1)
-    at = np.tile([1.2, 1.0, 0.6, *frames.yaw(0.5)], (2, 1))
+    at = np.tile([1.2, 1.0, 0.6, *frames.from_yaw(0.5)], (2, 1))
     return world(solids, ball, model=demo(), at=at, grass=3.0)[0]
 
 
 def raster(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -> tuple[np.ndarray, np.ndarray]:
     """Depth (inf for nothing) and primitive numbers [height, width] by the rasteriser."""
-    seen = Visibility(info.width, info.height)
+    seen = CameraRasterizer(info.width, info.height)
     seen.draw(primitives, pinhole(info, pose))
     shape = (info.height, info.width)
     return seen.depth.numpy().reshape(shape), seen.primitive.numpy().reshape(shape)
@@ -79,7 +79,7 @@ def raster(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -
 
 def oracle(primitives: Primitives, pose: np.ndarray, info: CameraInfo = SMALL) -> tuple[np.ndarray, np.ndarray]:
     """The same by the ray caster."""
-    return RayCaster(primitives).see(pinhole(info, pose))
+    return RayCaster(primitives).cast_camera(pinhole(info, pose))
 
 
 def pixel_rays(info: CameraInfo = SMALL) -> np.ndarray:

@@ -15,11 +15,11 @@ from vinesim.client.client import Client
 from vinesim.net.codec import messages
 from vinesim.net.replication.retained import Facts
 from vinesim.net.transport.bus import EVERY, MemoryBus, MemoryHub
-from vinesim.robot.description.description import Description, load
+from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load as load_scene
+from vinesim.scene.spec import load_scene as load_scene
 
 DT = 0.01
 SIZE = (0.5, 0.3, 0.2)
@@ -73,13 +73,13 @@ rotor = [0.5, 0.5]
 
 
 @functools.cache
-def cart() -> Description:
+def cart() -> RobotDescription:
     """A flat cart with a rim around its deck, and before it a hand of two fingers that goes up and down."""
     with tempfile.TemporaryDirectory() as folder:
         file = pathlib.Path(folder) / "cart.urdf"
         file.write_text(CART)
         file.with_suffix(".toml").write_text(SIDECAR)
-        return load(file)
+        return load_description(file)
 
 
 @functools.cache
@@ -131,7 +131,7 @@ class World:
         self.clients: dict[str, Client] = {}
 
     def join(self, name: str, x: float, y: float, heading: float = 0.0) -> Client:
-        pose = frames.pose([x, y, 0.0], frames.yaw(heading))
+        pose = frames.pose([x, y, 0.0], frames.from_yaw(heading))
         scene = self.scene
         client = Client(scene, self.model, cart(), self.hub.bus(name), name=name, pose=pose, clock=lambda: self.now)
         client.physics.wind = None

@@ -79,7 +79,7 @@ class Walker:
         self.root = np.asarray(root, float)
         self.pose = standing(self.root, height)
         self.closed = {"left": False, "right": False}
-        self._heading = frames.heading(self.root[3:])
+        self._heading = frames.to_yaw(self.root[3:])
         self._place = self.root[:2].copy()
         here = frames.inverse(self._stand())
         self._head = frames.compose(here, self.pose.head)
@@ -142,7 +142,7 @@ class Walker:
             left = float(np.linalg.norm(way))
             at = here[:3] + way * min(1.0, REACH * self.dt / max(left, 1e-9))
             shoulder = frames.compose(self._stand(), frames.pose(np.array([0.0, 0.2 if side == "left" else -0.2, 1.4])))
-            turn = frames.aligned(goal - shoulder[:3])
+            turn = frames.from_x_axis(goal - shoulder[:3])
             self._hands[side] = frames.compose(frames.inverse(self._stand()), frames.pose(at, turn))
             if left <= REACH * self.dt:
                 break
@@ -174,9 +174,9 @@ class Walker:
 
     def _stand(self) -> np.ndarray:
         """Where the body is [7]: on the floor, below the hips."""
-        return frames.pose(np.array([*self._place, self.root[2]]), frames.yaw(self._heading))
+        return frames.pose(np.array([*self._place, self.root[2]]), frames.from_yaw(self._heading))
 
 
 def _upright(head: np.ndarray) -> np.ndarray:
     """A head [7] that looks ahead and not up or down."""
-    return frames.pose(head[:3], frames.yaw(frames.heading(head[3:])))
+    return frames.pose(head[:3], frames.from_yaw(frames.to_yaw(head[3:])))

@@ -19,17 +19,17 @@ import trimesh
 from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, Measurement
-from vinesim.sensors.camera.camera import Camera, CameraSpec, Visibility, pinhole
-from vinesim.sensors.export.images import looking
+from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 
 _ROUNDS = 7
 
 
-def alternate(*cases: Callable[[], object]) -> list[float]:
+def median_cpu_times(*cases: Callable[[], object]) -> list[float]:
     """Median CPU milliseconds of each case, run in turn."""
     spent: list[list[float]] = [[] for _ in cases]
     for case in cases:
@@ -42,7 +42,7 @@ def alternate(*cases: Callable[[], object]) -> list[float]:
     return [statistics.median(times) for times in spent]
 
 
-def meshed(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
+def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [n, 3] m and triangles [m, 3] of plants and posts, as finely as another simulator would draw them."""
     kind = primitives.shapes.kind.numpy()
     a, b, c = (getattr(primitives.shapes, name).numpy() for name in "abc")
@@ -86,13 +86,13 @@ def meshed(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
 
 
-def demo() -> tuple[Model, Primitives]:
+def demo_scene() -> tuple[Model, Primitives]:
     """The vineyard of both benches, without grass."""
-    model = generate(load("demo"))
+    model = generate(load_scene("demo"))
     return model, Primitives(model, grass=0.0)
 
 
-def embree(vertices: np.ndarray, faces: np.ndarray) -> Any:
+def embree_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
     """Open3D's ray caster over triangles."""
     import open3d as o3d
 
@@ -103,11 +103,11 @@ def embree(vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 def camera() -> Iterator[Measurement]:
     """Rasteriser and pictures; the peer is Open3D where it is installed."""
-    _, primitives = demo()
+    _, primitives = demo_scene()
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
-    pose = looking(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
-    seen, lens = Visibility(info.width, info.height), pinhole(info, pose)
+    pose = look_at(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
+    seen, lens = CameraRasterizer(info.width, info.height), pinhole(info, pose)
     eyes = {name: Camera(spec, info, quality=name) for name in ("fast", "full")}
     cases: list[Callable[[], object]] = [lambda: seen.draw(primitives, lens)]
     cases += [lambda eye=eye: eye.render(primitives, pose) for eye in eyes.values()]
@@ -115,11 +115,11 @@ def camera() -> Iterator[Measurement]:
     if find_spec("open3d") is not None:
         import open3d as o3d
 
-        vertices, faces = meshed(primitives)
-        scene, rays = embree(vertices, faces), o3d.core.Tensor(_rays(info, pose))
+        vertices, faces = triangle_mesh(primitives)
+        scene, rays = embree_scene(vertices, faces), o3d.core.Tensor(_rays(info, pose))
         cases.append(lambda: scene.cast_rays(rays))
         peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
-    raster, *pictures = alternate(*cases)
+    raster, *pictures = median_cpu_times(*cases)
     if peer:
         theirs = pictures.pop()
         yield Measurement("camera", name, raster, "CPU ms", peer, theirs, theirs / raster)

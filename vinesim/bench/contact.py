@@ -21,7 +21,7 @@ from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement, RobotSpec
 
 CANE_COUNTS = (64, 256)
@@ -55,7 +55,7 @@ def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurem
     yield from _compare_with_mujoco(
         "1 hand, 1 held vine", "tick", scenes.cane_row(1), [scenes.gripper("hand", scenes.bunch_center(0))], 100
     )
-    model = generate(load(SCENE))
+    model = generate(load_scene(SCENE))
     with _one_core():
         for count in ROBOT_COUNTS:
             yield from _measure_vineyard(model, robot, raised, count)
@@ -66,7 +66,7 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
     physics = Physics(model)
     for i in range(count):
         pose = (
-            frames.pose([*ROBOT_POSITION, 0.0], frames.yaw(0.5 * np.pi))
+            frames.pose([*ROBOT_POSITION, 0.0], frames.from_yaw(0.5 * np.pi))
             if i == 0
             else frames.pose([4.0 * i, -6.0, 0.0])
         )

@@ -12,23 +12,23 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from vinesim.bench.camera import alternate, demo, embree, meshed
+from vinesim.bench.camera import demo_scene, embree_scene, median_cpu_times, triangle_mesh
 from vinesim.scene.values import Measurement
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.lidar.lidar_rasterizer import Sweep
-from vinesim.sensors.scene.primitives import still_view
+from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
+from vinesim.sensors.scene.primitives import rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 
 _STAND = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
 """Between two rows, level."""
 
 
-def _grid(spec: LidarSpec) -> Sweep:
+def _grid(spec: LidarSpec) -> LidarRasterizer:
     """The rays of one revolution."""
     turn = -2.0 * np.pi * spec.rate.value
     lasers = np.arange(len(spec.elevation.value))
     columns = round(1.0 / (spec.rate.value * spec.firing_period.value))
-    return Sweep(
+    return LidarRasterizer(
         np.radians(spec.elevation.value),
         turn * spec.laser_period.value * lasers,
         turn * spec.firing_period.value,
@@ -38,39 +38,39 @@ def _grid(spec: LidarSpec) -> Sweep:
 
 def lidar() -> Iterator[Measurement]:
     """Distances and primitives of all rays, the whole scan, and both while twenty trees move."""
-    model, primitives = demo()
+    model, primitives = demo_scene()
     spec = LidarSpec.load("vlp16")
     head, caster = _grid(spec), RayCaster(primitives)
     thin, wide = Lidar(spec.ideal()), Lidar(spec)
     rays = head.direction.numpy()
     reach = spec.farthest.value
     trees = np.unique(model.body_tree[model.bunch_body])[:20]
-    awake = dataclasses.replace(still_view(model), moved=trees)
+    awake = dataclasses.replace(rest_snapshot(model), moved=trees)
 
     def follow() -> None:
         primitives.update(awake)
-        head.hits(primitives, _STAND, reach=reach)
+        head.cast(primitives, _STAND, reach=reach)
 
     count = len(rays)
     cases: dict[str, Callable[[], object]] = {
-        f"VLP-16, {count} rays, rasterised": lambda: head.hits(primitives, _STAND, reach=reach),
+        f"VLP-16, {count} rays, rasterised": lambda: head.cast(primitives, _STAND, reach=reach),
         f"VLP-16, {count} rays, one by one": lambda: caster.cast(_STAND[:3], rays, reach),
         f"VLP-16, {count} shots, scan of thin beams": lambda: thin.scan(primitives, _STAND),
         f"VLP-16, {count} shots, scan of true beams": lambda: wide.scan(primitives, _STAND),
         f"20 trees moved, {count} rays, rasterised": follow,
     }
     if find_spec("open3d") is None:
-        for case, spent in zip(cases, alternate(*cases.values()), strict=True):
+        for case, spent in zip(cases, median_cpu_times(*cases.values()), strict=True):
             yield Measurement("lidar", case, spent, "CPU ms")
         return
     import open3d as o3d
 
-    vertices, faces = meshed(primitives)
-    scene = embree(vertices, faces)
+    vertices, faces = triangle_mesh(primitives)
+    scene = embree_scene(vertices, faces)
     tensor = o3d.core.Tensor(np.concatenate([np.broadcast_to(_STAND[:3].astype(np.float32), rays.shape), rays], 1))
-    *ours, theirs = alternate(*cases.values(), lambda: scene.cast_rays(tensor))
+    *ours, theirs = median_cpu_times(*cases.values(), lambda: scene.cast_rays(tensor))
     start = time.process_time()
-    embree(vertices, faces).cast_rays(tensor)
+    embree_scene(vertices, faces).cast_rays(tensor)
     rebuilt = (time.process_time() - start) * 1e3
     peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
     for case, spent in zip(cases, ours, strict=True):

@@ -18,9 +18,9 @@ import numpy as np
 from vinesim.bench.support.fake_client import Stage
 from vinesim.bench.support.network_emulator import Emulator, Line, Way
 from vinesim.client.recording.trace import Rows, remote_error
-from vinesim.client.tasks.start_poses import bunch_in_reach, spawn_pose
+from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
 LINES = {
@@ -70,8 +70,8 @@ def moves(rows: Rows, since: float) -> float:
 
 def watched(line: Line) -> tuple[Rows, Rows]:
     """What the picker and the visitor saw of the same bunch."""
-    scene = load("demo")
-    bunch = str(bunch_in_reach(generate(scene), spawn_pose(scene, 0)))
+    scene = load_scene("demo")
+    bunch = str(find_reachable_bunch(generate(scene), spawn_pose(scene, 0)))
     client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
     roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
     with tempfile.TemporaryDirectory() as folder, Emulator(dict.fromkeys(roles, line)) as net:

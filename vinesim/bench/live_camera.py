@@ -11,18 +11,18 @@ from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import Trace
 from vinesim.client.sensing.sensor_process import SensorProcess
-from vinesim.client.tasks.start_poses import bunch_in_reach, spawn_pose, start_pose
+from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, start_pose
 from vinesim.client.tasks.tasks import LookAt
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load as load_robot
-from vinesim.robot.tasks.push import ReachAndPush
+from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
-SECONDS = 8.0
+RUN_TIME = 8.0
 """Real time of one run [s]; each kind is run twice, in turn."""
-SETTLED = 100
+WARMUP_STEPS = 100
 """Ticks before the count begins."""
 
 
@@ -38,7 +38,7 @@ class _Run:
 
 def _run(pictures: bool) -> _Run:
     """One robot pushes a bunch again and again, and its head follows with the camera."""
-    plan = load("demo")
+    plan = load_scene("demo")
     model = generate(plan)
     description = load_robot("vinebot")
     with contextlib.ExitStack() as stack:
@@ -50,15 +50,15 @@ def _run(pictures: bool) -> _Run:
         client = Client(plan, model, description, bus, name="robot", pose=start_pose(plan, 0), executor=arrivals)
         stack.callback(client.leave)
         senses.attach(client)
-        bunch = bunch_in_reach(model, spawn_pose(plan, 0))
+        bunch = find_reachable_bunch(model, spawn_pose(plan, 0))
         body = int(model.bunch_body[bunch])
         client.trace = Trace(model, bunch, client.physics.state.body_q[body].copy(), 1 << 14)
-        reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
+        reach = PushBunch(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
         client.pre_step += [reach.control, LookAt(client.robot, client.trace.centre)]
         warm, pace = RateLoop(client.physics.dt), RateLoop(client.physics.dt)
         camera = description.cameras[0].name
         before = {"frames": 0, "frames_dropped": 0}
-        for beat, ticks in ((warm, SETTLED), (pace, round(SECONDS / client.physics.dt))):
+        for beat, ticks in ((warm, WARMUP_STEPS), (pace, round(RUN_TIME / client.physics.dt))):
             if beat is pace:
                 before = {key: counts.get(camera, 0) for key, counts in senses.report().items() if key in before}
             for _ in range(ticks):
@@ -82,6 +82,6 @@ def eyes() -> Iterator[Measurement]:
     yield Measurement("eyes", "tick p50", seeing.p50, "ms", peer, blind.p50, blind.p50 / seeing.p50)
     yield Measurement("eyes", "tick p99", seeing.p99, "ms", peer, blind.p99, blind.p99 / seeing.p99)
     yield Measurement("eyes", "ticks a second", seeing.hz, "Hz", peer, blind.hz, seeing.hz / blind.hz)
-    yield Measurement("eyes", f"ticks over 10 ms in {SECONDS:g} s", seeing.overruns, "1", peer, blind.overruns, None)
+    yield Measurement("eyes", f"ticks over 10 ms in {RUN_TIME:g} s", seeing.overruns, "1", peer, blind.overruns, None)
     yield Measurement("eyes", "pictures 640x480 a second, of 30 asked for", seeing.frames, "Hz")
     yield Measurement("eyes", "pictures dropped a second", seeing.dropped, "Hz")

@@ -14,8 +14,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
 from vinesim.bench.scenes import interleaved_medians
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -24,12 +24,12 @@ from vinesim.scene.values import Measurement
 CANE_COUNT = 64
 
 
-def plain_cane(side: float) -> Tree:
+def plain_cane(side: float) -> TreeBuilder:
     """A horizontal cane with a bunch hanging from its tip."""
-    tree = Tree(frames.pose(np.array([0.0, side, 2.0])))
-    last = tree.rod(-1, 1.0, (0.004, 0.004), Wood(5e9, 800.0, 0.006), 16)[-1]
-    tree.add(
-        last, offset=(1 / 16, 0, 0), rest=frames.aligned(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH), mass=0.5,
+    tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
+    last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), 16)[-1]
+    tree.add_body(
+        last, offset=(1 / 16, 0, 0), rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH), mass=0.5,
         com=(0.1, 0, 0), inertia=(5e-4, 5e-4, 5e-4), length=0.15, radius=(0.05, 0.05), damping=(0.002, 0.002, 0.002),
     )  # fmt: skip
     return tree
@@ -40,19 +40,19 @@ def cane_scene(count: int) -> Model:
     return assemble([plain_cane(0.5 * i) for i in range(count)])
 
 
-def warmed_up_solver(model: Model, awake: int) -> Plants:
+def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
     """Plants with their first trees awake and every kernel warm."""
-    plants = Plants(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(awake))
     run_steps(plants, 5)
     return plants
 
 
-def run_steps(plants: Plants, count: int) -> None:
+def run_steps(plants: ArticulationSolver, count: int) -> None:
     """Whole ticks without contacts."""
     for _ in range(count):
-        plants.free()
-        plants.commit()
+        plants.predict()
+        plants.integrate()
 
 
 def plant_measurements() -> Iterator[Measurement]:

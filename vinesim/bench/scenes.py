@@ -13,7 +13,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import Drive, RobotSpec
@@ -25,20 +25,20 @@ BUNCH_CENTER = 0.085
 """From the bunch's stalk to its middle [m]."""
 
 
-def cane_with_bunch(side: float) -> Tree:
+def cane_with_bunch(side: float) -> TreeBuilder:
     """A level cane along x with a bunch hanging from its tip."""
-    tree = Tree(frames.pose(np.array([0.0, side, HEIGHT])))
-    last = tree.rod(-1, 1.0, (0.006, 0.006), Wood(5e9, 800.0, 0.01, shear=2.5e9), 16)[-1]
-    down = frames.aligned(np.array([0.0, 0.0, -1.0]))
-    stalk = Wood(1e9, 800.0, 0.02, shear=0.5e9)
-    last = tree.rod(last, 0.08, (0.002, 0.002), stalk, 2, organ=Organ.PEDUNCLE, rest=down)[-1]
+    tree = TreeBuilder(frames.pose(np.array([0.0, side, HEIGHT])))
+    last = tree.add_rod(-1, 1.0, (0.006, 0.006), RodMaterial(5e9, 800.0, 0.01, shear_modulus=2.5e9), 16)[-1]
+    down = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
+    stalk = RodMaterial(1e9, 800.0, 0.02, shear_modulus=0.5e9)
+    last = tree.add_rod(last, 0.08, (0.002, 0.002), stalk, 2, organ=Organ.PEDUNCLE, rest=down)[-1]
     spring = np.asarray(tree.bodies[last]["stiffness"])
-    bunch = tree.add(
+    bunch = tree.add_body(
         last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=0.5, com=(BUNCH_CENTER, 0, 0), length=0.17,
         radius=(0.04, 0.04), inertia=(3.2e-4, 8.7e-4, 8.7e-4), stiffness=spring, damping=0.01 * spring + 2e-3,
     )  # fmt: skip
     tree.bunches.append({"body": bunch, "length": 0.17, "radius": 0.045, "berries": 80, "pull": 500.0, "bend": 50.0})
-    tree.settle()
+    tree.solve_rest_pose()
     return tree
 
 
@@ -47,7 +47,7 @@ def cane_row(count: int) -> Model:
     one = cane_with_bunch(0.0)
     trees = []
     for i in range(count):
-        tree = Tree(frames.pose(np.array([0.0, SPACING * i, HEIGHT])))
+        tree = TreeBuilder(frames.pose(np.array([0.0, SPACING * i, HEIGHT])))
         tree.bodies, tree.bunches = one.bodies, one.bunches
         trees.append(tree)
     return assemble(trees)

@@ -19,30 +19,30 @@ from vinesim import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Link, Measurement, Shape, View
-from vinesim.sensors.camera.camera import Camera, CameraSpec, Visibility, pinhole
-from vinesim.sensors.camera.renderers import NoRenderer
-from vinesim.sensors.export.images import depth_colours, looking, write_png
+from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
+from vinesim.sensors.camera.renderers import RendererUnavailable
+from vinesim.sensors.export.images import depth_colours, look_at, write_png
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import Primitives, still_view
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 from vinesim.sensors.truth import truth
 
 RANGES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
 """At which depth is measured [m]; what lies within a tenth of one counts for it."""
-LOOKS = 8
+VIEWS_PER_RANGE = 8
 """Bunches that are looked at from each of the ranges."""
 LIDARS = ("vlp16", "os1_64")
-OFF = 0.05
+MIXED_RETURN_ERROR = 0.05
 """A lidar's echo counts as mixed if it lies farther than this from what the middle of its beam meets [m]."""
 SEED = 7
-GAZE = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
+RENDERER_VIEW = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
 """Where renderers are compared: from, to [m]."""
 
 
 @dataclasses.dataclass
-class Depths:
+class DepthStatistics:
     """What a camera measured of one kind of thing, by range."""
 
     error: dict[float, float] = dataclasses.field(default_factory=dict)
@@ -58,42 +58,42 @@ class Depths:
             self.error[away] = float(1.4826 * np.median(np.abs(measured[found] - exact[found])))
 
 
-def formula(spec: CameraSpec, depth: np.ndarray) -> np.ndarray:
+def depth_noise_formula(spec: CameraSpec, depth: np.ndarray) -> np.ndarray:
     """The maker's standard deviation of depth: z^2 sigma_d / (f B)."""
     assert spec.stereo is not None
     return np.asarray(depth) ** 2 * spec.stereo.noise.value / (spec.stereo.focal.value * spec.stereo.baseline.value)
 
 
-def plane(spec: CameraSpec) -> Depths:
+def measure_plane(spec: CameraSpec) -> DepthStatistics:
     """Frontal, grey, lit by the sun."""
-    found = Depths()
+    found = DepthStatistics()
     for number, away in enumerate(RANGES):
         wall = Shape("box", (0.05, 20.0, 20.0), frames.pose(np.array([away + 0.05, 0.0, 1.0])))
         nothing = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=0)
-        view = still_view(nothing, (Link("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None])
+        view = rest_snapshot(nothing, (Link("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None])
         primitives = Primitives(nothing, grass=0.0)
         primitives.update(view)
-        camera = Camera(spec, spec.info("optical"), seed=SEED, image=number)
-        frame = camera.render(primitives, looking(np.array([0, 0, 1.0]), np.array([1.0, 0, 1.0])))
+        camera = Camera(spec, spec.info("optical"), seed=SEED, image_index=number)
+        frame = camera.render(primitives, look_at(np.array([0, 0, 1.0]), np.array([1.0, 0, 1.0])))
         mine = (frame.labels // LABEL_STRIDE == int(Organ.ROBOT)) & (frame.exact_depth < 1.1 * away)
         found.add(away, frame.exact_depth[mine], frame.depth[mine])
     return found
 
 
-def plants(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> dict[str, Depths]:
+def measure_plants(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> dict[str, DepthStatistics]:
     """Leaves and bunches, looked at from all ranges around some bunches."""
     rng = np.random.default_rng(SEED)
     camera = Camera(spec, spec.info("optical"), seed=SEED)
     seen: dict[tuple[str, float], list[tuple[np.ndarray, np.ndarray]]] = {}
     for away in RANGES:
-        for _ in range(LOOKS):
+        for _ in range(VIEWS_PER_RANGE):
             frame = camera.render(primitives, _towards_a_bunch(rng, model, view, away))
             organ = frame.labels // LABEL_STRIDE
             for name, number in (("leaves", Organ.LEAF), ("bunches", Organ.BUNCH)):
                 for at in RANGES:
                     mine = (organ == int(number)) & (np.abs(frame.exact_depth / at - 1.0) < 0.1)
                     seen.setdefault((name, at), []).append((frame.exact_depth[mine], frame.depth[mine]))
-    found = {"leaves": Depths(), "bunches": Depths()}
+    found = {"leaves": DepthStatistics(), "bunches": DepthStatistics()}
     for (name, at), parts in seen.items():
         exact, measured = (np.concatenate(column) for column in zip(*parts, strict=True))
         found[name].add(at, exact, measured)
@@ -108,18 +108,18 @@ def _towards_a_bunch(rng: np.random.Generator, model: Model, view: View, away: f
     around = rng.uniform(0.0, 2.0 * np.pi)
     rise = float(np.clip(rng.uniform(1.2, 1.7) - middle[2], -0.4 * away, 0.4 * away))
     level = np.sqrt(away**2 - rise**2)
-    return looking(middle + np.array([level * np.cos(around), level * np.sin(around), rise]), middle)
+    return look_at(middle + np.array([level * np.cos(around), level * np.sin(around), rise]), middle)
 
 
-def berries(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> np.ndarray:
+def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> np.ndarray:
     """Share of the bunch that is hidden, share of its berries that are seen [bunch in a picture, 2]; whole bunches."""
     rng = np.random.default_rng(SEED)
     info = spec.info("optical")
     rows = []
     for away in (0.6, 0.8, 1.0, 1.3):
-        for _ in range(LOOKS):
-            seen = truth.look(primitives, info, _towards_a_bunch(rng, model, view, away))
-            for one in truth.of_bunches(primitives, view, seen):
+        for _ in range(VIEWS_PER_RANGE):
+            seen = truth.render_buffers(primitives, info, _towards_a_bunch(rng, model, view, away))
+            for one in truth.bunch_truths(primitives, view, seen):
                 left, top, right, bottom = one.amodal_box
                 whole = left > 0 and top > 0 and right < info.width - 1 and bottom < info.height - 1
                 if whole and one.amodal_pixels > 1500:
@@ -128,7 +128,7 @@ def berries(spec: CameraSpec, model: Model, primitives: Primitives, view: View) 
 
 
 @dataclasses.dataclass(frozen=True)
-class Ranges:
+class RangeStatistics:
     """One revolution of one lidar in the vineyard."""
 
     exact: np.ndarray
@@ -141,7 +141,7 @@ class Ranges:
     """Share of the returns, before noise, that lie more than OFF from what the middle of their beam meets."""
 
 
-def ranges(name: str, primitives: Primitives) -> Ranges:
+def measure_ranges(name: str, primitives: Primitives) -> RangeStatistics:
     """Between two rows of the demo scene, 1 m above the ground."""
     pose = frames.pose(np.array([3.7, 1.25, 1.0]))
     spec = LidarSpec.load(name)
@@ -157,12 +157,12 @@ def ranges(name: str, primitives: Primitives) -> Ranges:
     shots = [{(o, r): k for k, (o, r) in enumerate(zip(s.offset, s.ring, strict=True))} for s in (thin, wide)]
     both = sorted(shots[0].keys() & shots[1].keys())
     first, second = (np.array([which[shot] for shot in both]) for which in shots)
-    mixed = float((np.abs(exact[first] - mean[second]) > OFF).mean())
-    return Ranges(exact, noisy, len(noisy) / len(exact), mixed)
+    mixed = float((np.abs(exact[first] - mean[second]) > MIXED_RETURN_ERROR).mean())
+    return RangeStatistics(exact, noisy, len(noisy) / len(exact), mixed)
 
 
 @dataclasses.dataclass
-class Pixels:
+class PixelView:
     """What the pixels of one view see, each [height, width]."""
 
     depth: np.ndarray
@@ -170,50 +170,50 @@ class Pixels:
     primitive: np.ndarray
 
 
-def backends(spec: CameraSpec, model: Model, view: View) -> dict[str, Pixels]:
+def compare_renderers(spec: CameraSpec, model: Model, view: View) -> dict[str, PixelView]:
     """One view by every renderer that runs here on the CPU, and by the ray caster, which is the measure of all."""
-    info, pose = spec.info("optical"), looking(*GAZE)
+    info, pose = spec.info("optical"), look_at(*RENDERER_VIEW)
     lens, found = pinhole(info, pose), {}
     for name in ("warp", "taichi"):
         try:
             primitives = Primitives(model, renderer=name)
-        except NoRenderer:
+        except RendererUnavailable:
             continue
         primitives.update(view)
-        seen = Visibility(info.width, info.height)
+        seen = CameraRasterizer(info.width, info.height)
         seen.draw(primitives, lens)
         depth, primitive = (a.numpy().reshape(info.height, info.width) for a in (seen.depth, seen.primitive))
-        found[name] = Pixels(depth, primitive)
+        found[name] = PixelView(depth, primitive)
         if name == "warp":
-            cast = Pixels(*RayCaster(primitives).see(lens))
+            cast = PixelView(*RayCaster(primitives).cast_camera(lens))
     return found | {"rays": cast}
 
 
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     """Figures of all sensor models; ``plot``: a folder for the pictures."""
-    model = generate(load("demo"))
-    primitives, view = Primitives(model), still_view(model)
+    model = generate(load_scene("demo"))
+    primitives, view = Primitives(model), rest_snapshot(model)
     spec = CameraSpec.load("d435")
-    depths = {"plane": plane(spec), **plants(spec, model, primitives, view)}
+    depths = {"plane": measure_plane(spec), **measure_plants(spec, model, primitives, view)}
     for name, one in depths.items():
         for away, error in one.error.items():
-            law = float(formula(spec, np.array(away)))
+            law = float(depth_noise_formula(spec, np.array(away)))
             peer = "formula z^2 s / (f B)"
             yield Measurement(
                 "sensors", f"d435, {name} at {away:g} m: error", 1e3 * error, "mm", peer, 1e3 * law, law / error
             )
             yield Measurement("sensors", f"d435, {name} at {away:g} m: fill rate", one.fill[away], "1")
-    scans = {name: ranges(name, primitives) for name in LIDARS}
+    scans = {name: measure_ranges(name, primitives) for name in LIDARS}
     for name, scan in scans.items():
         yield Measurement("sensors", f"{name}: shots that come back, of those that hit", scan.returned, "1")
         yield Measurement("sensors", f"{name}: mixed returns", scan.mixed, "1")
-    seen = berries(spec, model, primitives, view)
+    seen = measure_berries(spec, model, primitives, view)
     for low, high in ((0.0, 0.1), (0.4, 0.6), (0.8, 0.95)):
         mine = (seen[:, 0] >= low) & (seen[:, 0] < high)
         if mine.any():
             case = f"berries seen, bunch hidden by {100 * low:.0f} to {100 * high:.0f} %"
             yield Measurement("sensors", case, float(np.median(seen[mine, 1])), "1")
-    pictures = backends(spec, model, view)
+    pictures = compare_renderers(spec, model, view)
     cast = pictures["rays"].primitive
     for name, look in pictures.items():
         if name != "rays":
@@ -224,7 +224,7 @@ def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
         _compare(plot, pictures)
 
 
-def _compare(folder: pathlib.Path, pictures: dict[str, Pixels]) -> None:
+def _compare(folder: pathlib.Path, pictures: dict[str, PixelView]) -> None:
     """``sensors-backends.png``: depth by each renderer; magenta where it sees another primitive than the rays."""
     tiles = []
     for look in pictures.values():
@@ -236,7 +236,11 @@ def _compare(folder: pathlib.Path, pictures: dict[str, Pixels]) -> None:
 
 
 def _draw(
-    folder: pathlib.Path, spec: CameraSpec, depths: dict[str, Depths], scans: dict[str, Ranges], seen: np.ndarray
+    folder: pathlib.Path,
+    spec: CameraSpec,
+    depths: dict[str, DepthStatistics],
+    scans: dict[str, RangeStatistics],
+    seen: np.ndarray,
 ) -> None:
     """``sensors-depth.png``, ``sensors-lidar.png`` and ``sensors-berries.png``."""
     import matplotlib as mpl
@@ -247,7 +251,7 @@ def _draw(
     folder.mkdir(parents=True, exist_ok=True)
     figure, (error, fill) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     line = np.geomspace(RANGES[0], RANGES[-1], 50)
-    error.plot(line, 1e3 * formula(spec, line), "k--", label="maker's formula, z² · 0.08 px / (f B)")
+    error.plot(line, 1e3 * depth_noise_formula(spec, line), "k--", label="maker's formula, z² · 0.08 px / (f B)")
     for (name, one), mark in zip(depths.items(), "os^", strict=False):
         error.plot(list(one.error), 1e3 * np.array(list(one.error.values())), mark, label=name)
         fill.plot(list(one.fill), 100.0 * np.array(list(one.fill.values())), mark + "-", label=name)

@@ -21,7 +21,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.recording.trace import Trace
-from vinesim.client.tasks.start_poses import bunch_centres, bunch_in_reach, spawn_pose
+from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.exchange import Inbox
@@ -29,13 +29,13 @@ from vinesim.net.replication.jitter_buffer import Buffer
 from vinesim.net.replication.peers import ACTOR_PERIOD
 from vinesim.net.transport.bus import EVERY, MemoryHub
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description
-from vinesim.robot.description.description import load as load_robot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.description import load_description as load_robot
 from vinesim.robot.drives import RemoteRobot
-from vinesim.robot.tasks.push import Phase, ReachAndPush
+from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import Scene, load
+from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.values import Measurement, TreeUpdate
 
 DT = 0.01
@@ -59,8 +59,8 @@ SEEN = 0.001
 
 
 @functools.cache
-def _stage() -> tuple[Scene, Model, Description]:
-    scene = msgspec.structs.replace(load("demo"), boxes=())  # in their place the second robot will stand
+def _stage() -> tuple[Scene, Model, RobotDescription]:
+    scene = msgspec.structs.replace(load_scene("demo"), boxes=())  # in their place the second robot will stand
     model = generate(scene)
     model.bunch_pull[:] = model.bunch_bend[:] = 1e6  # who fights by the wrong rule would tear the bunch off
     return scene, model, load_robot("vinebot")
@@ -76,13 +76,13 @@ class Pair:
         server = self.hub.bus("server")
         server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now))
         start = spawn_pose(self.scene, 0)
-        self.bunch = bunch_in_reach(self.model, start)
+        self.bunch = find_reachable_bunch(self.model, start)
         self.tree = int(self.model.body_tree[self.model.bunch_body[self.bunch]])
         self.clients: list[Client] = []
         middle = bunch_centres(self.model)[self.bunch]
         opposite = 2.0 * middle[:2] - start[:2]
         heading = np.arctan2(*(middle[:2] - opposite)[::-1])
-        poses = {"first": start, "second": frames.pose([*opposite, 0.0], frames.yaw(heading))}
+        poses = {"first": start, "second": frames.pose([*opposite, 0.0], frames.from_yaw(heading))}
         for name, pose in poses.items():
             client = Client(
                 self.scene, self.model, robot, self.hub.bus(name), name=name, pose=pose, clock=lambda: self.now
@@ -101,10 +101,10 @@ class Pair:
 
         self.second.replicator.receive = overhear
 
-    def push(self, who: Client, **options: float) -> ReachAndPush:
+    def push(self, who: Client, **options: float) -> PushBunch:
         """Let a robot push the bunch, once."""
         rest = _trace(who).centre()
-        reach = ReachAndPush(who.robot, who.side_of(rest), lambda: rest, repeat=False, **options)
+        reach = PushBunch(who.robot, who.side_of(rest), lambda: rest, repeat=False, **options)
         who.pre_step.append(reach.control)
         return reach
 
@@ -258,7 +258,7 @@ def one_push(delay: float, *, quiet: float = 0.0) -> Rows:
     """The first robot pushes the bunch, the second looks on; then both worlds have ``quiet`` [s] at most to rest."""
     pair = Pair(delay)
     pair.meet()
-    reach = pair.push(pair.first, hold=0.5)
+    reach = pair.push(pair.first, hold_time=0.5)
     recorder = Recorder(pair, Authority(pair))
     until = 0
     for tick in range(2000):
@@ -285,7 +285,7 @@ def both_push(delay: float, *, naive: bool = False, hold: float = 4.0) -> Rows:
     if naive:
         pair.take_back()
     pair.meet()
-    reaches = [pair.push(client, hold=hold) for client in pair.clients]
+    reaches = [pair.push(client, hold_time=hold) for client in pair.clients]
     recorder = Recorder(pair)
     for _ in range(2000):
         recorder.tick()
@@ -335,7 +335,7 @@ def turns(signal: np.ndarray, least: float = 0.010) -> int:
 def along(rows: Rows) -> np.ndarray:
     """Displacement of the bunch on both clients along the line between the robots [tick, 2] m."""
     start = spawn_pose(_stage()[0], 0)[:2]
-    line = bunch_centres(_stage()[1])[bunch_in_reach(_stage()[1], spawn_pose(_stage()[0], 0))][:2] - start
+    line = bunch_centres(_stage()[1])[find_reachable_bunch(_stage()[1], spawn_pose(_stage()[0], 0))][:2] - start
     return rows.bunch[..., :2] @ (line / np.linalg.norm(line))
 
 

@@ -20,7 +20,7 @@ from vinesim.net.codec.human import encode_pose
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
 ROBOTS, PEOPLE = 10, 5
@@ -78,7 +78,7 @@ def broadcast(model: Model, puppets: list[Puppet]) -> float:
 
 def traffic() -> Iterator[Measurement]:
     """Rows for actors anywhere, and for the same ones close together."""
-    model = generate(load("tendone"))
+    model = generate(load_scene("tendone"))
     for case, share in (("all over the block", 1.0), ("in a quarter of it", 0.5)):
         hub = MemoryHub(delay=LAN, seed=1)
         server = hub.bus("server")

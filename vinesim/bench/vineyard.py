@@ -10,7 +10,7 @@ import numpy as np
 from vinesim.bench import scenes as scenes
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement, RobotSpec
 
 AWAKE_TREES = 20
@@ -45,7 +45,7 @@ def sleeping_measurements(robot: RobotSpec) -> Iterator[Measurement]:
 
 def _measure_tendone(robot: RobotSpec) -> Iterator[Measurement]:
     """The shipped tendone, one tick at a time: median and 99th percentile on one core."""
-    model = generate(load("tendone"))
+    model = generate(load_scene("tendone"))
     physics = Physics(model)
     physics.add_robot(robot)
     distance = np.linalg.norm(model.tree_pose[:, :2] - robot.pose[:2], axis=1)

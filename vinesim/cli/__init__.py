@@ -74,10 +74,10 @@ def demo(
       vinesim demo --job pick --seed 5
       vinesim demo --job exchange
     """
-    from vinesim.cli.demo import do, run
+    from vinesim.cli.demo import run, run_job
 
     if job != "push":
-        raise typer.Exit(do(job, seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out))
+        raise typer.Exit(run_job(job, seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out))
     raise typer.Exit(
         run(
             seconds=seconds or 20.0, seed=seed, scene=scene or "demo", robot=robot or "vinebot", headless=headless,

@@ -24,20 +24,20 @@ def _contact() -> Iterator[Measurement]:
 
 def _tick() -> Iterator[Measurement]:
     from vinesim.bench.contact import step_measurements
-    from vinesim.robot.description.description import load
+    from vinesim.robot.description.description import load_description
 
-    robot = load("vinebot")
+    robot = load_description("vinebot")
     raised = robot.home.copy()
     for joint, position in RAISED.items():
         raised[robot.joints.index(joint)] = position
-    return step_measurements(robot.spec("robot"), raised)
+    return step_measurements(robot.to_spec("robot"), raised)
 
 
 def _asleep() -> Iterator[Measurement]:
     from vinesim.bench.vineyard import sleeping_measurements
-    from vinesim.robot.description.description import load
+    from vinesim.robot.description.description import load_description
 
-    return sleeping_measurements(load("vinebot").spec("robot"))
+    return sleeping_measurements(load_description("vinebot").to_spec("robot"))
 
 
 def _camera() -> Iterator[Measurement]:

@@ -10,13 +10,13 @@ from multiprocessing.connection import Connection, wait
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vinesim.cli.render import pixels
-from vinesim.client.composition.randomizer import Life
+from vinesim.cli.render import parse_size
+from vinesim.client.composition.randomizer import SceneRandomizer
 from vinesim.errors import UsageError
-from vinesim.scene.spec import load
+from vinesim.scene.spec import load_scene
 from vinesim.sensors.camera import renderers
 from vinesim.sensors.export import dataset
-from vinesim.sensors.export.dataset import DatasetError, Plan
+from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 
 Share = tuple[multiprocessing.process.BaseProcess, Connection]
 
@@ -38,13 +38,20 @@ def run(
         raise UsageError(f"--seed is {seed}: give 0 or more")
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
-    life = Life(actors) if actors > 0.0 else None
-    plan = Plan(load(scene), seed, camera, None if size is None else pixels(size), life, renderers.check(renderer))
+    life = SceneRandomizer(actors) if actors > 0.0 else None
+    plan = DatasetPlan(
+        load_scene(scene),
+        seed,
+        camera,
+        None if size is None else parse_size(size),
+        life,
+        renderers.check_renderer(renderer),
+    )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crew: list[Share] = []
     try:
-        dataset.begin(plan, out)
-        wanted = dataset.missing(out, images)
+        dataset.prepare_folder(plan, out)
+        wanted = dataset.missing_images(out, images)
         shares = _shares(wanted, workers or max((os.cpu_count() or 2) // 2, 1))
         crew += [_start(plan, out, share) for share in shares]
         with Progress(*columns) as progress:
@@ -52,7 +59,7 @@ def run(
             _follow(crew, lambda: progress.advance(task))
     except KeyboardInterrupt:
         _end(crew, out)
-        done = images - len(dataset.missing(out, images))
+        done = images - len(dataset.missing_images(out, images))
         print(f"stopped with {done} of {images} images in {out}; the same command goes on")
         return 130
     finally:
@@ -65,14 +72,14 @@ def _shares(wanted: list[int], workers: int) -> list[list[int]]:
     """Whole vineyards for each worker, as even as it goes: growing one costs more than a picture of it."""
     vineyards: dict[int, list[int]] = {}
     for image in wanted:
-        vineyards.setdefault(image // dataset.IMAGES_A_VINEYARD, []).append(image)
+        vineyards.setdefault(image // dataset.IMAGES_PER_VINEYARD, []).append(image)
     shares: list[list[int]] = [[] for _ in range(workers)]
     for group in vineyards.values():
         min(shares, key=len).extend(group)
     return [share for share in shares if share]
 
 
-def _start(plan: Plan, out: pathlib.Path, share: list[int]) -> Share:
+def _start(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> Share:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(plan, out, share, there), daemon=True)
@@ -81,12 +88,12 @@ def _start(plan: Plan, out: pathlib.Path, share: list[int]) -> Share:
     return process, here
 
 
-def _work(plan: Plan, out: pathlib.Path, share: list[int], tell: Connection) -> None:
+def _work(plan: DatasetPlan, out: pathlib.Path, share: list[int], tell: Connection) -> None:
     """In a process of its own: draw, and say so; nobody listens any more: stop."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its crew
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
-        for image in dataset.draw(plan, out, share):
+        for image in dataset.render_images(plan, out, share):
             tell.send(image)
     except BrokenPipeError:
         return
@@ -123,5 +130,5 @@ def _end(crew: list[Share], out: pathlib.Path) -> None:
         process.join()
         tell.close()
     if crew:
-        dataset.sweep(out)
+        dataset.remove_partial_files(out)
     crew.clear()

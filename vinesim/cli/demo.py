@@ -25,23 +25,23 @@ from rich.table import Table
 
 from vinesim.client.recording import touch_plot
 from vinesim.client.recording.trace import Rows, remote_error
-from vinesim.robot.description.description import Mount
+from vinesim.robot.description.description import SensorMount
 from vinesim.ros import ros_setup
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 
 PUSHER, VISITOR = "picker", "visitor"
-GRACE = 1.6
+EXIT_TIMEOUT = 1.6
 """How long a process may take to end after SIGINT before it is killed [s]."""
 
 
-START = 300.0
+START_TIMEOUT = 300.0
 """How long a client may take to start; a first run compiles kernels [s]."""
-WAY = 14
+APPROACH_DISTANCE = 14
 """The visitor comes from so far [m]."""
-ASIDE = 3.0
+VISITOR_DISTANCE = 3.0
 """A visitor watches a job from so far [m]."""
-PATIENCE = 10.0
+REPORT_TIMEOUT = 10.0
 """How long the visitor may take to write what it saw [s]."""
 
 
@@ -57,8 +57,8 @@ class Process:
 
     name: str
     child: subprocess.Popen[str]
-    lines: queue.Queue[str]
-    words: list[str]
+    stdout_lines: queue.Queue[str]
+    stderr_tail: list[str]
 
     @classmethod
     def start(cls, name: str, *arguments: str, **environ: str) -> Process:
@@ -68,47 +68,47 @@ class Process:
             text=True, start_new_session=True, env={**os.environ, **environ},
         )  # fmt: skip
         process = cls(name, child, queue.Queue(), [])
-        threading.Thread(target=process._read, daemon=True).start()
-        threading.Thread(target=process._listen, daemon=True).start()
+        threading.Thread(target=process._read_stdout, daemon=True).start()
+        threading.Thread(target=process._read_stderr, daemon=True).start()
         return process
 
-    def _read(self) -> None:
+    def _read_stdout(self) -> None:
         assert self.child.stdout is not None
         for line in self.child.stdout:
-            self.lines.put(line.rstrip("\n"))
-        self.lines.put("")
+            self.stdout_lines.put(line.rstrip("\n"))
+        self.stdout_lines.put("")
 
-    def _listen(self) -> None:
+    def _read_stderr(self) -> None:
         assert self.child.stderr is not None
         for line in self.child.stderr:
-            self.words = [*self.words[-40:], line.rstrip("\n")]
+            self.stderr_tail = [*self.stderr_tail[-40:], line.rstrip("\n")]
 
-    def line(self, timeout: float) -> str:
+    def next_line(self, timeout: float) -> str:
         """The next line of output; :class:`DemoFailed` if it ended or stayed silent."""
         try:
-            line = self.lines.get(timeout=timeout)
+            line = self.stdout_lines.get(timeout=timeout)
         except queue.Empty:
-            raise DemoFailed(f"{self.name} said nothing for {timeout:.0f} s; {self._said()}") from None
+            raise DemoFailed(f"{self.name} said nothing for {timeout:.0f} s; {self._stderr_summary()}") from None
         if not line:
-            raise self.failed()
+            raise self.failure()
         return line
 
-    def last_words(self, timeout: float) -> str:
+    def remaining_output(self, timeout: float) -> str:
         """Close its input, and all that it prints until its end."""
         assert self.child.stdin is not None
         self.child.stdin.close()
         words = []
-        while line := self.lines.get(timeout=timeout):
+        while line := self.stdout_lines.get(timeout=timeout):
             words.append(line)
         return "\n".join(words)
 
-    def failed(self) -> DemoFailed:
+    def failure(self) -> DemoFailed:
         """Why it ended too early."""
-        self.child.wait(GRACE)
-        return DemoFailed(f"{self.name} ended with exit code {self.child.returncode}; {self._said()}")
+        self.child.wait(EXIT_TIMEOUT)
+        return DemoFailed(f"{self.name} ended with exit code {self.child.returncode}; {self._stderr_summary()}")
 
-    def _said(self) -> str:
-        last = [word for word in self.words if word.strip()]
+    def _stderr_summary(self) -> str:
+        last = [word for word in self.stderr_tail if word.strip()]
         return f"it said: {last[-1]}" if last else "it said nothing"
 
     def stop(self) -> None:
@@ -116,7 +116,7 @@ class Process:
         if self.child.poll() is None:
             self.child.send_signal(signal.SIGINT)
 
-    def reap(self, timeout: float) -> None:
+    def wait_or_kill(self, timeout: float) -> None:
         """Wait for its end, or end it."""
         try:
             self.child.wait(max(timeout, 0.0))
@@ -126,53 +126,52 @@ class Process:
 
 
 @contextlib.contextmanager
-def company() -> Iterator[list[Process]]:
+def process_group() -> Iterator[list[Process]]:
     """Processes that end with the block, all within :data:`GRACE`, however it is left."""
     processes: list[Process] = []
     try:
         yield processes
     finally:
-        deadline = time.monotonic() + GRACE
+        deadline = time.monotonic() + EXIT_TIMEOUT
         for process in processes:
             process.stop()
         for process in processes:
-            process.reap(deadline - time.monotonic())
+            process.wait_or_kill(deadline - time.monotonic())
 
 
 def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
     """Run the demo and write ``out``; 0 if all went well."""
-    from vinesim.robot.description.description import load as load_robot
+    from vinesim.robot.description.description import load_description as load_robot
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load as load_scene
-    from vinesim.scene.spec import reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     console = Console(stderr=True)
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     robot_named = load_robot(robot)  # say now, and once, what is wrong with it
     model = generate(plan)
-    bunch, places = set_the_stage(plan, model)
+    bunch, places = choose_poses(plan, model)
     for folder in (out, out / PUSHER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
-    no_ros = ros_setup.available()
+    no_ros = ros_setup.unavailable_reason()
     if no_ros:
         console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
 
     common = ["-m", "vinesim.cli", "client", "--role", "robot", "--scene", scene, "--robot", robot, "--status", "json"]
     common += ["--watch", str(bunch)] + ([] if seed is None else ["--seed", str(seed)])
     quiet_ros = {} if "ROS_AUTOMATIC_DISCOVERY_RANGE" in os.environ else {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    with company() as processes:
+    with process_group() as processes:
 
         def start(name: str, *arguments: str) -> Process:
             processes.append(Process.start(name, *arguments, **quiet_ros))
             return processes[-1]
 
         server = start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0")
-        endpoint = server.line(20.0).removeprefix("listening on ")
+        endpoint = server.next_line(20.0).removeprefix("listening on ")
         stranger = (
             None
             if no_ros
-            else start("stranger", "-m", "vinesim.ros.tools.topic_monitor", *heard_topics(robot_named.cameras))
+            else start("stranger", "-m", "vinesim.ros.tools.topic_monitor", *monitored_topics(robot_named.cameras))
         )
         console.print(
             f"server on {endpoint}; {PUSHER} will push bunch {bunch} for {seconds:.0f} s (a first run compiles kernels)"
@@ -182,19 +181,19 @@ def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: b
             "--seconds", str(seconds), "--out", str(out / PUSHER), "--sensor-hz", "1",
         )  # fmt: skip
         visitor = start(
-            VISITOR, *common, "--name", VISITOR, "--connect", endpoint, *places[1], "--back", str(WAY),
+            VISITOR, *common, "--name", VISITOR, "--connect", endpoint, *places[1], "--back", str(APPROACH_DISTANCE),
             "--namespace", VISITOR, "--out", str(out / VISITOR), "--sensor-hz", "0.5",
         )  # fmt: skip
-        newest = {process.name: json.loads(process.line(START)) for process in (pusher, visitor)}
-        watch(pusher, visitor, server, newest, console, headless)
+        newest = {process.name: json.loads(process.next_line(START_TIMEOUT)) for process in (pusher, visitor)}
+        show_progress(pusher, visitor, server, newest, console, headless)
         visitor.stop()
-        visitor.reap(PATIENCE)
+        visitor.wait_or_kill(REPORT_TIMEOUT)
         if visitor.child.returncode:
-            raise visitor.failed()
+            raise visitor.failure()
         heard = {}
         if stranger is not None:
-            heard = json.loads(stranger.last_words(10.0))
-    summary = summarise(out, bunch, heard, no_ros, scene, plan.seed, seconds)
+            heard = json.loads(stranger.remaining_output(10.0))
+    summary = write_summary(out, bunch, heard, no_ros, scene, plan.seed, seconds)
     console.print(_result(summary))
     console.print(f"pictures, plot and summary.json are in {out}/")
     return 0
@@ -204,53 +203,52 @@ JOBS = {"pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged")}
 """Jobs: the robot that does them unless another is named, and the word for that it was done."""
 
 
-def do(
+def run_job(
     job: str, *, seconds: float | None, seed: int | None, scene: str | None, robot: str | None, headless: bool,
     out: pathlib.Path,
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
-    from vinesim.client.tasks.tasks import UnknownJob
-    from vinesim.robot.description.description import load as load_robot
-    from vinesim.scene.spec import load as load_scene
-    from vinesim.scene.spec import reseeded
+    from vinesim.client.tasks.tasks import UnknownTask
+    from vinesim.robot.description.description import load_description as load_robot
+    from vinesim.scene.spec import load_scene, with_seed
 
     if job not in JOBS:
-        raise UnknownJob(f"no job {job!r}; give push, {' or '.join(JOBS)}")
+        raise UnknownTask(f"no job {job!r}; give push, {' or '.join(JOBS)}")
     console = Console(stderr=True)
     robot, scene = robot or JOBS[job][0], scene or "harvest"
-    plan = reseeded(load_scene(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     load_robot(robot)  # say now, and once, what is wrong with it
     out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
-    no_ros = ros_setup.available()
+    no_ros = ros_setup.unavailable_reason()
     quiet_ros = {} if "ROS_AUTOMATIC_DISCOVERY_RANGE" in os.environ else {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    with company() as processes:
+    with process_group() as processes:
         server = Process.start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0", **quiet_ros)
         processes.append(server)
-        endpoint = server.line(20.0).removeprefix("listening on ")
+        endpoint = server.next_line(20.0).removeprefix("listening on ")
         console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
         common = ["-m", "vinesim.cli", "client", "--role", "robot", "--connect", endpoint, "--scene", scene]
         common += ["--seed", str(plan.seed), "--robot", robot, "--status", "json"]
         visitor, newest = None, {}
-        if (place := onlooker(plan)) is not None:
+        if (place := visitor_pose(plan)) is not None:
             visitor = Process.start(
                 VISITOR, *common, "--name", VISITOR, *place, "--namespace", VISITOR, "--out", str(out / VISITOR),
                 "--sensor-hz", "0.5", **quiet_ros,
             )  # fmt: skip
             processes.append(visitor)
-            newest[VISITOR] = json.loads(visitor.line(START))
+            newest[VISITOR] = json.loads(visitor.next_line(START_TIMEOUT))
         worker = Process.start(
             PUSHER, *common, "--name", PUSHER, "--job", job, "--seconds", str(seconds or 120.0),
             "--out", str(out / PUSHER), "--sensor-hz", "1", **quiet_ros,
         )  # fmt: skip
         processes.append(worker)
-        newest[PUSHER] = json.loads(worker.line(START))
-        watch(worker, visitor, server, newest, console, headless)
+        newest[PUSHER] = json.loads(worker.next_line(START_TIMEOUT))
+        show_progress(worker, visitor, server, newest, console, headless)
         if visitor is not None:
             visitor.stop()
-            visitor.reap(PATIENCE)
+            visitor.wait_or_kill(REPORT_TIMEOUT)
             if visitor.child.returncode:
-                raise visitor.failed()
+                raise visitor.failure()
     report = json.loads((out / PUSHER / "report.json").read_text())
     done = bool(report["job"]["succeeded"])
     reason = report["job"]["reason"] or ("" if done else f"stopped at {report['job']['phase']!r} before the end")
@@ -280,7 +278,7 @@ def do(
     return 0 if done else 5
 
 
-def onlooker(plan: Scene) -> list[str] | None:
+def visitor_pose(plan: Scene) -> list[str] | None:
     """Where a visitor watches a job, as options: aside from where it starts, on the way to the second start place."""
     from vinesim.client.tasks import start_poses
 
@@ -288,26 +286,29 @@ def onlooker(plan: Scene) -> list[str] | None:
         return None
     here, there = (start_poses.spawn_pose(plan, i)[:2] for i in (0, 1))
     way = (there - here) / max(float(np.linalg.norm(there - here)), 1e-9)
-    place = here + ASIDE * way
+    place = here + VISITOR_DISTANCE * way
     return ["--place", f"{place[0]:.4f}", f"{place[1]:.4f}", f"{math.atan2(-way[1], -way[0]):.4f}"]
 
 
-def set_the_stage(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:
+def choose_poses(plan: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:
     """The bunch to push, and where both robots start, as options: the scene's places if a bunch is in reach there."""
     from vinesim.client.tasks import start_poses
 
     try:
-        return start_poses.bunch_in_reach(model, start_poses.spawn_pose(plan, 0)), (["--spawn", "0"], ["--spawn", "1"])
-    except start_poses.NoPlace:
-        bunch, pusher = start_poses.stand_before_a_bunch(model, start_poses.spawn_pose(plan, 0)[:2])
-    poses = (pusher, start_poses.way_to(model, pusher, WAY))
+        return start_poses.find_reachable_bunch(model, start_poses.spawn_pose(plan, 0)), (
+            ["--spawn", "0"],
+            ["--spawn", "1"],
+        )
+    except start_poses.PlacementError:
+        bunch, pusher = start_poses.find_push_pose(model, start_poses.spawn_pose(plan, 0)[:2])
+    poses = (pusher, start_poses.find_approach_pose(model, pusher, APPROACH_DISTANCE))
     pusher_at, visitor_at = (
         ["--place", *(f"{v:.4f}" for v in (p[0], p[1], 2.0 * math.atan2(p[5], p[6])))] for p in poses
     )
     return bunch, (pusher_at, visitor_at)
 
 
-def heard_topics(cameras: Sequence[Mount]) -> list[str]:
+def monitored_topics(cameras: Sequence[SensorMount]) -> list[str]:
     """What the stranger subscribes to: all of the pusher's topics, of the visitor's its joints and first picture."""
     topics = [
         "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",
@@ -320,7 +321,7 @@ def heard_topics(cameras: Sequence[Mount]) -> list[str]:
     return [word for topic in topics for word in ("--topic", topic)]
 
 
-def watch(
+def show_progress(
     pusher: Process, visitor: Process | None, server: Process, newest: dict[str, Any], console: Console, headless: bool
 ) -> None:
     """Show what both clients report until the pusher is done."""
@@ -328,19 +329,19 @@ def watch(
     with live as view:
         while True:
             with contextlib.suppress(queue.Empty):
-                while visitor is not None and (line := visitor.lines.get_nowait()):
+                while visitor is not None and (line := visitor.stdout_lines.get_nowait()):
                     newest[VISITOR] = json.loads(line)
             try:
-                line = pusher.lines.get(timeout=0.5)
+                line = pusher.stdout_lines.get(timeout=0.5)
             except queue.Empty:
                 line = None
             if line == "":
-                if pusher.child.wait(GRACE):
-                    raise pusher.failed()
+                if pusher.child.wait(EXIT_TIMEOUT):
+                    raise pusher.failure()
                 return
             for process in (visitor, server):
                 if process is not None and process.child.poll() is not None:
-                    raise process.failed()
+                    raise process.failure()
             if line is not None:
                 newest[PUSHER] = json.loads(line)
                 if view is not None:
@@ -383,7 +384,7 @@ def _table(newest: dict[str, dict[str, Any]]) -> Table:
     return table
 
 
-def summarise(
+def write_summary(
     out: pathlib.Path, bunch: int, heard: dict[str, Any], no_ros: str | None, scene: str, seed: int, seconds: float
 ) -> dict[str, Any]:
     """Put the clients' reports together; ``summary.json``, ``touch.png`` and the pusher's pictures go to ``out``."""

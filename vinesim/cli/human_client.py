@@ -25,25 +25,25 @@ def run(
 ) -> int:  # fmt: skip
     """Walk, reach for a bunch, hold it and pull at it, let go; until told to stop. Then write report.json."""
     from vinesim.avatar.scripted_human import Walker
-    from vinesim.cli.robot_client import SWITCH, save_report, speak, tick_until
+    from vinesim.cli.robot_client import SWITCH_INTERVAL, report_status, save_report, tick_until
     from vinesim.client.client import Client
     from vinesim.client.rate_loop import RateLoop
     from vinesim.client.recording.trace import Trace
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import bunch_centres, checked_bunch, placed, start_pose
+    from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch, with_start_pose
     from vinesim.errors import UsageError
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")
-    sys.setswitchinterval(SWITCH)
-    plan = reseeded(load(scene), seed)
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    plan = with_seed(load_scene(scene), seed)
     if place is not None:
-        plan, spawn = placed(plan, *place), 0
+        plan, spawn = with_start_pose(plan, *place), 0
     model = generate(plan)
-    checked_bunch(model, reach)
+    validate_bunch(model, reach)
     name = name or f"human-{os.getpid()}"
     start = start_pose(plan, spawn)
     walker = Walker(start, height)
@@ -67,11 +67,11 @@ def run(
             body = int(model.bunch_body[reach])
             client.trace = trace = Trace(model, reach, client.physics.state.body_q[body].copy(), 1 << 17)
             if walk is None:
-                walker.do(walker.walk(before(bunch_centres(model)[reach], start)))
-            walker.do(pull(walker, trace.centre))
+                walker.do(walker.walk(standing_place(bunch_centres(model)[reach], start)))
+            walker.do(pull_repeatedly(walker, trace.centre))
         pace = RateLoop(client.physics.dt)
         reporter = Status(client, pace)
-        speaker = threading.Thread(target=speak, args=(reporter, lambda _: None, status, stop), name="status")
+        speaker = threading.Thread(target=report_status, args=(reporter, lambda _: None, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
@@ -84,7 +84,7 @@ def run(
     return 0
 
 
-def pull(walker: Walker, point: Callable[[], np.ndarray]) -> Iterator[None]:
+def pull_repeatedly(walker: Walker, point: Callable[[], np.ndarray]) -> Iterator[None]:
     """Hold what is at a point, pull at it, let it go; for ever."""
     while True:
         yield from walker.reach("right", point)
@@ -96,7 +96,7 @@ def pull(walker: Walker, point: Callable[[], np.ndarray]) -> Iterator[None]:
         yield from walker.wait(1.5)
 
 
-def before(bunch: np.ndarray, start: np.ndarray) -> tuple[float, float]:
+def standing_place(bunch: np.ndarray, start: np.ndarray) -> tuple[float, float]:
     """A place to stand within reach of a bunch [3], on the side of ``start`` [7]."""
     way = bunch[:2] - start[:2]
     length = float(np.linalg.norm(way))

@@ -79,9 +79,9 @@ def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
             raise UsageError(f"--seed {seed}: a seed is of a scene, give --scene too")
         return {}
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
-    plan = reseeded(load(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     return {"scene": plan.name, "seed": str(plan.seed), "digest": generate(plan).digest()}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from vinesim.errors import UsageError
 
 if TYPE_CHECKING:
-    from vinesim.client.composition.composer import Stage
+    from vinesim.client.composition.composer import SceneComposer
 
 
 def run(
@@ -34,53 +34,53 @@ def run(
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
     from vinesim.sensors.camera import renderers
     from vinesim.sensors.camera.camera import Camera, CameraSpec
     from vinesim.sensors.export import annotations as formats
     from vinesim.sensors.export import images as picture
-    from vinesim.sensors.export.dataset import sized
+    from vinesim.sensors.export.dataset import resized_intrinsics
     from vinesim.sensors.scene.primitives import Primitives
-    from vinesim.sensors.scene.ray_caster import enclosing
+    from vinesim.sensors.scene.ray_caster import enclosing_primitive
     from vinesim.sensors.truth import truth
 
-    renderers.check(renderer)
-    eye, target = point("--at", at), point("--look", look)
+    renderers.check_renderer(renderer)
+    eye, target = parse_point("--at", at), parse_point("--look", look)
     if np.linalg.norm(target - eye) < 1e-6:
         raise UsageError(f"--look {look} is where the camera stands; look at another point")
     if eye[2] <= 0.0:
         raise UsageError(f"--at {at} lies in the ground; give a height above 0")
     spec = CameraSpec.load(camera)
-    info = sized(spec, None if size is None else pixels(size))
-    plan, staged = reseeded(load(scene), seed), stage(robots, people, crates)
+    info = resized_intrinsics(spec, None if size is None else parse_size(size))
+    plan, staged = with_seed(load_scene(scene), seed), parse_composition(robots, people, crates)
     sun = plan.sun if hour is None else msgspec.structs.replace(plan.sun, hour=hour)
     model = generate(plan)
-    view = staged.set(model)
+    view = staged.compose(model)
     primitives = Primitives(model, renderer=renderer)
     primitives.update(view)
-    inside = enclosing(primitives, eye)
+    inside = enclosing_primitive(primitives, eye)
     if inside >= 0:
         organ, index = unlabel(int(primitives.label[inside]))
         raise UsageError(f"--at {at} lies inside {organ.name.lower()} {index}; move the camera out of it")
-    pose = picture.looking(eye, target)
-    seen = truth.look(primitives, info, pose)
-    truths = truth.of_bunches(primitives, view, seen)
+    pose = picture.look_at(eye, target)
+    seen = truth.render_buffers(primitives, info, pose)
+    truths = truth.bunch_truths(primitives, view, seen)
     frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
         "depth": picture.depth_millimetres(frame.exact_depth),
         "measured": picture.depth_millimetres(frame.depth),
-        "labels": formats.ids(frame.labels),
-        "overlay": formats.overlay(frame.rgb, truths),
+        "labels": formats.encode_labels(frame.labels),
+        "overlay": formats.draw_overlay(frame.rgb, truths),
     }
-    actors = formats.actors(staged.told(model), seen.labels)
+    actors = formats.actor_records(staged.actor_records(model), seen.labels)
     described = {"scene": plan.name, "seed": plan.seed, "digest": model.digest(), "actors": actors}
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name, image in images.items():
             picture.write_png(out / f"{name}.png", image)
-        formats.write_json(out / "camera.json", formats.camera(spec.model, info, pose))
-        formats.write_json(out / "truth.json", {**described, "bunches": formats.record(truths, info)})
+        formats.write_json(out / "camera.json", formats.camera_record(spec.model, info, pose))
+        formats.write_json(out / "truth.json", {**described, "bunches": formats.bunch_records(truths, info)})
     except OSError as bad:
         raise UsageError(f"--out {out} cannot be written: {bad.strerror or bad}") from None
     in_sight = [one for one in truths if one.pixels]
@@ -91,9 +91,9 @@ def run(
     return 0
 
 
-def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> Stage:
+def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:
     """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
-    from vinesim.client.composition.composer import CrateAt, PersonAt, RobotAt, Stage
+    from vinesim.client.composition.composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
     from vinesim.robot.description import description
     from vinesim.scene import appearance
 
@@ -102,24 +102,24 @@ def stage(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -
         name, mark, where = text.rpartition("@")
         if not (mark and name):
             raise UsageError(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
-        description.load(name)  # says what is wrong with it
-        placed_robots.append(RobotAt(name, *_place("--robot", where, 3)))
+        description.load_description(name)  # says what is wrong with it
+        placed_robots.append(RobotPlacement(name, *_parse_place("--robot", where, 3)))
     for text in people:
         parts = text.split(",")
         posture = parts.pop() if len(parts) > 1 and parts[-1].strip().isidentifier() else "stand"
-        if posture not in appearance.postures():
-            raise UsageError(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.postures())}")
-        x, y, yaw = (*_place("--person", ",".join(parts), 3), 0.0)[:3]
-        placed_people.append(PersonAt(x, y, yaw, posture))
+        if posture not in appearance.posture_names():
+            raise UsageError(f"--person {text}: posture {posture!r} is none of {', '.join(appearance.posture_names())}")
+        x, y, yaw = (*_parse_place("--person", ",".join(parts), 3), 0.0)[:3]
+        placed_people.append(PersonPlacement(x, y, yaw, posture))
     for text in crates:
-        crate = CrateAt(*_place("--crate", text, 4))
+        crate = CratePlacement(*_parse_place("--crate", text, 4))
         if not 0.0 <= crate.fill <= 1.0:
             raise UsageError(f"--crate {text}: the fill is {crate.fill:g}; give 0 (empty) to 1 (full)")
         placed_crates.append(crate)
-    return Stage(tuple(placed_robots), tuple(placed_people), tuple(placed_crates))
+    return SceneComposer(tuple(placed_robots), tuple(placed_people), tuple(placed_crates))
 
 
-def _place(option: str, text: str, most: int) -> list[float]:
+def _parse_place(option: str, text: str, most: int) -> list[float]:
     """``X,Y[,YAW[,...]]`` as two to ``most`` numbers."""
     try:
         values = [float(part) for part in text.split(",")]
@@ -131,7 +131,7 @@ def _place(option: str, text: str, most: int) -> list[float]:
     return values
 
 
-def point(option: str, text: str) -> np.ndarray:
+def parse_point(option: str, text: str) -> np.ndarray:
     """``X,Y,Z`` as a point [3] m."""
     try:
         value = np.array([float(part) for part in text.split(",")])
@@ -142,7 +142,7 @@ def point(option: str, text: str) -> np.ndarray:
     return value
 
 
-def pixels(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """``WxH`` as width and height [px]."""
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if match is None:

@@ -85,14 +85,14 @@ def _look(
     from vinesim.client.recording.replay import ReplayBus
     from vinesim.client.spectator import PictureWriter, Spectator, follow_view, standing_view
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import SceneError, load, reseeded
+    from vinesim.scene.spec import SceneError, load_scene, with_seed
 
     if scene is None and "scene" not in tape.about:
         raise UsageError(f"{tape.path} does not say which scene it is of: give --scene")
     if seed is None and "seed" in tape.about:
         seed = int(tape.about["seed"])
     try:
-        plan = reseeded(load(scene or tape.about["scene"]), seed)
+        plan = with_seed(load_scene(scene or tape.about["scene"]), seed)
     except SceneError as error:
         raise SceneError(f"the scene of {tape.path}: {error}; give --scene FILE") from error
     model = generate(plan)

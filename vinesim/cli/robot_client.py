@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SWITCH = 2e-4
+SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the tick wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
@@ -46,16 +46,16 @@ def run(
     if tls is not None and connect is None:
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
-    from vinesim.physics.plants.device_buffers import device_of
+    from vinesim.physics.plants.device_buffers import find_device
     from vinesim.sensors.camera import renderers
 
-    device_of(device)  # refused before anything is built
-    renderers.check(renderer)
+    find_device(device)  # refused before anything is built
+    renderers.check_renderer(renderer)
     if threads > 1 and device != "cpu":
         raise UsageError(f"--threads {threads} --device {device}: threads are for the CPU; leave one of the two out")
 
     # The tick gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a tick.
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     stop = threading.Event()
 
     from vinesim.client.client import Client
@@ -63,30 +63,29 @@ def run(
     from vinesim.client.recording.trace import Trace
     from vinesim.client.sensing.sensor_process import SensorProcess
     from vinesim.client.status import Status
-    from vinesim.client.tasks.start_poses import checked_bunch, placed, start_pose
-    from vinesim.client.tasks.tasks import DriveTo, LookAt, checked_job, plan_job
+    from vinesim.client.tasks.start_poses import start_pose, validate_bunch, with_start_pose
+    from vinesim.client.tasks.tasks import DriveTo, LookAt, plan_task, validate_task_name
     from vinesim.net.transport.bus import MemoryHub
-    from vinesim.robot.description.description import load as load_robot
-    from vinesim.robot.tasks.push import ReachAndPush
+    from vinesim.robot.description.description import load_description as load_robot
+    from vinesim.robot.tasks.push import PushBunch
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load as load_scene
-    from vinesim.scene.spec import reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
-    checked_job(job)
-    plan = reseeded(load_scene(scene), seed)
+    validate_task_name(job)
+    plan = with_seed(load_scene(scene), seed)
     descriptions = [load_robot(one) for one in robot or ["vinebot"]]
     if place is not None:
-        plan = placed(plan, *place)
+        plan = with_start_pose(plan, *place)
         spawn = 0
     model = generate(plan)
     start = start_pose(plan, spawn, back)
     if job is not None:
-        begin, start = plan_job(job, model, start_pose(plan, spawn))
+        begin, start = plan_task(job, model, start_pose(plan, spawn))
         back = 0.0
     name = name or f"robot-{os.getpid()}"
     names = [name] if len(descriptions) == 1 else [f"{name}_{i + 1}" for i in range(len(descriptions))]
     for bunch in (push, watch):
-        checked_bunch(model, bunch)
+        validate_bunch(model, bunch)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
 
@@ -132,24 +131,24 @@ def run(
                 DriveTo(mine, start_pose(plan, spawn, queue=i)) for i, mine in enumerate(client.robots.values())
             ]
         if push is not None and client.trace is not None:
-            reach = ReachAndPush(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
+            reach = PushBunch(client.robot, client.side_of(client.trace.centre()), client.trace.centre)
             client.pre_step.append(reach.control)
         script = None
         if job is not None:
             script = begin(client.physics, client.robot)
             client.pre_step.append(script.control)
-            client.frame_score = script.worth
+            client.frame_score = script.frame_score
             client.pre_step.append(LookAt(client.robot, script.focus))
         elif client.trace is not None:
             client.pre_step.append(LookAt(client.robot, client.trace.centre))
         reporter = Status(client, pace, senses.sent_messages, script)
         speaker = threading.Thread(
-            target=speak, args=(reporter, senses.publish_diagnostics, status, stop), name="status"
+            target=report_status, args=(reporter, senses.publish_diagnostics, status, stop), name="status"
         )
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)
-        done = (lambda: False) if script is None else (lambda: script.done)
+        done = (lambda: False) if script is None else (lambda: script.is_done)
         tick_until(stop, client.tick, pace, seconds, client.physics.dt, done)
         if out is not None:
             report = reporter.report() | senses.report()
@@ -191,7 +190,7 @@ def ros_name(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-def speak(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
+def report_status(reporter: Any, diagnose: Callable[[dict], None], status: str, stop: threading.Event) -> None:
     """Once a second, say how it goes: to the terminal, and to whoever wants to ``diagnose``."""
     try:
         while not stop.wait(STATUS_PERIOD):

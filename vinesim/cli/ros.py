@@ -7,15 +7,15 @@ from vinesim.ros import ros_setup
 
 def build(quiet: bool) -> int:
     """Build what has no wheel. Without ROS there is nothing to build, which is an error only if one asks aloud."""
-    reason = ros_setup.available()
+    reason = ros_setup.unavailable_reason()
     if reason is not None:
         if not quiet:
             print(f"ROS 2 is not usable here: {reason}")
         return 0 if quiet else 3
     from vinesim.ros.messages import interfaces
 
-    for package in interfaces.known():
+    for package in interfaces.available_packages():
         interfaces.build(package)
     if not quiet:
-        print(f"ROS message packages ready: {', '.join(interfaces.known())}")
+        print(f"ROS message packages ready: {', '.join(interfaces.available_packages())}")
     return 0

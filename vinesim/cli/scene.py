@@ -8,15 +8,15 @@ from rich.console import Console
 from rich.table import Table
 
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.spec import load, reseeded
-from vinesim.scene.summary import table as rows_of
-from vinesim.sensors.export.images import portrait
-from vinesim.sensors.scene.primitives import still_view
+from vinesim.scene.spec import load_scene, with_seed
+from vinesim.scene.summary import summary_rows as rows_of
+from vinesim.sensors.export.images import render_overview
+from vinesim.sensors.scene.primitives import rest_snapshot
 
 
 def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
     """Print a table of the scene and write its picture."""
-    scene = reseeded(load(file), seed)
+    scene = with_seed(load_scene(file), seed)
     model = generate(scene)
     console = Console()
     table = Table(title=f"scene {scene.name}, seed {scene.seed}", title_justify="left", show_header=False)
@@ -24,6 +24,6 @@ def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
         table.add_row(quantity, value, unit)
     console.print(table)
     target = out or pathlib.Path(f"{scene.name}.png")
-    portrait(model, still_view(model), target, sun=scene.sun.direction())
+    render_overview(model, rest_snapshot(model), target, sun=scene.sun.direction())
     console.print(f"picture: {target}")
     return 0

@@ -50,9 +50,9 @@ def run(
 
 def _plan(scene: str, seed: int | None) -> Plan:
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
 
-    plan = reseeded(load(scene), seed)
+    plan = with_seed(load_scene(scene), seed)
     return Plan(plan.name, generate(plan).digest())
 
 

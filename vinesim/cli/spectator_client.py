@@ -19,7 +19,7 @@ def run(
     renderer: str, **_: Any,
 ) -> int:  # fmt: skip
     """Look until told to stop; pictures go to ``out``."""
-    from vinesim.cli.robot_client import speak, tick_until
+    from vinesim.cli.robot_client import report_status, tick_until
     from vinesim.client.rate_loop import RateLoop
     from vinesim.client.spectator import PictureWriter, Spectator, standing_view
     from vinesim.client.status import Status
@@ -28,15 +28,15 @@ def run(
     from vinesim.net.transport.bus import MemoryHub
     from vinesim.net.transport.zenoh_bus import ZenohBus
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load, reseeded
+    from vinesim.scene.spec import load_scene, with_seed
     from vinesim.sensors.camera import renderers
 
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")
     if tls is not None and connect is None:
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
-    renderers.check(renderer)
-    plan = reseeded(load(scene), seed)
+    renderers.check_renderer(renderer)
+    plan = with_seed(load_scene(scene), seed)
     if place is None:
         start = spawn_pose(plan, spawn)
         place = float(start[0]), float(start[1]), 2.0 * float(np.arctan2(start[5], start[6]))
@@ -56,7 +56,7 @@ def run(
         stop = threading.Event()
         pace = RateLoop(spectator.physics.dt)
         reporter = Status(spectator, pace)
-        speaker = threading.Thread(target=speak, args=(reporter, lambda _: None, status, stop), name="status")
+        speaker = threading.Thread(target=report_status, args=(reporter, lambda _: None, status, stop), name="status")
         speaker.start()
         stack.callback(speaker.join)
         stack.callback(stop.set)

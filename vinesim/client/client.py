@@ -33,7 +33,7 @@ from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_body import standing
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description
+from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives import RemoteRobot, Robot
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
@@ -57,7 +57,7 @@ class Client:
         self,
         scene: Scene,
         model: Model,
-        description: Description | None,
+        description: RobotDescription | None,
         bus: Bus,
         *,
         name: str,
@@ -105,7 +105,7 @@ class Client:
         self.spawner = RemoteSpawner(self.physics.rigid, description, executor)
 
     def _add_own_actor(
-        self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
+        self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
         height: float, bus: Bus,
     ) -> None:  # fmt: skip
         """Come into the world as what this client is to be."""
@@ -115,7 +115,7 @@ class Client:
         else:
             self.robot = self.add_robot(description, self.name, pose, bus)
 
-    def add_robot(self, description: Description, name: str, pose: np.ndarray, bus: Bus) -> Robot:
+    def add_robot(self, description: RobotDescription, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Move one more robot, standing at ``pose`` [7]; ``bus`` is opened in its name."""
         hello = Hello(
             name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=self.scene.name,
@@ -165,7 +165,7 @@ class Client:
         for name in inbox.left:
             self.spawner.cancel(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
-                other.leave()
+                other.remove()
                 self.physics.contact_solver.remote_actors.discard(name)
                 log.info("%s left", name)
         for name, update in (*inbox.robots.items(), *inbox.people.items()):

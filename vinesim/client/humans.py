@@ -12,9 +12,9 @@ from vinesim.net.codec.messages import Hello
 from vinesim.physics.rigid.human_body import JUMP, LINGER, SIDES
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.scene.values import POINTS, HumanPose, HumanSpec, HumanUpdate
+from vinesim.scene.values import POINT_NAMES, HumanPose, HumanSpec, HumanUpdate
 
-_HEAD, _HANDS = POINTS.index("head"), [POINTS.index(side) for side in SIDES]
+_HEAD, _HANDS = POINT_NAMES.index("head"), [POINT_NAMES.index(side) for side in SIDES]
 
 
 class Person:
@@ -54,7 +54,7 @@ class Person:
             velocity[:] = 0.0
         self._told = points
         left, right = (free < LINGER for free in self._free)
-        pose = dataclasses.replace(self.pose.at(points), left_busy=left, right_busy=right)
+        pose = dataclasses.replace(self.pose.with_points(points), left_busy=left, right_busy=right)
         return HumanUpdate(self.name, now, pose, velocity)
 
     def pushed(self, robots: Container[str]) -> dict[str, dict[str, np.ndarray]]:
@@ -73,7 +73,7 @@ class RemotePerson:
         """Be where ``update`` says at the end of the coming tick."""
         self.rigid.move_human(self.name, update.pose)
 
-    def leave(self) -> None:
+    def remove(self) -> None:
         """Go."""
         self.rigid.remove_human(self.name)
 

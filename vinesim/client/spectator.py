@@ -12,7 +12,7 @@ from vinesim.client.client import Client, label_index
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.exchange import ONLOOKER, Exchange
 from vinesim.net.transport.bus import Bus
-from vinesim.robot.description.description import Description
+from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import images
@@ -34,7 +34,7 @@ MIDDLE = 1.2
 
 def standing_view(x: float, y: float, heading: float) -> np.ndarray:
     """Pose [7] of the eyes of somebody who stands at (x, y) [m] and looks along ``heading`` [rad]."""
-    return frames.pose([x, y, EYE_HEIGHT], frames.yaw(heading))
+    return frames.pose([x, y, EYE_HEIGHT], frames.from_yaw(heading))
 
 
 def follow_view(base: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ class Spectator(Client):
     picking = False  # it is told what parts
 
     def _enter(
-        self, description: Description | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
+        self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
         height: float, bus: Bus,
     ) -> None:  # fmt: skip
         self.pose = np.asarray(pose, float)
@@ -113,7 +113,7 @@ class PictureWriter:
         self._primitives.update(view, np.flatnonzero(self._moved))
         self._moved[:] = False
         ahead = frames.rotate(spectator.pose[3:], np.array([1.0, 0.0, 0.0]))
-        eye = images.looking(spectator.pose[:3], spectator.pose[:3] + ahead)
+        eye = images.look_at(spectator.pose[:3], spectator.pose[:3] + ahead)
         self.last = self._camera.render(self._primitives, eye, view.time)
         self.count += 1
         images.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
@@ -122,4 +122,4 @@ class PictureWriter:
         """Draw what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
         self._draw(spectator)
         assert self.last is not None
-        images.save(self.last, self.folder, "")
+        images.save_frame(self.last, self.folder, "")

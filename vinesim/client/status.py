@@ -10,13 +10,13 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import touch_to_motion
-from vinesim.robot.tasks.task import Script
+from vinesim.robot.tasks.task import Task
 
 
 class Status:
     """Figures of a running client. Reads what the tick leaves behind; may be asked from another thread."""
 
-    def __init__(self, client: Client, rate_loop: RateLoop, sent: Any = None, task: Script | None = None) -> None:
+    def __init__(self, client: Client, rate_loop: RateLoop, sent: Any = None, task: Task | None = None) -> None:
         """``sent`` gives the number of messages sent so far by ROS topic, if there is a node; ``script``: the job."""
         self.client, self.rate_loop, self._task = client, rate_loop, task
         self._sent = sent or (dict)

@@ -8,32 +8,32 @@ HEAD, HIPS, LEFT_FOOT, RIGHT_FOOT = wp.constant(0), wp.constant(1), wp.constant(
 
 
 @wp.func
-def spot(poses: wp.array2d(dtype=wp.float64), i: int):
+def position(poses: wp.array2d(dtype=wp.float64), i: int):
     """Position of a pose."""
     return wp.vec3d(poses[i, 0], poses[i, 1], poses[i, 2])
 
 
 @wp.func
-def heading(poses: wp.array2d(dtype=wp.float64), i: int):
+def orientation(poses: wp.array2d(dtype=wp.float64), i: int):
     """Rotation of a pose."""
     return wp.quatd(poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6])
 
 
 @wp.func
-def across(v: wp.vec3d, axis: wp.vec3d):
+def perpendicular(v: wp.vec3d, axis: wp.vec3d):
     """Unit vector along what of ``v`` is perpendicular to the unit vector ``axis``."""
     return wp.normalize(v - wp.dot(v, axis) * axis)
 
 
 @wp.func
-def framed(x: wp.vec3d, z: wp.vec3d):
+def rotation_from_axes(x: wp.vec3d, z: wp.vec3d):
     """Rotation of axes x and z to these perpendicular unit vectors."""
     y = wp.cross(z, x)
     return wp.normalize(wp.quat_from_matrix(wp.matrix_from_cols(x, y, z)))
 
 
 @wp.func
-def write(at: wp.vec3d, q: wp.quatd, i: int, poses_out: wp.array2d(dtype=wp.float64)):
+def write_pose(at: wp.vec3d, q: wp.quatd, i: int, poses_out: wp.array2d(dtype=wp.float64)):
     """Put a pose into its row."""
     for k in range(3):
         poses_out[i, k] = at[k]
@@ -42,7 +42,7 @@ def write(at: wp.vec3d, q: wp.quatd, i: int, poses_out: wp.array2d(dtype=wp.floa
 
 
 @wp.kernel
-def stand(
+def pose_torso_and_legs(
     # model
     thigh: wp.float64,
     shank: wp.float64,
@@ -57,43 +57,43 @@ def stand(
     side = wp.tid()
     zero = wp.float64(0.0)
     x = wp.vec3d(wp.float64(1.0), zero, zero)
-    hips = spot(tracked, HIPS)
-    ahead = wp.quat_rotate(heading(tracked, HIPS), x)
+    hips = position(tracked, HIPS)
+    ahead = wp.quat_rotate(orientation(tracked, HIPS), x)
     if side == 2:
         for k in range(7):  # bit by bit
             parts_out[0, k] = tracked[HEAD, k]
             parts_out[2, k] = tracked[HIPS, k]
-        up = wp.normalize(spot(tracked, HEAD) + wp.quat_rotate(heading(tracked, HEAD), neck) - hips)
-        write(hips, framed(across(ahead, up), up), 1, parts_out)
+        up = wp.normalize(position(tracked, HEAD) + wp.quat_rotate(orientation(tracked, HEAD), neck) - hips)
+        write_pose(hips, rotation_from_axes(perpendicular(ahead, up), up), 1, parts_out)
     else:
         foot = LEFT_FOOT + side
         leg = 3 + 3 * side
         sign = wp.float64(1 - 2 * side)
-        joint = hips + wp.quat_rotate(heading(tracked, HIPS), wp.vec3d(zero, sign * hip, zero))
-        apart = spot(tracked, foot) - joint
+        joint = hips + wp.quat_rotate(orientation(tracked, HIPS), wp.vec3d(zero, sign * hip, zero))
+        apart = position(tracked, foot) - joint
         down = wp.normalize(apart)
         reach = wp.clamp(
             wp.length(apart), wp.abs(thigh - shank) + wp.float64(1.0e-3), thigh + shank - wp.float64(1.0e-6)
         )
         along = (thigh * thigh - shank * shank + reach * reach) / (wp.float64(2.0) * reach)
-        front = across(wp.quat_rotate(heading(tracked, foot), x) + ahead, down)
+        front = perpendicular(wp.quat_rotate(orientation(tracked, foot), x) + ahead, down)
         knee = joint + along * down + wp.sqrt(wp.max(thigh * thigh - along * along, zero)) * front
         upper = wp.normalize(knee - joint)
         lower = wp.normalize(joint + reach * down - knee)
-        write(joint, framed(upper, across(front, upper)), leg, parts_out)
-        write(knee, framed(lower, across(front, lower)), leg + 1, parts_out)
+        write_pose(joint, rotation_from_axes(upper, perpendicular(front, upper)), leg, parts_out)
+        write_pose(knee, rotation_from_axes(lower, perpendicular(front, lower)), leg + 1, parts_out)
         for k in range(7):
             parts_out[leg + 2, k] = tracked[foot, k]
 
 
 @wp.func
-def turned(poses: wp.array2d(dtype=wp.float64), i: int, v: wp.vec3d):
+def rotate_by_pose(poses: wp.array2d(dtype=wp.float64), i: int, v: wp.vec3d):
     """A vector of a pose's frame, in the world."""
-    return wp.quat_rotate(heading(poses, i), v)
+    return wp.quat_rotate(orientation(poses, i), v)
 
 
 @wp.kernel
-def hang(
+def pose_arms_and_fingers(
     # model
     upper: wp.float64,
     lower: wp.float64,
@@ -120,40 +120,40 @@ def hang(
     x = wp.vec3d(one, zero, zero)
     z = wp.vec3d(zero, zero, one)
     if thread == 0:
-        foot = spot(held, 0) + turned(held, 0, wp.vec3d(zero, zero, neck))
-        up = wp.normalize(spot(held, 1) + turned(held, 1, nape) - foot)
-        write(foot, framed(up, across(turned(held, 0, x), up)), 0, limbs_out)
+        foot = position(held, 0) + rotate_by_pose(held, 0, wp.vec3d(zero, zero, neck))
+        up = wp.normalize(position(held, 1) + rotate_by_pose(held, 1, nape) - foot)
+        write_pose(foot, rotation_from_axes(up, perpendicular(rotate_by_pose(held, 0, x), up)), 0, limbs_out)
     elif thread < 3:
         hand = thread + 1
         mirror = wp.vec3d(one, wp.float64(3 - 2 * thread), one)
-        joint = spot(held, 0) + turned(held, 0, wp.cw_mul(shoulder, mirror))
-        target = spot(held, hand) + turned(held, hand, wp.cw_mul(wrist, mirror))
+        joint = position(held, 0) + rotate_by_pose(held, 0, wp.cw_mul(shoulder, mirror))
+        target = position(held, hand) + rotate_by_pose(held, hand, wp.cw_mul(wrist, mirror))
         reach = wp.length(target - joint)
         way = wp.normalize(target - joint)
         most = upper + lower - wp.float64(1.0e-6)
         joint = joint + wp.clamp(reach - most, zero, wp.float64(0.2) * upper) * way
         reach = wp.clamp(wp.length(target - joint), wp.abs(upper - lower) + wp.float64(1.0e-3), most)
         along = (upper * upper - lower * lower + reach * reach) / (wp.float64(2.0) * reach)
-        out = across(turned(held, 0, wp.cw_mul(pole, mirror)), way)
+        out = perpendicular(rotate_by_pose(held, 0, wp.cw_mul(pole, mirror)), way)
         elbow = joint + along * way + wp.sqrt(wp.max(upper * upper - along * along, zero)) * out
         arm = wp.normalize(elbow - joint)
         fore = wp.normalize(joint + reach * way - elbow)
-        write(joint, framed(arm, across(-out, arm)), 2 * thread - 1, limbs_out)
-        back = turned(held, hand, z) + wp.float64(1.0e-3) * turned(held, hand, x)
-        write(elbow, framed(fore, across(back, fore)), 2 * thread, limbs_out)
+        write_pose(joint, rotation_from_axes(arm, perpendicular(-out, arm)), 2 * thread - 1, limbs_out)
+        back = rotate_by_pose(held, hand, z) + wp.float64(1.0e-3) * rotate_by_pose(held, hand, x)
+        write_pose(elbow, rotation_from_axes(fore, perpendicular(back, fore)), 2 * thread, limbs_out)
     else:
         finger = thread - 3
         hand = 2 + finger / 5
-        at = spot(held, hand) + turned(held, hand, spot(root, finger))
-        q = heading(held, hand) * heading(root, finger)
+        at = position(held, hand) + rotate_by_pose(held, hand, position(root, finger))
+        q = orientation(held, hand) * orientation(root, finger)
         for k in range(3):
             q = q * wp.quat_from_axis_angle(wp.vec3d(zero, one, zero), bent[finger, k] * closed[finger])
-            write(at, wp.normalize(q), 5 + 3 * finger + k, limbs_out)
+            write_pose(at, wp.normalize(q), 5 + 3 * finger + k, limbs_out)
             at = at + wp.quat_rotate(q, length[finger, k] * x)
 
 
 @wp.kernel
-def differ(
+def pose_difference(
     # in
     start: wp.array2d(dtype=wp.float64),
     goal: wp.array2d(dtype=wp.float64),
@@ -162,11 +162,11 @@ def differ(
     turn_out: wp.array2d(dtype=wp.float64),
     turn_within_out: wp.array2d(dtype=wp.float64),
 ):
-    """Way and turn from one pose to another, the turn in the axes of the world and of the first pose."""
+    """One thread finds way [m] and turn [rad] from one pose to another, the turn in axes of the world and of the first."""
     i = wp.tid()
-    way = spot(goal, i) - spot(start, i)
-    q = heading(start, i)
-    turn = wp.quat_inverse(q) * heading(goal, i)
+    way = position(goal, i) - position(start, i)
+    q = orientation(start, i)
+    turn = wp.quat_inverse(q) * orientation(goal, i)
     vector = wp.vec3d(turn[0], turn[1], turn[2])
     if turn[3] < wp.float64(0.0):
         vector = -vector

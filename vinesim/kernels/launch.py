@@ -1,8 +1,8 @@
 """A kernel bound to its arrays once, launched many times a second; and a crew of threads that share one launch.
 
 Warp packs a kernel's arguments anew at every CPU launch, recorded or not: 10 us for twenty arguments, more than most of
-our kernels run. :func:`bind` packs them once and then only calls the compiled function: 1 us. That call gives the
-interpreter lock away, so Python threads can run a kernel side by side on parts of its list: see :class:`Crew`.
+our kernels run. :func:`bind_launch` packs them once and then only calls the compiled function: 1 us. That call gives the
+interpreter lock away, so Python threads can run a kernel side by side on parts of its list: see :class:`ThreadPool`.
 """
 
 import ctypes
@@ -11,19 +11,19 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
-BLOCK = 32
+THREADS_PER_BLOCK = 32
 """CUDA threads a block. One thread is one tree and runs long: small blocks spread few trees over all multiprocessors."""
 
 
-def bind(
+def bind_launch(
     kernel: wp.Kernel,
     inputs: list,
     outputs: list,
     *,
     device: str = "cpu",
-    over: str = "",
-    shares: int = 1,
-    block: int = BLOCK,
+    index_list: str = "",
+    partitions: int = 1,
+    block: int = THREADS_PER_BLOCK,
 ) -> Callable[..., None]:
     """A function that launches ``kernel`` with so many threads, on the arrays named here.
 
@@ -33,9 +33,9 @@ def bind(
     """
     commands = [
         wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=device, record_cmd=True, block_dim=block)
-        for _ in range(shares)
+        for _ in range(partitions)
     ]
-    at = kernel.arg_indices[over] if over else -1
+    at = kernel.arg_indices[index_list] if index_list else -1
     if not wp.get_device(device).is_cpu:
         return _recorded(commands, inputs, -1)
     try:
@@ -44,10 +44,10 @@ def bind(
             bounds, values = command.params[0], command.params[1:]
             fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, values, strict=True)]
             packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
-            dealt = getattr(packed, over) if over else None
+            dealt = getattr(packed, index_list) if index_list else None
             calls.append((bounds, bounds.shape, dealt, ctypes.byref(bounds), ctypes.byref(packed)))
         forward = commands[0].hooks.forward
-        start, step = (dealt.data, inputs[at].strides[0]) if over else (0, 0)
+        start, step = (dealt.data, inputs[at].strides[0]) if index_list else (0, 0)
     except (AttributeError, TypeError, ValueError):  # another Warp: its own way, at its own speed
         return _recorded(commands, inputs, at)
 
@@ -76,7 +76,7 @@ def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> Callable[...,
     return launch
 
 
-class Crew:
+class ThreadPool:
     """Threads that wait for work and do it together with whoever brings it.
 
     A hand-over costs 10 to 30 us: worth it for work of 100 us and more.
@@ -95,7 +95,7 @@ class Crew:
             loop = (self._work, self._failed, self._start[i], self._done[i], i)
             threading.Thread(target=_wait_and_work, args=loop, name=f"crew {i}", daemon=True).start()
 
-    def share(self, works: Sequence[Callable[[], None]]) -> None:
+    def run(self, works: Sequence[Callable[[], None]]) -> None:
         """Do all of ``works`` [at most ``size``] at once and return when all are done."""
         for i in range(1, len(works)):
             self._work[i] = works[i]

@@ -9,11 +9,11 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.plants.detachment import Blade, Partings
-from vinesim.physics.plants.fault_guard import Guard
-from vinesim.physics.plants.level_of_detail import Detail
-from vinesim.physics.plants.sleep import Sleep
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.detachment import Blade, DetachmentMonitor
+from vinesim.physics.plants.fault_guard import FaultGuard
+from vinesim.physics.plants.level_of_detail import LevelOfDetail
+from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.dormant_bunches import Lying
 from vinesim.physics.rigid.hand_grasp import Holding
@@ -39,30 +39,30 @@ class Physics:
         threads: int = 1,
         picking: bool = True,
     ) -> None:
-        """``device``, ``threads``: see :class:`Plants`; ``picking``: whether bunches detach when pulled too hard."""
+        """``device``, ``threads``: see :class:`ArticulationSolver`; ``picking``: whether bunches detach when pulled too hard."""
         p = parameters
         self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
-        self.plants = Plants(
-            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, brisk=p.fast_joint_rate,
-            limit=p.max_joint_rate, bound=p.fault_joint_rate,
+        self.plants = ArticulationSolver(
+            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, fast_rate=p.fast_joint_rate,
+            max_rate=p.max_joint_rate, fault_rate=p.fault_joint_rate,
         )  # fmt: skip
         self.rigid = Rigid(model, parameters=p)
         self.contact_solver = ContactSolver(
             model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
         )
-        self.parting = Partings(self.plants, self.rigid, self.contact_solver)
+        self.parting = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
         self.holding = Holding(self.plants, self.rigid, self.contact_solver)
         self.riding = Riding(self.rigid)
         self.lying = Lying(self.plants, self.rigid, self.contact_solver, self.riding)
         self._links: tuple[tuple[Link, ...], tuple[Link, ...], tuple[Link, ...]] = ((), (), ())
         self._picking = picking
-        self.detail = Detail(
+        self.detail = LevelOfDetail(
             self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
             patience=p.steps(p.detail_rest_duration),
         )  # fmt: skip
-        self.sleep = Sleep(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
-        self.guard = Guard(self.plants)
+        self.sleep = SleepMonitor(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
+        self.guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
         self.partings: tuple[Parting, ...] = ()
@@ -78,7 +78,7 @@ class Physics:
             ("rigid: predict without plants", self.rigid.prep),
             ("contacts: wake the trees that moving bodies are near to", self.contact_solver.wake_near_trees),
             ("detail: berries move where somebody is near", self._refine),
-            ("plants: predict without contacts", self.plants.free),
+            ("plants: predict without contacts", self.plants.predict),
             ("contacts: solve those of plants and rigid bodies", self.contact_solver.solve),
             ("plants: move, pushed by them", self._commit),
             ("rigid: move, pushed by them", self._finish),
@@ -122,7 +122,7 @@ class Physics:
     def refresh(self) -> None:
         """Bring ``state.body_q`` from the start of the last tick to its end."""
         if not self._fresh:
-            self.plants.kinematics()
+            self.plants.forward_kinematics()
             self._fresh = True
 
     def view(self) -> View:
@@ -184,37 +184,37 @@ class Physics:
         return self.rigid.hand(name, side)
 
     def pick(self, bunch: int) -> None:
-        """Take a bunch off its vine, between ticks; see :meth:`Partings.pick`."""
+        """Take a bunch off its vine, between ticks; see :meth:`DetachmentMonitor.pick`."""
         self.parting.pick(bunch)
         self._body_q = None
 
     def cut(self, body: int) -> None:
-        """Cut a piece of wood off its vine, between ticks; see :meth:`Partings.cut`."""
+        """Cut a piece of wood off its vine, between ticks; see :meth:`DetachmentMonitor.cut`."""
         self.parting.cut(body)
         self._body_q = None
 
     def told_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Another client has picked a bunch; see :meth:`Partings.told_pick`."""
-        self.parting.told_pick(bunch, pose, velocity)
+        """Another client has picked a bunch; see :meth:`DetachmentMonitor.apply_remote_pick`."""
+        self.parting.apply_remote_pick(bunch, pose, velocity)
         self._body_q = None
 
     def told_cut(self, body: int) -> None:
-        """Another client has cut a piece of wood off; see :meth:`Partings.told_cut`."""
-        self.parting.told_cut(body)
+        """Another client has cut a piece of wood off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
+        self.parting.apply_remote_cut(body)
         self._body_q = None
 
     def told_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
         """Others say in what shape trees rest ([body of the tree, 4] each): so they do here, and none wakes for it."""
         for tree, turned in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(turned, np.float32))
-        self.plants.rest(np.array(trees, np.int32))
+        self.plants.put_to_sleep(np.array(trees, np.int32))
         self.contact_solver.update_tree_bounds(np.array(trees, np.int32))
         self.stirred = np.union1d(self.stirred, trees).astype(np.int32)
         self._body_q = None
 
     def watch(self, points: np.ndarray, radius: float) -> None:
-        """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`Detail.watch`."""
-        self.detail.watch(points, radius)
+        """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`LevelOfDetail.set_focus`."""
+        self.detail.set_focus(points, radius)
 
     def blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
         """Give a robot's link a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
@@ -239,7 +239,7 @@ class Physics:
         self.detail.update(self.contact_solver.near_trees)
 
     def _commit(self) -> None:
-        self.plants.commit(self.contact_solver.bodies, self.contact_solver.wrenches)
+        self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
         if len(self.plants.awake):
             self._body_q, self._fresh = None, False
 
@@ -247,16 +247,16 @@ class Physics:
         self.rigid.finish(self.contact_solver.rigid_force)
 
     def _guard(self) -> None:
-        self.guard.check()
+        self.guard.stop_faulty_trees()
 
     def _part(self) -> None:
-        self.partings = self.parting.update(strain=self._picking)
+        self.partings = self.parting.update(check_load=self._picking)
         if self.partings:
             self._body_q = None
 
     def _hold(self) -> None:
         self.holding.end(self.partings)
-        self.parting.held = self.holding.contacts
+        self.parting.hand_contacts = self.holding.contacts
 
     def _sleep(self) -> None:
         if not self.parameters.sleep:

@@ -26,55 +26,55 @@ from vinesim import frames
 from vinesim.physics.plants.detachment import Blade
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import Description, Mount
+from vinesim.robot.description.description import RobotDescription, SensorMount
 from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
 
-SPARE = 0.7
+ACCELERATION_EFFORT_SHARE = 0.7
 """Share of its effort that a drive may spend on gaining speed: the rest carries weight and meets resistance."""
 
 
-class Interface(enum.IntEnum):
+class CommandInterface(enum.IntEnum):
     """What a joint is commanded by; D6.4 names the first three in section 5.2, elastic elements in section 3.1."""
 
     POSITION = 0
     VELOCITY = 1
     EFFORT = 2
-    ELASTIC = 3
+    MOTOR_POSITION = 3
 
 
 class CommandError(ValueError):
     """A command that no joint can take; the text says which and why."""
 
 
-class Embodied:
+class RobotInstance:
     """A robot that stands in the rigid world, whoever moves it."""
 
     def __init__(
         self,
         rigid: Rigid,
-        description: Description,
+        description: RobotDescription,
         name: str = "",
         index: int = 0,
         pose: np.ndarray | None = None,
         *,
-        here: bool = False,
+        is_in_world: bool = False,
     ) -> None:
-        """``here``: it was admitted to ``rigid`` already."""
+        """``is_in_world``: it was added to ``rigid`` already."""
         self.rigid = rigid
         self.description = description
         self.name = name or description.name
         self._index = index
-        spec = description.spec(self.name, index, pose)
-        if not here:
+        spec = description.to_spec(self.name, index, pose)
+        if not is_in_world:
             rigid.add_robot(spec)
         back = frames.conjugate(spec.pose[3:])
         self._start = spec.pose[:3].copy()
-        self._start_turn = frames.matrix(back)
+        self._start_turn = frames.to_matrix(back)
         self._start_left = frames.multiply(back, np.eye(4)).T
         """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
-        self._odometer = Odometer(*description.base_limits.slip, spec.pose)
+        self._odometer = TrackOdometry(*description.base_limits.slip, spec.pose)
 
-    def leave(self) -> None:
+    def remove(self) -> None:
         """Take it out of the world."""
         self.rigid.remove_robot(self.name)
 
@@ -88,8 +88,8 @@ class Embodied:
             base_q=base_q,
             base_qd=base_qd,
             odom_q=self._odometry(base_q),
-            transforms=self.description.moving.frames,
-            transform_q=self.description.moving.poses(position),
+            transforms=self.description.moving_joints.frames,
+            transform_q=self.description.moving_joints.poses(position),
             contacts=tuple(c for c in contacts if c.actor == self.name),
         )
 
@@ -100,23 +100,23 @@ class Embodied:
     def _odometry(self, base_q: np.ndarray) -> np.ndarray:
         """Pose [7] since the start as the tracks tell it: exact, unless they slip."""
         if any(self.description.base_limits.slip):
-            return self._odometer.roll(base_q)
+            return self._odometer.update(base_q)
         return np.concatenate([self._start_turn @ (base_q[:3] - self._start), self._start_left @ base_q[3:]])
 
 
-class Odometer:
+class TrackOdometry:
     """Dead reckoning of tracks that slip: they travel farther than the base, and believe in what they travelled."""
 
     def __init__(self, ahead: float, turning: float, pose: np.ndarray) -> None:
         """``ahead``, ``turning``: shares of the travel that are lost; ``pose`` [7] of the base at the start."""
         self._gain = 1.0 / (1.0 - ahead), 1.0 / (1.0 - turning)
-        self._seen = float(pose[0]), float(pose[1]), frames.heading(pose[3:])
+        self._seen = float(pose[0]), float(pose[1]), frames.to_yaw(pose[3:])
         self._believed = 0.0, 0.0, 0.0
 
-    def roll(self, base_q: np.ndarray) -> np.ndarray:
+    def update(self, base_q: np.ndarray) -> np.ndarray:
         """Count the way to ``base_q`` [7] and return the pose [7] since the start as odometry believes it."""
         x, y, yaw = self._seen
-        self._seen = float(base_q[0]), float(base_q[1]), frames.heading(base_q[3:])
+        self._seen = float(base_q[0]), float(base_q[1]), frames.to_yaw(base_q[3:])
         turn = (self._seen[2] - yaw + np.pi) % (2.0 * np.pi) - np.pi
         c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
         way = self._seen[0] - x, self._seen[1] - y
@@ -125,44 +125,50 @@ class Odometer:
         x, y, yaw = self._believed
         c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
         self._believed = x + c * ahead - s * left, y + s * ahead + c * left, yaw + turn
-        return frames.pose([*self._believed[:2], 0.0], frames.yaw(self._believed[2]))
+        return frames.pose([*self._believed[:2], 0.0], frames.from_yaw(self._believed[2]))
 
 
-class Robot(Embodied):
+class Robot(RobotInstance):
     """A robot that this client controls: the local robot of D6.4 section 5.2."""
 
     def __init__(
         self,
         rigid: Rigid,
-        description: Description,
+        description: RobotDescription,
         name: str = "",
         index: int = 0,
         pose: np.ndarray | None = None,
     ) -> None:
         super().__init__(rigid, description, name, index, pose)
         drives = description.drives
-        self.lower = np.array([drive.lower for drive in drives])
-        self.upper = np.array([drive.upper for drive in drives])
-        self.speed = np.array([drive.velocity for drive in drives])
+        self.lower_limit = np.array([drive.lower for drive in drives])
+        self.upper_limit = np.array([drive.upper for drive in drives])
+        self.max_velocity = np.array([drive.velocity for drive in drives])
         """[joint] largest speeds [rad/s or m/s]"""
-        self.effort = np.array([drive.effort for drive in drives])
+        self.max_effort = np.array([drive.effort for drive in drives])
         """[joint] largest efforts [N m or N]"""
         self._stiffness = np.array([drive.stiffness for drive in drives])
         self._damping = np.array([drive.damping for drive in drives])
-        self._compliant = np.zeros(len(drives), bool)
+        self._is_compliant = np.zeros(len(drives), bool)
         """[joint] whose gains were asked for, so that they must be right to the letter"""
-        self._limit = self.effort.copy()
-        self.spring = np.array([drive.elastic or drive.stiffness or drive.effort / 0.05 for drive in drives])
+        self._effort_limit = self.max_effort.copy()
+        self.series_stiffness = np.array(
+            [drive.series_stiffness or drive.stiffness or drive.effort / 0.05 for drive in drives]
+        )
         """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
-        self._spring_damping = np.array([drive.elastic_damping if drive.elastic else drive.damping for drive in drives])
-        self._order = {drive.joint: i for i, drive in enumerate(drives)}
-        self._grippers: dict[str, np.ndarray] = {}
+        self._series_damping = np.array(
+            [drive.series_damping if drive.series_stiffness else drive.damping for drive in drives]
+        )
+        self._joint_index = {drive.joint: i for i, drive in enumerate(drives)}
+        self._finger_groups: dict[str, np.ndarray] = {}
         """Fingers that close together: a hand that drifted with what it holds would be two hands."""
         self._cutters: dict[str, list[Blade]] = {}
         self._physics: Physics | None = None
         for mount in (*description.wrenches, *description.imus):
             rigid.instrument(self.name, mount.frame)
-        self._beyond = {mount.frame: _links_beyond(description, mount.frame) for mount in description.wrenches}
+        self._links_beyond_sensor = {
+            mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches
+        }
         self.stop()
 
     def fit_cutters(self, physics: Physics) -> None:
@@ -172,24 +178,24 @@ class Robot(Embodied):
             blade = physics.blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
             self._cutters.setdefault(cutter.group, []).append(blade)
 
-    def leave(self) -> None:
+    def remove(self) -> None:
         """Take it out of the world, its cutters with it."""
         if self._physics is not None:
             self._physics.remove_robot(self.name)
         else:
-            super().leave()
+            super().remove()
 
     def stop(self) -> None:
         """Forget all commands and hold every joint and the base where they are."""
         self.setpoint = self.rigid.read(self.name)[0].copy()
         """[joint] what the servos are asked for [rad or m]"""
-        self.interface = np.full(len(self.setpoint), Interface.POSITION)
-        """[joint] :class:`Interface` by which each was commanded last"""
-        self._goal = self.setpoint.copy()
+        self.interface = np.full(len(self.setpoint), CommandInterface.POSITION)
+        """[joint] :class:`CommandInterface` by which each was commanded last"""
+        self._command = self.setpoint.copy()
         self._velocity = np.zeros(len(self.setpoint))
         self._rate = np.zeros(len(self.setpoint))
-        self._braked = np.zeros(len(self.setpoint), bool)
-        self._retuned = True
+        self._is_speed_limited = np.zeros(len(self.setpoint), bool)
+        self._gains_changed = True
         self._base_goal = np.zeros(2)
         self._base_velocity = np.zeros(2)
         self._base_time = -np.inf
@@ -203,45 +209,45 @@ class Robot(Embodied):
         if isinstance(joints, np.ndarray):
             return joints
         try:
-            return np.array([self._order[joint] for joint in joints], int)
+            return np.array([self._joint_index[joint] for joint in joints], int)
         except KeyError as error:
-            known = ", ".join(self._order)
+            known = ", ".join(self._joint_index)
             raise CommandError(f"{self.name} has no drive for {error.args[0]!r}; it drives: {known}") from None
 
     def command_position(
         self, position: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None = None
     ) -> None:
         """Go to positions [rad or m] as fast as the joints may; beyond a limit means to the limit."""
-        i, values = self._checked(position, joints)
-        self._goal[i] = np.clip(values, self.lower[i], self.upper[i])
-        self._switch(i, Interface.POSITION)
+        i, values = self._validated(position, joints)
+        self._command[i] = np.clip(values, self.lower_limit[i], self.upper_limit[i])
+        self._switch_interface(i, CommandInterface.POSITION)
 
     def command_velocity(
         self, velocity: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None = None
     ) -> None:
         """Move with velocities [rad/s or m/s] until the joints' limits."""
-        i, values = self._checked(velocity, joints)
-        self._goal[i] = np.clip(values, -self.speed[i], self.speed[i])
-        self._switch(i, Interface.VELOCITY)
+        i, values = self._validated(velocity, joints)
+        self._command[i] = np.clip(values, -self.max_velocity[i], self.max_velocity[i])
+        self._switch_interface(i, CommandInterface.VELOCITY)
 
     def command_effort(
         self, effort: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None = None
     ) -> None:
         """Transmit efforts [N m or N] beyond the weight, which the drives carry; zero lets the joint be moved."""
-        i, values = self._checked(effort, joints)
-        self._goal[i] = np.clip(values, -self.effort[i], self.effort[i])
-        self._switch(i, Interface.EFFORT)
+        i, values = self._validated(effort, joints)
+        self._command[i] = np.clip(values, -self.max_effort[i], self.max_effort[i])
+        self._switch_interface(i, CommandInterface.EFFORT)
 
-    def command_elastic(
+    def command_motor_position(
         self, motor: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None = None
     ) -> None:
         """Hold the motors at positions [rad or m]; each link hangs on its spring and sags by load over stiffness.
 
         Nothing makes up for the weight, as nothing but the spring connects the two (D6.4 section 3.1).
         """
-        i, values = self._checked(motor, joints)
-        self._goal[i] = values
-        self._switch(i, Interface.ELASTIC)
+        i, values = self._validated(motor, joints)
+        self._command[i] = values
+        self._switch_interface(i, CommandInterface.MOTOR_POSITION)
 
     def command_gripper(self, group: str, opening: float, effort: float | None = None) -> None:
         """Open a gripper's fingers to ``opening`` [m] between them (sum over prismatic fingers) or [rad].
@@ -249,13 +255,15 @@ class Robot(Embodied):
         ``effort`` is the most that each finger may give [N or N m], the drives' own unless it is given. What lies
         between the fingers is held by friction alone.
         """
-        fingers = self._gripper(group)
+        fingers = self._gripper_indices(group)
         if effort is not None and not effort > 0.0:
             raise CommandError(f"{self.name}: gripper effort {effort}; give more than 0, or none for all there is")
         self.command_position(np.full(len(fingers), opening / len(fingers)), fingers)
-        self._grippers[group] = fingers
-        self._limit[fingers] = self.effort[fingers] if effort is None else np.minimum(effort, self.effort[fingers])
-        self._retuned = True
+        self._finger_groups[group] = fingers
+        self._effort_limit[fingers] = (
+            self.max_effort[fingers] if effort is None else np.minimum(effort, self.max_effort[fingers])
+        )
+        self._gains_changed = True
 
     def command_cutter(self, group: str) -> None:
         """Close the cutter of a gripper, and open it again: what is in its mouth at the end of the tick is cut."""
@@ -286,42 +294,42 @@ class Robot(Embodied):
 
         D6.4 section 3.1. Kept until given anew; :meth:`stop` leaves them.
         """
-        i, stiff = self._checked(stiffness, joints)
-        _, damp = self._checked(damping, joints)
+        i, stiff = self._validated(stiffness, joints)
+        _, damp = self._validated(damping, joints)
         if (stiff < 0.0).any() or (damp < 0.0).any():
             raise CommandError(f"{self.name}: gains below zero would feed energy in; give 0 or more")
         self._stiffness[i], self._damping[i] = stiff, damp
-        self._compliant[i] = True
-        self._retuned = True
+        self._is_compliant[i] = True
+        self._gains_changed = True
 
-    def stiffen(self, joints: Sequence[str] | np.ndarray | None = None) -> None:
+    def reset_gains(self, joints: Sequence[str] | np.ndarray | None = None) -> None:
         """Give joints back the stiff servos of their description."""
         i, drives = self.joint_indices(joints), self.description.drives
         self._stiffness[i] = [drives[j].stiffness for j in i]
         self._damping[i] = [drives[j].damping for j in i]
-        self._compliant[i] = False
-        self._retuned = True
+        self._is_compliant[i] = False
+        self._gains_changed = True
 
-    def _gripper(self, group: str) -> np.ndarray:
+    def _gripper_indices(self, group: str) -> np.ndarray:
         if group not in self.description.groups:
             known = ", ".join(self.description.groups)
             raise CommandError(f"{self.name} has no gripper {group!r}; its groups are: {known}")
-        return self.description.indices(group)
+        return self.description.joint_indices(group)
 
-    def _switch(self, joints: np.ndarray, interface: Interface) -> None:
-        before = self.interface[joints] == Interface.ELASTIC
-        if before.any() or interface == Interface.ELASTIC:  # from motors to links, or back
+    def _switch_interface(self, joints: np.ndarray, interface: CommandInterface) -> None:
+        before = self.interface[joints] == CommandInterface.MOTOR_POSITION
+        if before.any() or interface == CommandInterface.MOTOR_POSITION:  # from motors to links, or back
             position, _, effort, _ = self.rigid.read(self.name)
-            motor = position + effort / self.spring
+            motor = position + effort / self.series_stiffness
             self.setpoint[joints] = np.where(
-                before == (interface == Interface.ELASTIC),
+                before == (interface == CommandInterface.MOTOR_POSITION),
                 self.setpoint[joints],
                 np.where(before, position[joints], motor[joints]),
             )
         self.interface[joints] = interface
-        self._retuned = True
+        self._gains_changed = True
 
-    def _checked(
+    def _validated(
         self, values: Sequence[float] | np.ndarray, joints: Sequence[str] | np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         i, values = self.joint_indices(joints), np.asarray(values, float)
@@ -336,84 +344,91 @@ class Robot(Embodied):
 
     def control(self, time: float) -> None:
         """Hand set-points for the tick that starts at ``time`` [s] to the servos; call it before physics steps."""
-        if self._retuned:
-            self._arrange()
+        if self._gains_changed:
+            self._prepare_interfaces()
         position, velocity = self.rigid.state(self.name)
-        rate = self._advance(position, velocity)
-        if self._retuned or self._changing:
-            braked, brake = self._brakes(velocity)
-            self._tune(braked, brake)
-            rate = np.where(braked, np.copysign(self.speed, velocity), rate)
+        rate = self._advance_setpoints(position, velocity)
+        if self._gains_changed or self._gains_vary:
+            braked, brake = self._speed_limiters(velocity)
+            self._apply_gains(braked, brake)
+            rate = np.where(braked, np.copysign(self.max_velocity, velocity), rate)
         self._velocity = velocity
         self.rigid.command(self.name, self.setpoint, rate)
-        self._drive(time)
+        self._command_base_velocity(time)
         self._odometry(self.rigid.base(self.name)[0])
 
-    def _arrange(self) -> None:
+    def _prepare_interfaces(self) -> None:
         """Prepare what changes only with the interfaces, gains and limits."""
-        self._by_effort, self._by_motor = self.interface == Interface.EFFORT, self.interface == Interface.ELASTIC
-        self._by_velocity = np.flatnonzero(self.interface == Interface.VELOCITY)
-        self._changing = bool(self._by_effort.any() or self._by_motor.any())
+        self._in_effort, self._in_motor_position = (
+            self.interface == CommandInterface.EFFORT,
+            self.interface == CommandInterface.MOTOR_POSITION,
+        )
+        self._velocity_joints = np.flatnonzero(self.interface == CommandInterface.VELOCITY)
+        self._gains_vary = bool(self._in_effort.any() or self._in_motor_position.any())
         """Whether gains follow the state, so that they must be set in every tick."""
-        self._spring_in_use = np.where(self._by_motor, self.spring, self._stiffness)
-        self._lead = self._limit / np.maximum(self._spring_in_use, 1e-9) + self.speed * self.rigid.dt
-        self._gain = SPARE * self.rigid.dt * self._limit
+        self._active_stiffness = np.where(self._in_motor_position, self.series_stiffness, self._stiffness)
+        self._max_tracking_error = (
+            self._effort_limit / np.maximum(self._active_stiffness, 1e-9) + self.max_velocity * self.rigid.dt
+        )
+        self._max_impulse = ACCELERATION_EFFORT_SHARE * self.rigid.dt * self._effort_limit
 
-    def _advance(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    def _advance_setpoints(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Move the set-points on by a tick; their rates [joint]."""
         dt = self.rigid.dt
         # A servo that already gives all it has gives no more when asked for more, but would overshoot when let go.
         middle = position
-        if self._grippers:
+        if self._finger_groups:
             middle = position.copy()
-            for fingers in self._grippers.values():
+            for fingers in self._finger_groups.values():
                 middle[fingers] = position[fingers].mean()
-        start = np.clip(self.setpoint, middle - self._lead, middle + self._lead)
-        wanted = (self._goal - start) / dt
-        wanted[self._by_velocity] = self._goal[self._by_velocity]
+        start = np.clip(self.setpoint, middle - self._max_tracking_error, middle + self._max_tracking_error)
+        wanted = (self._command - start) / dt
+        wanted[self._velocity_joints] = self._command[self._velocity_joints]
         # Nor may it run ahead faster than the drive can follow: at its limit the servo would shoot past the speed.
-        gain = self._gain / np.maximum(self.rigid.inertia(self.name), 1e-9)
-        slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.speed)
-        fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.speed)
+        gain = self._max_impulse / np.maximum(self.rigid.inertia(self.name), 1e-9)
+        slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.max_velocity)
+        fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.max_velocity)
         rate = np.clip(wanted, slowest, fastest)
-        if self._changing:
-            start, rate = np.where(self._by_effort, position, start), np.where(self._by_effort, 0.0, rate)
-        self.setpoint = np.clip(start + dt * rate, self.lower, self.upper)
+        if self._gains_vary:
+            start, rate = np.where(self._in_effort, position, start), np.where(self._in_effort, 0.0, rate)
+        self.setpoint = np.clip(start + dt * rate, self.lower_limit, self.upper_limit)
         rate = (self.setpoint - start) / dt
-        self._rate = np.where(self._by_effort, velocity, rate)
+        self._rate = np.where(self._in_effort, velocity, rate)
         return rate
 
-    def _brakes(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _speed_limiters(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joints whose effort would drive them too fast, bool, and the damping about their largest speed [joint].
 
         90 % of the speed are free. It looks a tick ahead, and brakes no harder than the effort that was asked for:
         at its limit a servo does not feel how the speed falls within the tick.
         """
         towards = np.copysign(1.0, velocity)
-        brake, along = 10.0 * self.effort / self.speed, towards * self._goal
+        brake, along = 10.0 * self.max_effort / self.max_velocity, towards * self._command
         ahead = towards * (2.0 * velocity - self._velocity)
-        near = (along > brake * (self.speed - ahead)) | (self._braked & (np.abs(velocity) > 0.5 * self.speed))
-        self._braked = near & (along >= 0.0) & self._by_effort
-        spare = self.speed - np.abs(velocity)
-        most = 0.8 * np.where(spare > 0.0, along, self.effort)
-        return self._braked, np.minimum(brake, most / np.maximum(np.abs(spare), 1e-9))
+        near = (along > brake * (self.max_velocity - ahead)) | (
+            self._is_speed_limited & (np.abs(velocity) > 0.5 * self.max_velocity)
+        )
+        self._is_speed_limited = near & (along >= 0.0) & self._in_effort
+        spare = self.max_velocity - np.abs(velocity)
+        most = 0.8 * np.where(spare > 0.0, along, self.max_effort)
+        return self._is_speed_limited, np.minimum(brake, most / np.maximum(np.abs(spare), 1e-9))
 
-    def _tune(self, braked: np.ndarray, brake: np.ndarray) -> None:
+    def _apply_gains(self, braked: np.ndarray, brake: np.ndarray) -> None:
         """Give the servos the gains and efforts that the interfaces ask for."""
-        by_effort, by_motor = self._by_effort, self._by_motor
-        damping = np.where(by_motor, self._spring_damping, self._damping)
+        by_effort, by_motor = self._in_effort, self._in_motor_position
+        damping = np.where(by_motor, self._series_damping, self._damping)
         effort = np.where(by_motor, -self.rigid.weight(self.name), 0.0)
         self.rigid.tune(
             self.name,
-            np.where(by_effort, 0.0, self._spring_in_use),
+            np.where(by_effort, 0.0, self._active_stiffness),
             np.where(braked, brake, np.where(by_effort, 0.0, damping)),
-            np.where(by_effort & ~braked, self._goal, effort),
-            limit=self._limit,
-            exact=by_motor | (self._compliant & ~by_effort),
+            np.where(by_effort & ~braked, self._command, effort),
+            limit=self._effort_limit,
+            exact=by_motor | (self._is_compliant & ~by_effort),
         )
-        self._retuned = False
+        self._gains_changed = False
 
-    def _drive(self, time: float) -> None:
+    def _command_base_velocity(self, time: float) -> None:
         """Let the base gain and lose speed as it may."""
         limits = self.description.base_limits
         goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
@@ -425,10 +440,10 @@ class Robot(Embodied):
         """What the robot knows of itself at ``time`` [s], sensors and elastic elements included."""
         known = super().sample(time, contacts)
         effort = known.joints.effort
-        deflection = effort / self.spring
+        deflection = effort / self.series_stiffness
         elements = ElasticSample(
-            time, self.description.joints, self.spring, known.joints.position + deflection, deflection,
-            self.spring * deflection,
+            time, self.description.joints, self.series_stiffness, known.joints.position + deflection, deflection,
+            self.series_stiffness * deflection,
         )  # fmt: skip
         return dataclasses.replace(
             known,
@@ -437,9 +452,9 @@ class Robot(Embodied):
             imus=tuple(self._imu(mount, time) for mount in self.description.imus),
         )
 
-    def _wrench(self, mount: Mount, time: float, contacts: Sequence[Contact]) -> Wrench:
+    def _wrench(self, mount: SensorMount, time: float, contacts: Sequence[Contact]) -> Wrench:
         wrench = self.rigid.wrench(self.name, mount.frame)
-        mine = [contact for contact in contacts if contact.link in self._beyond[mount.frame]]
+        mine = [contact for contact in contacts if contact.link in self._links_beyond_sensor[mount.frame]]
         if mine:  # with plants, which the rigid world does not know
             pose = self.frame_pose(mount.frame)
             back = frames.conjugate(pose[3:])
@@ -449,7 +464,7 @@ class Robot(Embodied):
             wrench[3:] += frames.rotate(back, frames.cross(arm, force).sum(0))
         return Wrench(time, mount.name, mount.frame, wrench[:3], wrench[3:])
 
-    def _imu(self, mount: Mount, time: float) -> Imu:
+    def _imu(self, mount: SensorMount, time: float) -> Imu:
         turn = self.frame_pose(mount.frame)[3:]
         spin = self.rigid.angular_velocity(self.name, mount.frame)
         acceleration = self.rigid.acceleration(self.name, mount.frame)[3:]
@@ -462,19 +477,19 @@ class Robot(Embodied):
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)
 
 
-def _links_beyond(description: Description, frame: str) -> frozenset[str]:
+def _subtree_links(description: RobotDescription, frame: str) -> frozenset[str]:
     """A link and all that hangs on it."""
     beyond = {frame}
-    joints = (*description.fixed, *description.moving.frames)
+    joints = (*description.fixed_frames, *description.moving_joints.frames)
     while more := {child for parent, child in joints if parent in beyond} - beyond:
         beyond |= more
     return frozenset(beyond)
 
 
-class RemoteRobot(Embodied):
+class RemoteRobot(RobotInstance):
     """The copy of a robot that another client controls: pulled to its states, yet it can be held and pushed."""
 
-    SNAP = 1.0
+    TELEPORT_DISTANCE = 1.0
     """Distance [m] beyond which the copy is set down anew instead of pulled."""
 
     def follow(self, update: RobotUpdate) -> None:
@@ -486,12 +501,12 @@ class RemoteRobot(Embodied):
                 "load the same robot on both clients"
             )
         here, _ = self.rigid.base(self.name)
-        if np.linalg.norm(update.base_q[:3] - here[:3]) > self.SNAP:
-            self._set_down(update, here)
+        if np.linalg.norm(update.base_q[:3] - here[:3]) > self.TELEPORT_DISTANCE:
+            self._teleport(update, here)
         self.rigid.follow(self.name, update.base_q, update.base_qd, update.position, update.velocity)
 
-    def _set_down(self, update: RobotUpdate, here: np.ndarray) -> None:
+    def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
         if abs(update.base_q[2] - here[2]) > 1e-3:  # a base rolls on its plane; another height is another world
             self.rigid.remove_robot(self.name)
-            self.rigid.add_robot(self.description.spec(self.name, self._index, update.base_q))
+            self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))
         self.rigid.place(self.name, update.base_q, update.position)

@@ -2,7 +2,7 @@
 
 The simulation hands over values and goes on; the node's own threads build and publish the messages. A value that is
 replaced by a newer one before its turn comes is dropped and counted: a slow network or subscriber costs messages, not
-ticks. Nothing is built for which nobody listens, and :meth:`Node.wanted` lets sensors not even render it.
+ticks. Nothing is built for which nobody listens, and :meth:`Node.has_subscribers` lets sensors not even render it.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from rclpy.validate_node_name import validate_node_name
 from rclpy.validate_topic_name import validate_topic_name
 
 from vinesim.ros import ros_setup
-from vinesim.ros.commands.subscriptions import Commands
+from vinesim.ros.commands.subscriptions import CommandSubscriptions
 from vinesim.ros.commands.types import Command
 from vinesim.ros.messages import convert, interfaces
-from vinesim.ros.publishers.camera import Camera
-from vinesim.ros.publishers.clock import Clock
-from vinesim.ros.publishers.ground_truth import Surroundings
-from vinesim.ros.publishers.lidar import Lidar
-from vinesim.ros.publishers.robot import Robot
-from vinesim.ros.topic import RELIABLE, Build, Offer, Topic
+from vinesim.ros.publishers.camera import CameraPublisher
+from vinesim.ros.publishers.clock import ClockPublisher
+from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
+from vinesim.ros.publishers.lidar import LidarPublisher
+from vinesim.ros.publishers.robot import RobotPublisher
+from vinesim.ros.topic import RELIABLE, Build, PendingMessage, Topic
 from vinesim.scene.values import CameraFrame, LidarScan, RobotSample
 
 log = logging.getLogger(__name__)
 
-Sensor = TypeVar("Sensor", Camera, Lidar)
+SensorPublisher = TypeVar("Sensor", CameraPublisher, LidarPublisher)
 
-COUNT_PERIOD = 0.1
+SUBSCRIPTION_COUNT_PERIOD = 0.1
 """How often subscribers are counted [s of wall time]: so long may a new one wait for its first picture."""
 
-CONTROLLERS = ("arm_left_controller", "arm_right_controller", "torso_controller", "head_controller")
+TRAJECTORY_CONTROLLERS = ("arm_left_controller", "arm_right_controller", "torso_controller", "head_controller")
 
 
 class Node:
@@ -67,7 +67,7 @@ class Node:
         static_transforms: Sequence[tuple[str, str, np.ndarray]] = (),
         cameras: Sequence[str] = (),
         lidars: Sequence[str] = (),
-        controllers: Sequence[str] = CONTROLLERS,
+        controllers: Sequence[str] = TRAJECTORY_CONTROLLERS,
         base: str = "base_footprint",
         clock: bool = True,
     ) -> None:
@@ -79,14 +79,14 @@ class Node:
         except NameValidationException as error:
             # rclpy points at the wrong letter in a second line.
             raise ValueError(" ".join(str(error).replace("^", "").split())) from error
-        ros_setup.prepare()
-        interfaces.ensure(["tf2_msgs"])
+        ros_setup.configure()
+        interfaces.ensure_importable(["tf2_msgs"])
         from tf2_msgs.msg import TFMessage
 
         self._topics: dict[str, Topic] = {}
         # What the tick brings has a thread of its own, so that no picture in the making holds up the clock.
-        self._urgent: dict[Topic, Build] = {}
-        self._patient: dict[Topic, Build] = {}
+        self._high_priority: dict[Topic, Build] = {}
+        self._low_priority: dict[Topic, Build] = {}
         self._changed = threading.Condition()
         self._closing = False
 
@@ -95,13 +95,13 @@ class Node:
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
             self._node = rclpy.create_node(name, context=self._context, namespace=namespace or None)
-            self._clock = Clock(self._advertise) if clock else None
-            self._robot = Robot(self._advertise, TFMessage, urdf, static_transforms, base)
-            self._surroundings = Surroundings(self._advertise, TFMessage)
+            self._clock = ClockPublisher(self._advertise) if clock else None
+            self._robot = RobotPublisher(self._advertise, TFMessage, urdf, static_transforms, base)
+            self._ground_truth = GroundTruthPublisher(self._advertise, TFMessage)
             self._diagnostics = self._advertise(DiagnosticArray, "diagnostics", RELIABLE)
-            self._cameras = {camera: Camera(self._advertise, camera) for camera in cameras}
-            self._lidars = {lidar: Lidar(self._advertise, lidar) for lidar in lidars}
-            self._commands = Commands(self._node, controllers)
+            self._cameras = {camera: CameraPublisher(self._advertise, camera) for camera in cameras}
+            self._lidars = {lidar: LidarPublisher(self._advertise, lidar) for lidar in lidars}
+            self._commands = CommandSubscriptions(self._node, controllers)
         except BaseException:
             self._context.shutdown()
             raise
@@ -109,51 +109,51 @@ class Node:
         self._executor.add_node(self._node)
         self._threads = [
             threading.Thread(target=self._receive, name=f"ros receive {name}", daemon=True),
-            threading.Thread(target=self._send, args=(self._urgent,), name=f"ros send {name}", daemon=True),
-            threading.Thread(target=self._send, args=(self._patient,), name=f"ros send large {name}", daemon=True),
+            threading.Thread(target=self._send, args=(self._high_priority,), name=f"ros send {name}", daemon=True),
+            threading.Thread(target=self._send, args=(self._low_priority,), name=f"ros send large {name}", daemon=True),
         ]
         for thread in self._threads:
             thread.start()
 
     # What the simulation calls: never blocks, never builds.
 
-    def publish_tick(self, time: float, sample: RobotSample) -> None:
+    def publish_robot_state(self, time: float, sample: RobotSample) -> None:
         """State of the robot at ``time`` [s]; call it every tick."""
-        offers = list(self._robot.offers(sample))
+        offers = list(self._robot.pending(sample))
         if self._clock is not None:
-            offers[:0] = self._clock.offers(time)
-        self._offer(offers)
+            offers[:0] = self._clock.pending(time)
+        self._enqueue(offers)
 
     def publish_camera(self, frame: CameraFrame) -> None:
         """One picture of one of ``cameras``."""
-        self._offer(self._named(self._cameras, "camera", frame.name).offers(frame))
+        self._enqueue(self._publisher(self._cameras, "camera", frame.name).pending(frame))
 
     def publish_lidar(self, scan: LidarScan) -> None:
         """One revolution of one of ``lidars``."""
-        self._offer(self._named(self._lidars, "lidar", scan.name).offers(scan))
+        self._enqueue(self._publisher(self._lidars, "lidar", scan.name).pending(scan))
 
     def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
         """True poses [name, 7] in the map of what moves: attached bunches, people. 10 to 30 Hz will do.
 
         Pass the same tuple object as long as the names stay: the message is then patched, not built.
         """
-        self._offer(self._surroundings.offers(time, names, poses))
+        self._enqueue(self._ground_truth.pending(time, names, poses))
 
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
         """True poses [name, 7] in the map of what stands: poles. Once; late joiners get it too."""
-        self._offer(self._surroundings.static_offers(names, poses), always=True)
+        self._enqueue(self._ground_truth.pending_static(names, poses), always=True)
 
     def publish_diagnostics(self, time: float, values: Mapping[str, object], *, healthy: bool = True) -> None:
         """Figures of the client (real-time factor, sync lag); the node adds what it had to drop. 1 Hz will do."""
-        own = {"ros_dropped": sum(self.dropped.values()), "ros_refused_commands": self._commands.refused}
+        own = {"ros_dropped": sum(self.dropped.values()), "ros_refused_commands": self._commands.rejected}
         build = partial(convert.diagnostics, time, self._node.get_fully_qualified_name(), {**values, **own}, healthy)
-        self._offer([(self._diagnostics, build)])
+        self._enqueue([(self._diagnostics, build)])
 
     def commands(self) -> list[Command]:
         """What peers asked for since the last call."""
         return self._commands.drain()
 
-    def wanted(self, family: str) -> bool:
+    def has_subscribers(self, family: str) -> bool:
         """Does anybody listen to a topic or to one below it? ``"head_front_camera/depth"``, ``"lidar"``, ``"tf"``.
 
         As counted at most :data:`COUNT_PERIOD` ago; :class:`ValueError` if there is no such topic.
@@ -162,7 +162,7 @@ class Node:
         topics = [topic for name, topic in self._topics.items() if (name + "/").startswith(below)]
         if not topics:
             raise ValueError(f"no topic {family!r}; there are: {', '.join(sorted(self._topics))}")
-        return any(topic.listeners for topic in topics)
+        return any(topic.subscription_count for topic in topics)
 
     @property
     def sent(self) -> dict[str, int]:
@@ -175,9 +175,9 @@ class Node:
         return {name: topic.dropped for name, topic in self._topics.items()}
 
     @property
-    def busy(self) -> bool:
+    def has_pending(self) -> bool:
         """Does anything wait to be sent?"""
-        return bool(self._urgent or self._patient)
+        return bool(self._high_priority or self._low_priority)
 
     def close(self) -> None:
         """Leave the ROS graph; returns when its threads have ended. A second call does nothing."""
@@ -199,22 +199,22 @@ class Node:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _advertise(self, message: type, name: str, qos: QoSProfile = RELIABLE, *, urgent: bool = False) -> Topic:
-        topic = Topic(name, self._node.create_publisher(message, name, qos), urgent)
+    def _advertise(self, message: type, name: str, qos: QoSProfile = RELIABLE, *, high_priority: bool = False) -> Topic:
+        topic = Topic(name, self._node.create_publisher(message, name, qos), high_priority)
         self._topics[name] = topic
         return topic
 
-    def _named(self, kinds: Mapping[str, Sensor], kind: str, name: str) -> Sensor:
+    def _publisher(self, kinds: Mapping[str, SensorPublisher], kind: str, name: str) -> SensorPublisher:
         if name not in kinds:
             raise ValueError(f"no {kind} {name!r} in this node; it was made with: {', '.join(kinds) or 'none'}")
         return kinds[name]
 
-    def _offer(self, offers: Iterable[Offer], *, always: bool = False) -> None:
+    def _enqueue(self, offers: Iterable[PendingMessage], *, always: bool = False) -> None:
         with self._changed:
             for topic, build in offers:
-                if not topic.listeners and not always:
+                if not topic.subscription_count and not always:
                     continue
-                waiting = self._urgent if topic.urgent else self._patient
+                waiting = self._high_priority if topic.high_priority else self._low_priority
                 if topic in waiting:
                     topic.dropped += 1
                 waiting[topic] = build
@@ -241,10 +241,10 @@ class Node:
         next_count = 0.0
         while not self._closing and self._context.ok():
             try:
-                self._executor.spin_once(timeout_sec=COUNT_PERIOD)
+                self._executor.spin_once(timeout_sec=SUBSCRIPTION_COUNT_PERIOD)
             except Exception:
                 log.exception("a ROS callback failed; the node goes on")
             if wall.monotonic() >= next_count:
                 for topic in self._topics.values():
-                    topic.count_listeners()
-                next_count = wall.monotonic() + COUNT_PERIOD
+                    topic.update_subscription_count()
+                next_count = wall.monotonic() + SUBSCRIPTION_COUNT_PERIOD

@@ -13,11 +13,11 @@ import os
 import pathlib
 import sys
 
-PROFILE = pathlib.Path(__file__).resolve().parent / "shared_memory.xml"
+PROFILE_FILE = pathlib.Path(__file__).resolve().parent / "shared_memory.xml"
 """Fast DDS profile with a shared-memory segment that large messages fit into."""
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-OWN_MIDDLEWARE = "rmw_fastrtps_cpp"
+WHEEL_MIDDLEWARE = "rmw_fastrtps_cpp"
 """The only middleware among the wheels."""
 
 
@@ -25,7 +25,7 @@ class RosUnavailableError(RuntimeError):
     """ROS 2 cannot be used in this process; the text says why and what to do."""
 
 
-def available() -> str | None:
+def unavailable_reason() -> str | None:
     """None if ROS 2 can be used here, else one line that says why not and names the remedy."""
     wheels = importlib.util.find_spec("ros_wheels_bootstrapper") is not None
     sourced = os.environ.get("AMENT_PREFIX_PATH", "")
@@ -40,9 +40,9 @@ def available() -> str | None:
             "the ROS 2 wheels did not get to set LD_LIBRARY_PATH (Python was started with -S or -I, or by a program of "
             "another environment); start Python plainly, or unset _ROS_WHEELS_BOOTSTRAP_COMPLETE"
         )
-    chosen = os.environ.get("RMW_IMPLEMENTATION", OWN_MIDDLEWARE)
-    if wheels and chosen != OWN_MIDDLEWARE:
-        return f"RMW_IMPLEMENTATION is {chosen!r}, but the ROS 2 wheels have {OWN_MIDDLEWARE!r} only; unset it"
+    chosen = os.environ.get("RMW_IMPLEMENTATION", WHEEL_MIDDLEWARE)
+    if wheels and chosen != WHEEL_MIDDLEWARE:
+        return f"RMW_IMPLEMENTATION is {chosen!r}, but the ROS 2 wheels have {WHEEL_MIDDLEWARE!r} only; unset it"
     try:
         for module in ("rclpy.node", "sensor_msgs.msg"):
             importlib.import_module(module)
@@ -52,18 +52,18 @@ def available() -> str | None:
     return None
 
 
-def prepare() -> None:
+def configure() -> None:
     """Settings that must stand before the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
 
     A profile that the user has chosen stays.
     """
-    reason = available()
+    reason = unavailable_reason()
     if reason is not None:
         raise RosUnavailableError(reason)
-    os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE))
+    os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE_FILE))
 
 
-def without_profile() -> None:
+def clear_profile() -> None:
     """Forget our own profile again, as a program that knows nothing of vinesim would be started."""
-    if os.environ.get(PROFILE_VARIABLE) == str(PROFILE):
+    if os.environ.get(PROFILE_VARIABLE) == str(PROFILE_FILE):
         del os.environ[PROFILE_VARIABLE]

@@ -11,9 +11,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """What tf2 listeners expect of /tf."""
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TRANSIENT_LOCAL = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 """The last message reaches late joiners too."""
-SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 Build = Callable[[], Any]
 """Makes a message, its serialised bytes, or a list of messages; called only when somebody listens."""
@@ -22,12 +24,12 @@ Build = Callable[[], Any]
 class Topic:
     """A publisher with its counts; only the ROS thread sends."""
 
-    def __init__(self, name: str, publisher: Publisher, urgent: bool) -> None:
+    def __init__(self, name: str, publisher: Publisher, high_priority: bool) -> None:
         self.name = name
         """As asked for: relative to the node's namespace unless it begins with a slash."""
-        self.urgent = urgent
+        self.high_priority = high_priority
         """Sent before anything that is not: what the tick brings, before pictures and clouds."""
-        self.listeners = 0
+        self.subscription_count = 0
         """Subscribers when last counted."""
         self.sent = 0
         """Messages."""
@@ -35,9 +37,9 @@ class Topic:
         """Messages replaced by newer ones before they could be sent, or that could not be built."""
         self._publisher = publisher
 
-    def count_listeners(self) -> None:
+    def update_subscription_count(self) -> None:
         """Ask the middleware how many subscribers there are."""
-        self.listeners = self._publisher.get_subscription_count()
+        self.subscription_count = self._publisher.get_subscription_count()
 
     def send(self, message: Any) -> None:
         """Publish a message, its serialised bytes, or each message of a list."""
@@ -49,8 +51,8 @@ class Topic:
 class Advertise(Protocol):
     """How a topic family gets its topics from the node."""
 
-    def __call__(self, message: type, name: str, qos: QoSProfile = ..., *, urgent: bool = ...) -> Topic: ...
+    def __call__(self, message: type, name: str, qos: QoSProfile = ..., *, high_priority: bool = ...) -> Topic: ...
 
 
-Offer = tuple[Topic, Build]
+PendingMessage = tuple[Topic, Build]
 """A message to be: the node builds and sends it on its own thread."""

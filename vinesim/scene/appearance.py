@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene.data_files import find
-from vinesim.scene.toml_loader import DataError, read
+from vinesim.scene.data_files import find_data_file
+from vinesim.scene.toml_loader import DataError, load_toml
 from vinesim.scene.values import HumanPose, Mesh, Shape
 
 SURFACES = ("paint", "plastic", "cloth", "skin", "rubber", "metal", "straw", "reflex", "glass", "lamp")
@@ -28,7 +28,7 @@ PHALANGES = 3
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 
-class FigureError(DataError):
+class AppearanceError(DataError):
     """A figure that cannot be drawn; one line with file, place, finding and remedy."""
 
 
@@ -44,7 +44,7 @@ class Paint(_Part, frozen=True):
     surface: Surface
 
 
-class Piece(_Part, frozen=True, kw_only=True):
+class ShapeSpec(_Part, frozen=True, kw_only=True):
     """One shape of a part [m, rad]; which fields count follows from ``kind``."""
 
     kind: Literal["cone", "cylinder", "ellipsoid", "box", "loft"]
@@ -116,14 +116,14 @@ class _File(_Part, frozen=True):
     source: str
     height: float
     paints: dict[str, Paint]
-    parts: dict[str, tuple[Piece, ...]]
+    parts: dict[str, tuple[ShapeSpec, ...]]
     limbs: Limbs
     fingers: dict[str, Finger]
     finger_paint: str
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Figure:
+class HumanModel:
     """A person's looks at one height: shapes [m] by part, and what the parts between the tracked ones need."""
 
     parts: dict[str, tuple[Shape, ...]]
@@ -138,10 +138,10 @@ class Figure:
 
 
 @functools.lru_cache(16)
-def person(height: float, name: str = "worker") -> Figure:
-    """The figure of a person of this height [m], from ``data/figures``; :class:`FigureError` if it cannot be read."""
-    path = find("figures", name, ".toml")
-    file = read(path, _File, FigureError)
+def load_human_model(height: float, name: str = "worker") -> HumanModel:
+    """The figure of a person of this height [m], from ``data/figures``; :class:`AppearanceError` if it cannot be read."""
+    path = find_data_file("figures", name, ".toml")
+    file = load_toml(path, _File, AppearanceError)
     scale = height / file.height
     for part, pieces in file.parts.items():
         for i, piece in enumerate(pieces):
@@ -166,7 +166,7 @@ def person(height: float, name: str = "worker") -> Figure:
                 parts[f"{side}_{FINGERS[number]}_{k + 1}"] = (bone,)
     limbs = msgspec.convert(_scaled(msgspec.to_builtins(file.limbs), scale), Limbs)
     every = [file.fingers[finger] for finger in FINGERS] * 2
-    return Figure(
+    return HumanModel(
         parts=parts, limbs=limbs, root=np.array(roots), length=scale * np.array([f.lengths for f in every]),
         bent=np.array([f.bent for f in every]),
     )  # fmt: skip
@@ -178,19 +178,21 @@ def _scaled(value, scale: float):
     return [scale * one for one in value] if isinstance(value, (list, tuple)) else scale * value
 
 
-def _check(paints: dict[str, Paint], piece: Piece, place: str) -> None:
+def _check(paints: dict[str, Paint], piece: ShapeSpec, place: str) -> None:
     names = (piece.paint,) if isinstance(piece.paint, str) else piece.paint
     if missing := [name for name in names if name not in paints]:
-        raise FigureError(f"{place}.paint is {missing[0]!r}; give one of: {', '.join(paints)}")
+        raise AppearanceError(f"{place}.paint is {missing[0]!r}; give one of: {', '.join(paints)}")
     if piece.kind != "loft":
         return
     if len(piece.rings) < 2 or any(len(ring) not in (4, 5) for ring in piece.rings):
-        raise FigureError(f"{place}.rings: give two rings or more, each [place, rear, front, half width] or one more")
+        raise AppearanceError(
+            f"{place}.rings: give two rings or more, each [place, rear, front, half width] or one more"
+        )
     if not isinstance(piece.paint, str) and len(piece.paint) != len(piece.rings) - 1:
-        raise FigureError(f"{place}.paint names {len(piece.paint)} paints; give one, or {len(piece.rings) - 1}")
+        raise AppearanceError(f"{place}.paint names {len(piece.paint)} paints; give one, or {len(piece.rings) - 1}")
 
 
-def _shapes(piece: Piece, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
+def _shapes(piece: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
     """A piece as shapes: one, or two that mirror each other, or a mesh for each paint of a loft."""
     sides = (False, True) if piece.twin else (mirror,)
     if piece.kind == "loft":
@@ -218,12 +220,12 @@ def _between(start, end, radius: tuple[float, float], scale: float, paint: Paint
     """A round cone or a cylinder from one point to another."""
     a, b = scale * np.asarray(start, float), scale * np.asarray(end, float)
     half = 0.5 * float(np.linalg.norm(b - a))
-    turn = frames.multiply(frames.aligned(b - a), _Z_TO_X)
+    turn = frames.multiply(frames.from_x_axis(b - a), _Z_TO_X)
     ends = tuple(scale * r for r in radius) if kind == "cone" else (scale * radius[0],)
     return Shape(kind, (*ends, half), frames.pose(0.5 * (a + b), turn), *_look(paint))
 
 
-def _loft(piece: Piece, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
+def _loft(piece: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
     """Meshes through the rings of a loft, one for each paint; a whole ring is closed by a lid at either end."""
     place, rear, front, wide, aside = np.array([(*ring, 0.0)[:5] for ring in piece.rings]).T
     whole = piece.arc[1] - piece.arc[0] >= 360.0
@@ -262,18 +264,18 @@ def _loft(piece: Piece, paints: dict[str, Paint], scale: float, mirror: bool) ->
     every = np.concatenate([face for faces in strips.values() for face in faces])
     every = every[:, ::-1] if reverse else every
     ends = np.cumsum([sum(map(len, faces)) for faces in strips.values()])[:-1]
-    pieces = zip(strips, np.split(vertices[every], ends), np.split(smooth(vertices, every), ends), strict=True)
+    pieces = zip(strips, np.split(vertices[every], ends), np.split(smooth_normals(vertices, every), ends), strict=True)
     return [
         Shape("mesh", (1.0,), frames.pose(np.zeros(3)), *_look(paints[name]), Mesh(corners, normals))
         for name, corners, normals in pieces
     ]
 
 
-CREASE = np.radians(50.0)
+CREASE_ANGLE = np.radians(50.0)
 """Faces that meet at a sharper angle than this [rad] meet at an edge; others are one smooth surface."""
 
 
-def smooth(vertices: np.ndarray, faces: np.ndarray, crease: float = float(CREASE)) -> np.ndarray:
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray, crease: float = float(CREASE_ANGLE)) -> np.ndarray:
     """Unit normals [face, 3, 3] at the corners of a mesh: of the faces around, as far as they turn no crease."""
     corners = vertices[faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -328,19 +330,19 @@ class _Postures(_Part, frozen=True):
 
 @functools.cache
 def _postures() -> _Postures:
-    return read(find("figures", "postures", ".toml"), _Postures, FigureError)
+    return load_toml(find_data_file("figures", "postures", ".toml"), _Postures, AppearanceError)
 
 
-def postures() -> tuple[str, ...]:
-    """Names that :func:`posed` knows."""
+def posture_names() -> tuple[str, ...]:
+    """Names that :func:`apply_posture` knows."""
     return tuple(_postures().postures)
 
 
-def posed(standing: HumanPose, name: str, height: float) -> HumanPose:
+def apply_posture(standing: HumanPose, name: str, height: float) -> HumanPose:
     """Somebody of this height [m], who is ``standing`` upright, in a posture of ``data/figures/postures.toml``."""
     file = _postures()
     if name not in file.postures:
-        raise FigureError(f"posture {name!r} is unknown; give one of: {', '.join(file.postures)}")
+        raise AppearanceError(f"posture {name!r} is unknown; give one of: {', '.join(file.postures)}")
     scale, one, usual = height / file.height, file.postures[name], file.postures["stand"]
     points = {}
     for point in ("head", "hips", "left_foot", "right_foot"):
@@ -351,7 +353,7 @@ def posed(standing: HumanPose, name: str, height: float) -> HumanPose:
     for side in ("left", "right"):
         palm = getattr(one, side) or getattr(usual, side)
         if palm:
-            turn = frames.aligned(np.array(palm.along), np.array(palm.back))
+            turn = frames.from_x_axis(np.array(palm.along), np.array(palm.back))
             points[side] = frames.compose(standing.root, frames.pose(scale * np.array(palm.at), turn))
             points[f"{side}_fingers"] = palm.bent
     return dataclasses.replace(standing, **points)
@@ -389,9 +391,9 @@ class Crate(_Part, frozen=True):
 
 
 @functools.lru_cache(256)
-def crate(size: tuple[float, float, float], number: int, name: str = "crate") -> tuple[Shape, ...]:
+def crate_shapes(size: tuple[float, float, float], number: int, name: str = "crate") -> tuple[Shape, ...]:
     """A slatted crate of this outer ``size`` [m], origin in the middle of its underside; its inside is free."""
-    one = read(find("figures", name, ".toml"), Crate, FigureError)
+    one = load_toml(find_data_file("figures", name, ".toml"), Crate, AppearanceError)
     t, look = one.wall, _look(one.paints[number % len(one.paints)])
     length, width, height = size
     found: list[Shape] = []

@@ -47,9 +47,9 @@ VARIETIES = tuple(
 )  # fmt: skip
 """Indexed by ``Model.bunch_variety``."""
 
-COUNTS = (50, 64, 80, 97, 116, 140)
+PROTOTYPE_BERRIES = (50, 64, 80, 97, 116, 140)
 """Berries of the prototypes; a bunch takes the next larger one and leaves berries off at its tip."""
-FEWEST, MOST = 40, COUNTS[-1]
+MIN_BERRIES, MAX_BERRIES = 40, PROTOTYPE_BERRIES[-1]
 _SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
 """Taper and wings of the three prototypes of each count: conical, shouldered, cylindrical with two wings."""
 _ITERATIONS = 400
@@ -58,7 +58,7 @@ _SPREAD = 0.07
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Bunch:
+class BerryLayout:
     """Berries in the bunch's body frame: origin at the end of the peduncle, +x down the rachis."""
 
     position: np.ndarray
@@ -75,24 +75,26 @@ class Bunch:
     """[n, 8] int32, nearest first, -1 where there are fewer."""
 
 
-def berries(length: float, radius: float, count: int, variety: int, seed: int) -> Bunch:
+def lay_out_berries(length: float, radius: float, count: int, variety: int, seed: int) -> BerryLayout:
     """The berries of one bunch of ``Model``; it fits the hull ``length`` x ``radius`` [m] that :func:`hull` gave."""
     return _scaled(int(_prototype(count, seed)), int(count), float(length), float(radius), int(variety))
 
 
-def hull(count: np.ndarray, seed: np.ndarray) -> np.ndarray:
+def hull_size(count: np.ndarray, seed: np.ndarray) -> np.ndarray:
     """Length and radius of bunches [..., 2] in units of the berry's volume radius."""
     which = _prototype(count, seed)
     count = np.asarray(count)
     return np.stack([_tables()[0][which, count], _tables()[1][which]], -1)
 
 
-def piece_of(position: np.ndarray, length: float, pieces: int) -> np.ndarray:
+def segment_of(position: np.ndarray, length: float, pieces: int) -> np.ndarray:
     """Which of the equal pieces of a rachis of this length points [..., 3] belong to; 0 is at the peduncle."""
     return np.clip((position[..., 0] * (pieces / length)).astype(int), 0, pieces - 1)
 
 
-def spread(count: np.ndarray, seed: np.ndarray, pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def mass_by_segment(
+    count: np.ndarray, seed: np.ndarray, pieces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How berries weigh on equal pieces of their rachis: bunches [n] cut into ``pieces`` [n], for unit mass and length.
 
     Share of the mass [n, most], centre of mass [n, most, 3] and moments of inertia about it [n, most, 3], axes of the
@@ -100,7 +102,7 @@ def spread(count: np.ndarray, seed: np.ndarray, pieces: np.ndarray) -> tuple[np.
     """
     which = _prototype(count, seed)
     position, radius = _packed()
-    number, most = np.arange(MOST), int(np.max(pieces, initial=1))
+    number, most = np.arange(MAX_BERRIES), int(np.max(pieces, initial=1))
     count, pieces = np.asarray(count), np.asarray(pieces)
     length = _tables()[0][which, count]
     position, radius = position[which] / length[:, None, None], radius[which] / length[:, None]
@@ -124,7 +126,7 @@ def spread(count: np.ndarray, seed: np.ndarray, pieces: np.ndarray) -> tuple[np.
 @functools.cache
 def _packed() -> tuple[np.ndarray, np.ndarray]:
     """Positions [prototype, MOST, 3] and radii [prototype, MOST]; rounded as :func:`_tables` is."""
-    position, radius = np.zeros((len(prototypes()), MOST, 3)), np.zeros((len(prototypes()), MOST))
+    position, radius = np.zeros((len(prototypes()), MAX_BERRIES, 3)), np.zeros((len(prototypes()), MAX_BERRIES))
     for i, bunch in enumerate(prototypes()):
         position[i, : len(bunch.radius)], radius[i, : len(bunch.radius)] = bunch.position, bunch.radius
     return position.round(3), radius.round(3)
@@ -132,15 +134,15 @@ def _packed() -> tuple[np.ndarray, np.ndarray]:
 
 def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
     """Number of the prototype: the next larger count, its shape by seed."""
-    if np.min(count) < 1 or np.max(count) > MOST:
-        raise ValueError(f"a bunch has 1 to {MOST} berries, not {np.min(count)} to {np.max(count)}")
-    return np.searchsorted(COUNTS, count) * len(_SHAPES) + np.asarray(seed, np.int64) % len(_SHAPES)
+    if np.min(count) < 1 or np.max(count) > MAX_BERRIES:
+        raise ValueError(f"a bunch has 1 to {MAX_BERRIES} berries, not {np.min(count)} to {np.max(count)}")
+    return np.searchsorted(PROTOTYPE_BERRIES, count) * len(_SHAPES) + np.asarray(seed, np.int64) % len(_SHAPES)
 
 
 @functools.cache
 def _tables() -> tuple[np.ndarray, np.ndarray]:
     """Length by prototype and count, radius by prototype; rounded so that a last bit cannot differ between machines."""
-    lengths = np.zeros((len(prototypes()), MOST + 1))
+    lengths = np.zeros((len(prototypes()), MAX_BERRIES + 1))
     for i, bunch in enumerate(prototypes()):
         reach = np.maximum.accumulate(bunch.position[:, 0] + bunch.radius)
         lengths[i, 1 : len(reach) + 1] = reach
@@ -149,24 +151,26 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 @functools.lru_cache(maxsize=512)
-def _scaled(which: int, count: int, length: float, radius: float, variety: int) -> Bunch:
+def _scaled(which: int, count: int, length: float, radius: float, variety: int) -> BerryLayout:
     unit = prototypes()[which]
     lengths, across = _tables()
     scale = min(length / lengths[which, count], radius / across[which])
     thin = VARIETIES[variety].elongation ** (-1.0 / 3.0)
     near = np.where(unit.neighbours[:count] < count, unit.neighbours[:count], -1)
     order = np.argsort(near < 0, axis=1, kind="stable")
-    return Bunch(
+    return BerryLayout(
         position=unit.position[:count] * scale, radius=unit.radius[:count] * (scale * thin), axis=unit.axis[:count],
         foot=unit.foot[:count] * scale, rachis=unit.rachis * scale, neighbours=np.take_along_axis(near, order, 1),
     )  # fmt: skip
 
 
 @functools.cache
-def prototypes() -> tuple[Bunch, ...]:
+def prototypes() -> tuple[BerryLayout, ...]:
     """The packed library, berries of unit volume radius sorted from the top of the bunch to its tip."""
     drafts = [
-        _draft(count, *shape, i * len(_SHAPES) + j) for i, count in enumerate(COUNTS) for j, shape in enumerate(_SHAPES)
+        _draft(count, *shape, i * len(_SHAPES) + j)
+        for i, count in enumerate(PROTOTYPE_BERRIES)
+        for j, shape in enumerate(_SHAPES)
     ]
     position, foot, radius = (np.concatenate([d[k] for d in drafts]) for k in (0, 1, 2))
     position = _relax(position, foot, radius, [len(d[0]) for d in drafts])
@@ -182,7 +186,7 @@ def prototypes() -> tuple[Bunch, ...]:
         distance = np.linalg.norm(p[:, None] - p[None], axis=2) + np.diag(np.full(len(p), np.inf))
         near = np.argsort(distance, axis=1, kind="stable")[:, :8].astype(np.int32)
         axis = normalize(normalize(p - foot) + np.array([0.35, 0.0, 0.0]))
-        library.append(Bunch(p, radius, axis, foot, rachis, near))
+        library.append(BerryLayout(p, radius, axis, foot, rachis, near))
     return tuple(library)
 
 

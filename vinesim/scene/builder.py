@@ -21,12 +21,12 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 """[m/s^2], world axes."""
 
 
-CLUSTERS = 8
+MAX_CLUSTERS = 8
 """Most berry clusters of a bunch."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Wood:
+class RodMaterial:
     """Material of a rod."""
 
     modulus: float
@@ -35,12 +35,12 @@ class Wood:
     """[kg/m^3]"""
     damping: float = 0.0
     """Stiffness-proportional damping beta [s]: joint damping = beta * joint stiffness."""
-    shear: float | None = None
+    shear_modulus: float | None = None
     """Shear modulus G [Pa]; E / 2.6 (Poisson 0.3) unless given."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Pieces:
+class BunchSegments:
     """Bunches [n] cut across their rachis into a chain of pieces of equal length: the head first, then clusters.
 
     Frames stand on the rachis where a piece begins, axes as the bunch's.
@@ -73,13 +73,13 @@ class Pieces:
         return mass, com, inertia.sum(1)
 
 
-def bunch_pieces(
+def segment_bunches(
     mass: np.ndarray, length: np.ndarray, radius: np.ndarray, berry_count: np.ndarray, seed: np.ndarray,
     rachis: plant_parameters.Rachis, stem_share: float,
-) -> Pieces:  # fmt: skip
+) -> BunchSegments:  # fmt: skip
     """Cut bunches [n] into pieces that weigh what their own berries and stems weigh; four clusters to eight."""
-    count = np.clip(np.round(length / rachis.piece.value).astype(int), 5, 1 + CLUSTERS)
-    share, com, inertia = berries.spread(berry_count, seed, count)
+    count = np.clip(np.round(length / rachis.piece.value).astype(int), 5, 1 + MAX_CLUSTERS)
+    share, com, inertia = berries.mass_by_segment(berry_count, seed, count)
     number = np.arange(share.shape[1])
     here = number < count[:, None]
     h = length / count
@@ -99,14 +99,14 @@ def bunch_pieces(
     edges = np.stack([number, number + 1], -1) * h[:, None, None]
     hull = radius[:, None, None] * np.sqrt(np.maximum(1.0 - (edges / half[..., None] - 1.0) ** 2, 0.0))
     thick = 0.5 * rachis.diameter.at(number / count[:, None])
-    stiffness = 0.5 * section(h[:, None], thick, thick, rachis.modulus.value, 1.0)[2]
-    return Pieces(
+    stiffness = 0.5 * segment_properties(h[:, None], thick, thick, rachis.modulus.value, 1.0)[2]
+    return BunchSegments(
         count, h, np.where(here, fruit + stem, 0.0), both, np.where(here[..., None], inertia, 0.0),
         np.where(here[..., None], hull, 0.0), np.where(here[..., None], stiffness, 0.0),
     )  # fmt: skip
 
 
-class Tree:
+class TreeBuilder:
     """One tree while it grows: a list of bodies, parents before children. Bodies are numbered from 0, the root.
 
     Berry clusters stand apart: :func:`assemble` numbers them behind all other bodies of their tree.
@@ -122,7 +122,9 @@ class Tree:
         self.bunches: list[dict[str, Any]] = []
         self.leaves: list[dict[str, Any]] = []
 
-    def add(self, parent: int, *, offset: Any = (0.0, 0.0, 0.0), rest: Any = frames.IDENTITY, **fields: Any) -> int:
+    def add_body(
+        self, parent: int, *, offset: Any = (0.0, 0.0, 0.0), rest: Any = frames.IDENTITY, **fields: Any
+    ) -> int:
         """Append one body with explicit :class:`Model` fields (names without prefix); returns its number."""
         if not -1 <= parent < len(self.bodies):
             raise ValueError(f"body {len(self.bodies)} names parent {parent}, which does not stand before it")
@@ -131,13 +133,13 @@ class Tree:
         )
         return len(self.bodies) - 1
 
-    def rod(
+    def add_rod(
         self,
         parent: int,
         length: float,
         radius: tuple[float, float],
-        wood: Wood,
-        pieces: int,
+        material: RodMaterial,
+        segments: int,
         *,
         organ: Organ = Organ.CANE,
         offset: Any = None,
@@ -151,43 +153,48 @@ class Tree:
         of this rod and what of the parent, if that is a piece of a rod, lies between its middle and the joint; damping
         is each wood's in its share.
         """
-        if length <= 0.0 or min(radius) <= 0.0 or pieces < 1 or wood.modulus <= 0.0 or wood.density <= 0.0:
+        if length <= 0.0 or min(radius) <= 0.0 or segments < 1 or material.modulus <= 0.0 or material.density <= 0.0:
             raise ValueError(
-                f"rod of length {length} m, radius {radius} m, {pieces} pieces, {wood}: all must be positive"
+                f"rod of length {length} m, radius {radius} m, {segments} pieces, {material}: all must be positive"
             )
-        h = length / pieces
-        edges = radius[0] + (radius[1] - radius[0]) * np.arange(pieces + 1) / pieces
-        masses, inertias, near, far = section(h, edges[:-1], edges[1:], wood.modulus, wood.density, wood.shear)
+        h = length / segments
+        edges = radius[0] + (radius[1] - radius[0]) * np.arange(segments + 1) / segments
+        masses, inertias, near, far = segment_properties(
+            h, edges[:-1], edges[1:], material.modulus, material.density, material.shear_modulus
+        )
         above = self.bodies[parent] if 0 <= parent < len(self.bodies) else {}
         if offset is None:
             offset = (above.get("length", 0.0), 0.0, 0.0)
-        slack, damped = 1.0 / near, wood.damping / near  # [rad/N m] of the lower halves, and with the wood's damping
+        slack, damped = (
+            1.0 / near,
+            material.damping / near,
+        )  # [rad/N m] of the lower halves, and with the wood's damping
         slack[1:] += 1.0 / far[:-1]
-        damped[1:] += wood.damping / far[:-1]
+        damped[1:] += material.damping / far[:-1]
         if "far" in above:
             reach = np.clip(2.0 * offset[0] / above["length"] - 1.0, 0.0, 1.0)
-            share = reach * (1.0 / above["far"]) @ frames.matrix(np.asarray(rest, float)) ** 2
+            share = reach * (1.0 / above["far"]) @ frames.to_matrix(np.asarray(rest, float)) ** 2
             slack[0] += share
             damped[0] += above["beta"] * share
         stiffnesses = 1.0 / slack
         dampings = stiffnesses**2 * damped
         numbers = []
-        for i in range(pieces):
+        for i in range(segments):
             turn = frames.IDENTITY if bends is None else bends[i]
             if i == 0:
                 at = offset
                 turn = frames.multiply(rest, turn)
             else:
                 at = (h, 0.0, 0.0)
-            parent = self.add(
+            parent = self.add_body(
                 parent, offset=at, rest=turn, organ=int(organ), mass=masses[i], com=(h / 2, 0, 0), length=h,
                 radius=(edges[i], edges[i + 1]), inertia=inertias[i], stiffness=stiffnesses[i],
-                damping=dampings[i], far=far[i], beta=wood.damping,
+                damping=dampings[i], far=far[i], beta=material.damping,
             )  # fmt: skip
             numbers.append(parent)
         return numbers
 
-    def bunch(
+    def add_bunch(
         self,
         parent: int,
         mass: float,
@@ -200,7 +207,7 @@ class Tree:
         stiffness: Any = None,
         damping: Any = None,
         clusters: bool = True,
-        parts: plant_parameters.Vine | None = None,
+        parameters: plant_parameters.VineParameters | None = None,
         **fields: Any,
     ) -> int:
         """Hang a bunch of ``count`` berries on a piece of peduncle and return its body's number.
@@ -209,16 +216,18 @@ class Tree:
         on. ``parts`` gives the rachis (``data/plants/vine.toml`` unless given); ``fields`` are further ``bunch_``
         fields of the :class:`Model`.
         """
-        parts = plant_parameters.load("vine") if parts is None else parts
+        parameters = plant_parameters.load_plant("vine") if parameters is None else parameters
         above = self.bodies[parent]
         berry = berries.VARIETIES[variety]
-        share = parts.bunch.stem_share.value
+        share = parameters.bunch.stem_share.value
         size = berry.volume_radius * np.cbrt(mass * (1.0 - share) / (count * berry.mass))
-        length, radius = berries.hull(np.array(count), np.array(seed)) * size
-        one = bunch_pieces(*(np.array([value]) for value in (mass, length, radius, count, seed)), parts.rachis, share)
+        length, radius = berries.hull_size(np.array(count), np.array(seed)) * size
+        one = segment_bunches(
+            *(np.array([value]) for value in (mass, length, radius, count, seed)), parameters.rachis, share
+        )
         whole, com, inertia = (value[0] for value in one.compound())
         offset = (above["length"], 0.0, 0.0) if offset is None else offset
-        body = self.add(
+        body = self.add_body(
             parent, offset=offset, rest=rest, organ=int(Organ.BUNCH), mass=whole, com=com, inertia=inertia,
             length=length, radius=(radius, radius),
             stiffness=above["stiffness"] if stiffness is None else stiffness,
@@ -239,21 +248,21 @@ class Tree:
                     "parent": None if i > 1 else body, "offset": np.array([one.length[0], 0.0, 0.0]),
                     "rest": frames.IDENTITY, "organ": int(Organ.BUNCH), "mass": one.mass[0, i], "com": one.com[0, i],
                     "inertia": one.inertia[0, i], "length": one.length[0], "radius": one.radius[0, i],
-                    "stiffness": one.stiffness[0, i], "damping": parts.rachis.damping.value * one.stiffness[0, i],
+                    "stiffness": one.stiffness[0, i], "damping": parameters.rachis.damping.value * one.stiffness[0, i],
                 })  # fmt: skip
         self.bunches.append(bunch)
         return body
 
-    def settle(self) -> None:
+    def solve_rest_pose(self) -> None:
         """Choose rest rotations so that the shape drawn so far is the equilibrium under gravity: see :func:`settle`."""
-        model = settle(assemble([self]))
+        model = solve_rest_pose(assemble([self]))
         for body, rest, settled in zip(
             [*self.bodies, *self.clusters], model.body_rest, model.joint_settled, strict=True
         ):
             body["rest"], body["settled"] = rest.astype(float), settled.astype(float)
 
 
-def section(
+def segment_properties(
     length: np.ndarray | float,
     start: np.ndarray | float,
     end: np.ndarray | float,
@@ -280,7 +289,7 @@ def section(
     return mass, inertia, halves[0], halves[1]
 
 
-def settle(model: Model) -> Model:
+def solve_rest_pose(model: Model) -> Model:
     """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is the equilibrium.
 
     The spring must carry the weight hanging below each joint, so it is turned by theta = torque / stiffness (in joint
@@ -293,7 +302,7 @@ def settle(model: Model) -> Model:
             f"body {body} has joint stiffness {model.joint_stiffness[body]}; all must be positive to carry weight"
         )
     drawn = frames.normalize(model.body_rest.astype(float))
-    world = model.forward(np.broadcast_to(frames.IDENTITY, drawn.shape))
+    world = model.forward_kinematics(np.broadcast_to(frames.IDENTITY, drawn.shape))
     depth, parent = model.depth(), model.body_parent
     mass, com = model.body_mass.astype(float), model.body_com.astype(float)
     fine = model.bunch_clusters > 0
@@ -318,7 +327,7 @@ def settle(model: Model) -> Model:
     return model
 
 
-def assemble(trees: list[Tree], **others: np.ndarray) -> Model:
+def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
     """One :class:`Model` of all trees; ``others`` are whole arrays of the rest (``fixed_start=...``)."""
     counts = {
         "tree": len(trees),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pathlib
 
 
-class NotFoundInData(FileNotFoundError):
+class DataFileNotFound(FileNotFoundError):
     """A scene, robot, camera or lidar that neither is a file nor ships with vinesim; the text says what there is."""
 
 
@@ -15,8 +15,8 @@ def data_dir() -> pathlib.Path:
     return next(d for d in (package / "data", package.parent / "data") if d.is_dir())
 
 
-def find(kind: str, name: str, suffix: str) -> pathlib.Path:
-    """The file ``name`` if it exists, else ``data/<kind>/<name><suffix>``; :class:`NotFoundInData` otherwise."""
+def find_data_file(kind: str, name: str, suffix: str) -> pathlib.Path:
+    """The file ``name`` if it exists, else ``data/<kind>/<name><suffix>``; :class:`DataFileNotFound` otherwise."""
     given = pathlib.Path(name)
     if given.is_file():
         return given
@@ -24,4 +24,4 @@ def find(kind: str, name: str, suffix: str) -> pathlib.Path:
     if shipped.is_file():
         return shipped
     known = ", ".join(sorted(p.stem for p in (data_dir() / kind).glob(f"*{suffix}"))) or "none"
-    raise NotFoundInData(f"no file {name!r} and none of that name in data/{kind}; give a path or one of: {known}")
+    raise DataFileNotFound(f"no file {name!r} and none of that name in data/{kind}; give a path or one of: {known}")

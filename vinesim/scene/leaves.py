@@ -11,7 +11,7 @@ import functools
 
 import numpy as np
 
-SHAPES = 4
+SHAPE_COUNT = 4
 """How many outlines there are, from deeply cut to round."""
 
 _LOBES = ((0.0, 1.0), (np.radians(54.0), 0.88), (np.radians(112.0), 0.66))
@@ -45,18 +45,18 @@ def _circle(shape: int) -> tuple[float, float]:
     return width, float(np.trapezoid(0.5 * radius * radius, theta))
 
 
-def outline(theta: np.ndarray, shape: int = 0) -> np.ndarray:
+def blade_outline(theta: np.ndarray, shape: int = 0) -> np.ndarray:
     """Distance from the petiole's junction to the edge at ``theta`` [rad, -pi..pi], in units of ``leaf_size``."""
     return _blade(np.asarray(theta, float), shape) / _circle(shape)[0]
 
 
-def area(shape: int = 0) -> float:
+def blade_area(shape: int = 0) -> float:
     """Area of the flat blade [leaf_size^2]."""
     width, blade = _circle(shape)
     return blade / width**2
 
 
-def shape_of(leaf: np.ndarray) -> np.ndarray:
+def blade_shape(leaf: np.ndarray) -> np.ndarray:
     """Which outline a leaf of that number has [leaf]: the same on every client."""
     scrambled = np.asarray(leaf, np.uint32) * np.uint32(2654435761)
-    return (scrambled >> np.uint32(16)).astype(np.int32) % SHAPES
+    return (scrambled >> np.uint32(16)).astype(np.int32) % SHAPE_COUNT

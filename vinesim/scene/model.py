@@ -17,7 +17,7 @@ import hashlib
 import numpy as np
 
 from vinesim import frames
-from vinesim.arrays import Arrays, array
+from vinesim.arrays import StructOfArrays, array
 from vinesim.scene.ids import Organ
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -25,7 +25,7 @@ _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclasses.dataclass
-class Model(Arrays):
+class Model(StructOfArrays):
     """Constants of a vineyard (units in the declarations; frames in the module's text)."""
 
     # trees: the smallest thing that wakes, sleeps, is owned and is transmitted
@@ -127,7 +127,7 @@ class Model(Arrays):
     def digest(self) -> str:
         """Hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
         h = hashlib.blake2b(digest_size=8)
-        for name in self.dims():
+        for name in self.array_fields():
             h.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         return h.hexdigest()
 
@@ -136,7 +136,7 @@ class Model(Arrays):
         first = int(self.tree_first[tree])
         return slice(first, first + int(self.tree_size[tree]))
 
-    def forward(self, joint_q: np.ndarray) -> np.ndarray:
+    def forward_kinematics(self, joint_q: np.ndarray) -> np.ndarray:
         """World poses of all bodies [body, 7] for joint rotations [body, 4] (loops over depth: not for the tick)."""
         body_q = np.zeros((len(self.body_mass), 7))
         joint = np.concatenate([self.body_offset, frames.multiply(self.body_rest, joint_q)], -1).astype(float)
@@ -148,7 +148,7 @@ class Model(Arrays):
             body_q[here] = frames.compose(base, joint[here])
         return body_q
 
-    def bunch_of(self) -> np.ndarray:
+    def bunch_of_body(self) -> np.ndarray:
         """Which bunch a body belongs to [body]: its own body, its clusters and its peduncle; -1 for all others."""
         owner = np.full(len(self.body_mass), -1, np.int32)
         owner[self.bunch_body] = bunch = np.arange(len(self.bunch_body), dtype=np.int32)

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from vinesim.scene.data_files import find
-from vinesim.scene.toml_loader import DataError, read
+from vinesim.scene.data_files import find_data_file
+from vinesim.scene.toml_loader import DataError, load_toml
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -141,7 +141,7 @@ class Trellis(_Part, frozen=True, kw_only=True):
     tie_damping: Annotated[Number, "s"]
 
 
-class Vine(_Part, frozen=True, kw_only=True):
+class VineParameters(_Part, frozen=True, kw_only=True):
     """All parameters of a vine and its trellis."""
 
     cane: Cane
@@ -170,18 +170,18 @@ class Varieties(_Part, frozen=True, kw_only=True):
 
 
 @functools.cache
-def load(name: str) -> Vine:
+def load_plant(name: str) -> VineParameters:
     """Parameters from a file, or from the one of that name in ``data/plants``; :class:`DataError` if a unit is off."""
-    path = find("plants", name, ".toml")
-    vine = read(path, Vine)
+    path = find_data_file("plants", name, ".toml")
+    vine = load_toml(path, VineParameters)
     _check_units(vine, str(path))
     return vine
 
 
 def load_varieties() -> tuple[Berry, ...]:
     """The varieties that ship with vinesim, in the order of ``Model.bunch_variety``."""
-    path = find("plants", "varieties", ".toml")
-    varieties = read(path, Varieties).varieties
+    path = find_data_file("plants", "varieties", ".toml")
+    varieties = load_toml(path, Varieties).varieties
     for i, berry in enumerate(varieties):
         _check_units(berry, f"{path}: varieties[{i}]")
     return varieties

@@ -14,11 +14,11 @@ import msgspec
 
 from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
-from vinesim.scene.data_files import NotFoundInData, find
+from vinesim.scene.data_files import DataFileNotFound, find_data_file
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.toml_loader import DataError, read
+from vinesim.scene.toml_loader import DataError, load_toml
 
-MOST_ROBOTS = 10
+MAX_ROBOTS = 10
 """Robots that may meet in one vineyard (CANOPIES D6.4 section 2.3)."""
 
 Length = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -97,12 +97,12 @@ class Sun(_Part, frozen=True, kw_only=True):
         if self.hour is not None:
             # Cooper (1969), to 0.4 degrees
             declination = math.radians(23.45) * math.sin(2.0 * math.pi * (284 + self.day) / 365.0)
-            return sun_at(self.hour + time / 3600.0, declination, self.latitude)
+            return sun_direction(self.hour + time / 3600.0, declination, self.latitude)
         level = math.cos(self.elevation)
         return level * math.cos(self.azimuth), level * math.sin(self.azimuth), math.sin(self.elevation)
 
 
-def sun_at(hour: float, declination: float, latitude: float) -> tuple[float, float, float]:
+def sun_direction(hour: float, declination: float, latitude: float) -> tuple[float, float, float]:
     """Unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude [rad]."""
     turn = math.radians(15.0) * (hour - 12.0)
     east = -math.cos(declination) * math.sin(turn)
@@ -151,20 +151,20 @@ class Scene(_Part, frozen=True, kw_only=True):
     """Parameters that differ from their defaults; they are not part of the vineyard's digest."""
 
 
-def load(path_or_name: str | pathlib.Path) -> Scene:
+def load_scene(path_or_name: str | pathlib.Path) -> Scene:
     """The scene in a file, or the one of that name in ``data/scenes``; :class:`SceneError` in one line otherwise."""
     try:
-        path = find("scenes", str(path_or_name), ".toml")
-    except NotFoundInData as missing:
+        path = find_data_file("scenes", str(path_or_name), ".toml")
+    except DataFileNotFound as missing:
         raise SceneError(str(missing)) from None
-    scene = read(path, Scene, SceneError)
-    trouble = _trouble(scene)
+    scene = load_toml(path, Scene, SceneError)
+    trouble = _find_error(scene)
     if trouble:
         raise SceneError(f"{path}: {trouble}")
     return scene
 
 
-def _trouble(scene: Scene) -> str:
+def _find_error(scene: Scene) -> str:
     """What the types cannot say: place, finding, remedy; empty if all is well."""
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
@@ -173,11 +173,11 @@ def _trouble(scene: Scene) -> str:
     for i, name in enumerate(scene.fruit.varieties):
         if name not in known:
             return f"fruit.varieties[{i}] is {name!r}; give one of: {', '.join(known)}"
-    if len(scene.spawns) > MOST_ROBOTS:
-        return f"spawns has {len(scene.spawns)} entries; give at most {MOST_ROBOTS}"
+    if len(scene.spawns) > MAX_ROBOTS:
+        return f"spawns has {len(scene.spawns)} entries; give at most {MAX_ROBOTS}"
     try:
-        plant_parameters.load(scene.plants)
-    except (NotFoundInData, DataError) as bad:
+        plant_parameters.load_plant(scene.plants)
+    except (DataFileNotFound, DataError) as bad:
         return f"plants is {scene.plants!r}; {bad}"
     names = [s.name for s in scene.spawns]
     for i, name in enumerate(names):
@@ -186,7 +186,7 @@ def _trouble(scene: Scene) -> str:
     return ""
 
 
-def reseeded(scene: Scene, seed: int | None) -> Scene:
+def with_seed(scene: Scene, seed: int | None) -> Scene:
     """The same scene grown from another seed; None keeps its own."""
     if seed is None:
         return scene

@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.arrays import Arrays, array
+from vinesim.arrays import StructOfArrays, array
 from vinesim.scene.model import Model
 
 
 @dataclasses.dataclass
-class State(Arrays):
+class State(StructOfArrays):
     """State of all plants. Rigid things (robots, boxes, hands) keep theirs in MuJoCo."""
 
     joint_q: np.ndarray = array("body", 4, unit="1", fill=(0.0, 0.0, 0.0, 1.0))
@@ -40,5 +40,5 @@ class State(Arrays):
         counts = model.counts()
         state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
         state.joint_q[:] = model.joint_settled
-        state.body_q[:] = model.forward(state.joint_q)
+        state.body_q[:] = model.forward_kinematics(state.joint_q)
         return state

@@ -10,13 +10,13 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 
 
-def table(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
+def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
     """Rows of (quantity, value, unit)."""
     counts, layout = model.counts(), scene.layout
     vines = layout.rows * layout.vines
     ground = vines * layout.row_spacing * layout.vine_spacing
     bent = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)
-    memory = sum(getattr(model, name).nbytes for name in model.dims())
+    memory = sum(getattr(model, name).nbytes for name in model.array_fields())
     fruit = model.body_mass[model.bunch_body].sum()
     return [
         ("scene", f"{scene.name}, {scene.training}, seed {scene.seed}", ""),
@@ -29,7 +29,7 @@ def table(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
         ("berries", f"{model.bunch_berries.sum()}", ""),
         ("fruit per vine", f"{fruit / vines:.1f}", "kg"),
         ("leaves", f"{counts['leaf']}", ""),
-        ("leaf area index", f"{leaf_area(model) / ground:.2f}", "m^2/m^2"),
+        ("leaf area index", f"{total_leaf_area(model) / ground:.2f}", "m^2/m^2"),
         ("poles, wires, old wood", f"{counts['fixed']}", "pieces"),
         ("boxes", f"{counts['box']}", ""),
         ("start places", ", ".join(s.name for s in scene.spawns) or "none", ""),
@@ -39,7 +39,7 @@ def table(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
     ]
 
 
-def leaf_area(model: Model) -> float:
+def total_leaf_area(model: Model) -> float:
     """One side of all blades, flat [m^2]."""
-    unit = np.array([leaves.area(shape) for shape in range(leaves.SHAPES)])
-    return float((unit[leaves.shape_of(np.arange(len(model.leaf_size)))] * model.leaf_size.astype(float) ** 2).sum())
+    unit = np.array([leaves.blade_area(shape) for shape in range(leaves.SHAPE_COUNT)])
+    return float((unit[leaves.blade_shape(np.arange(len(model.leaf_size)))] * model.leaf_size.astype(float) ** 2).sum())

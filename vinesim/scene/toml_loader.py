@@ -26,7 +26,7 @@ class DataError(ValueError):
     """A data file that cannot be used. The text is one line."""
 
 
-def read(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
+def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
     """The TOML file at ``path`` as a ``kind``; raises ``error`` otherwise."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -72,15 +72,15 @@ class Drive:
     lower: float
     upper: float
     """Limits of the joint [rad or m]."""
-    rotor: float = 0.0
+    armature: float = 0.0
     """Inertia of motor and gear seen from the joint [kg m2 or kg]: the gear ratio squared makes it the larger part.
 
     A stiff servo at its effort limit needs it: a bare hand of 0.02 kg m2 under 40 N m gains 20 rad/s in a tick.
     """
-    elastic: float = 0.0
+    series_stiffness: float = 0.0
     """Stiffness of the spring between gear and joint [N m/rad or N/m]; 0: the position gain stands for it."""
-    elastic_damping: float = 0.0
-    """Damping of that spring [N m s/rad or N s/m]; of no meaning if ``elastic`` is 0."""
+    series_damping: float = 0.0
+    """Damping of that spring [N m s/rad or N s/m]; of no meaning if ``series_stiffness`` is 0."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -137,15 +137,15 @@ class HumanPose:
 
     @property
     def points(self) -> np.ndarray:
-        """[7, 7] all poses, in the order of :data:`POINTS`."""
-        return np.stack([getattr(self, name) for name in POINTS])
+        """[7, 7] all poses, in the order of :data:`POINT_NAMES`."""
+        return np.stack([getattr(self, name) for name in POINT_NAMES])
 
-    def at(self, points: np.ndarray) -> HumanPose:
+    def with_points(self, points: np.ndarray) -> HumanPose:
         """The same hands and fingers with all poses [7, 7] elsewhere."""
-        return dataclasses.replace(self, **dict(zip(POINTS, points, strict=True)))
+        return dataclasses.replace(self, **dict(zip(POINT_NAMES, points, strict=True)))
 
 
-POINTS = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
+POINT_NAMES = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
 """Poses of a :class:`HumanPose`."""
 
 

@@ -1,6 +1,6 @@
 """The thread that sees: takes the newest view of the world, renders what somebody wants, drops what comes too late.
 
-Physics calls :meth:`Eyes.see` every tick and never waits. Warp's launches release the interpreter lock, so a frame
+Physics calls :meth:`SensorScheduler.submit` every tick and never waits. Warp's launches release the interpreter lock, so a frame
 costs the physics thread the other core, not its tick. A camera takes a frame at once; a lidar fires at every view the
 shots whose time has come, and delivers a revolution when its last shot is fired.
 """
@@ -26,12 +26,12 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, LidarScan, View
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.lidar.lidar import Lidar
-from vinesim.sensors.lidar.spinning_scan import Rolling
+from vinesim.sensors.lidar.spinning_scan import SpinningScan
 from vinesim.sensors.scene.primitives import Primitives
 
 log = logging.getLogger(__name__)
 
-_STANDS = 1024
+_MAX_PENDING_POSES = 1024
 """Poses of a lidar that wait for the thread; more than it ever needs."""
 
 
@@ -41,21 +41,21 @@ def load_kernels() -> None:
         wp.load_module(module, device="cpu")
 
 
-class Wanted(Protocol):
+class DemandQuery(Protocol):
     """Whether anybody listens to a sensor now."""
 
     def __call__(self) -> bool: ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Mount:
+class ScheduledSensor:
     """One sensor and its listener."""
 
     sensor: Camera | Lidar
     deliver: Callable[[CameraFrame | LidarScan], None]
     """Called in the sensing thread with every frame or scan."""
-    wanted: Wanted = lambda: True
-    depth_wanted: Wanted = lambda: True
+    is_wanted: DemandQuery = lambda: True
+    is_depth_wanted: DemandQuery = lambda: True
     """Of a camera: whether anybody looks at its depth, too."""
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
@@ -66,23 +66,23 @@ class Mount:
         return self.sensor.name
 
 
-class Eyes:
+class SensorScheduler:
     """All sensors of one client in one thread. Use as a context manager, or :meth:`start` and :meth:`stop`."""
 
     def __init__(
         self,
         model: Model,
-        mounts: list[Mount] | tuple[Mount, ...],
+        sensors: list[ScheduledSensor] | tuple[ScheduledSensor, ...],
         *,
         primitives: Primitives | None = None,
         nice: int = 0,
     ) -> None:
-        """``nice``: how far the thread stands back where cores are scarce, as in nice(1); Linux only."""
-        names = [m.name for m in mounts]
+        """``nice``: how far the thread poses_by_time back where cores are scarce, as in nice(1); Linux only."""
+        names = [m.name for m in sensors]
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)
             raise ValueError(f"two sensors are named {twice!r}; give each its own name")
-        self.mounts = tuple(mounts)
+        self.sensors = tuple(sensors)
         self._nice = nice
         self.primitives = primitives or Primitives(model)
         self.frames = dict.fromkeys(names, 0)
@@ -91,16 +91,16 @@ class Eyes:
         """Frames that were due and not rendered in time, by sensor."""
         self.failure: BaseException | None = None
         """What stopped the thread, if anything did; :meth:`see` and :meth:`stop` raise it."""
-        self._due = dict.fromkeys(names, -np.inf)
-        self._turning = {m.name: Rolling(m.sensor, m.rate) for m in mounts if isinstance(m.sensor, Lidar)}
-        self._stands: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in self._turning}
-        self._news = threading.Condition()
-        self._newest: tuple[View, Mapping[str, np.ndarray]] | None = None
-        self._moved: list[np.ndarray] = []
+        self._next_time = dict.fromkeys(names, -np.inf)
+        self._scans = {m.name: SpinningScan(m.sensor, m.rate) for m in sensors if isinstance(m.sensor, Lidar)}
+        self._pending_poses: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in self._scans}
+        self._condition = threading.Condition()
+        self._latest: tuple[View, Mapping[str, np.ndarray]] | None = None
+        self._moved_trees: list[np.ndarray] = []
         self._stopping = False
         self._thread: threading.Thread | None = None
 
-    def start(self) -> Eyes:
+    def start(self) -> SensorScheduler:
         """Start the thread."""
         if self._thread is not None:
             raise RuntimeError("these eyes are open already; stop them first")
@@ -111,9 +111,9 @@ class Eyes:
 
     def stop(self, timeout: float = 10.0) -> None:
         """End the thread after the frame it is at; raises what went wrong in it, once."""
-        with self._news:
+        with self._condition:
             self._stopping = True
-            self._news.notify()
+            self._condition.notify()
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join(timeout)
@@ -121,7 +121,7 @@ class Eyes:
                 raise TimeoutError(f"the sensing thread did not end within {timeout} s")
         self._raise()
 
-    def __enter__(self) -> Eyes:
+    def __enter__(self) -> SensorScheduler:
         return self.start()
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -131,20 +131,20 @@ class Eyes:
             if kind is None:  # a failure of the body comes first
                 raise
 
-    def see(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
+    def submit(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
         """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
         self._raise()
-        with self._news:
-            self._newest = (view, poses)
-            for name in self._stands.keys() & poses.keys():
-                self._stands[name].append((view.time, poses[name]))
-                if len(self._stands[name]) > _STANDS:
-                    del self._stands[name][: _STANDS // 2]
+        with self._condition:
+            self._latest = (view, poses)
+            for name in self._pending_poses.keys() & poses.keys():
+                self._pending_poses[name].append((view.time, poses[name]))
+                if len(self._pending_poses[name]) > _MAX_PENDING_POSES:
+                    del self._pending_poses[name][: _MAX_PENDING_POSES // 2]
             if len(view.moved):
-                self._moved.append(view.moved)
-                if len(self._moved) > 256:
-                    self._moved = [np.unique(np.concatenate(self._moved))]
-            self._news.notify()
+                self._moved_trees.append(view.moved)
+                if len(self._moved_trees) > 256:
+                    self._moved_trees = [np.unique(np.concatenate(self._moved_trees))]
+            self._condition.notify()
 
     def _raise(self) -> None:
         if self.failure is not None:
@@ -157,61 +157,61 @@ class Eyes:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
         try:
             while True:
-                with self._news:
-                    self._news.wait_for(lambda: self._stopping or self._newest is not None)
+                with self._condition:
+                    self._condition.wait_for(lambda: self._stopping or self._latest is not None)
                     if self._stopping:
                         return
-                    (view, poses), self._newest = self._newest, None
-                    moved += self._moved
-                    self._moved = []
-                    for name, stands in self._stands.items():
-                        for time, pose in stands:
-                            self._turning[name].track.add(time, pose)
-                        stands.clear()
-                due = [m for m in self.mounts if self._is_due(m, view.time, poses)]
+                    (view, poses), self._latest = self._latest, None
+                    moved += self._moved_trees
+                    self._moved_trees = []
+                    for name, poses_by_time in self._pending_poses.items():
+                        for time, pose in poses_by_time:
+                            self._scans[name].pose_history.add(time, pose)
+                        poses_by_time.clear()
+                due = [m for m in self.sensors if self._is_due(m, view.time, poses)]
                 if not due:
                     continue
                 self.primitives.update(view, np.concatenate(moved) if moved else np.zeros(0, np.int64))
                 moved = []
-                for mount in due:
+                for sensor in due:
                     if self._stopping:
                         return
-                    for result in self._take(mount, view.time, poses[mount.name]):
-                        mount.deliver(result)
-                        self.frames[mount.name] += 1
+                    for result in self._results(sensor, view.time, poses[sensor.name]):
+                        sensor.deliver(result)
+                        self.frames[sensor.name] += 1
         except BaseException as failure:  # surfaced by the next see() or stop()
             log.exception("the sensing thread stops")
             self.failure = failure
 
-    def _take(self, mount: Mount, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
+    def _results(self, sensor: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
         """What a sensor has to deliver at simulation time ``now``."""
-        if isinstance(mount.sensor, Camera):
-            yield mount.sensor.render(self.primitives, pose, now, measure=mount.depth_wanted())
+        if isinstance(sensor.sensor, Camera):
+            yield sensor.sensor.render(self.primitives, pose, now, measure_depth=sensor.is_depth_wanted())
             return
-        turning = self._turning[mount.name]
-        missed = turning.dropped
-        yield from turning.go(self.primitives, now)
-        self.dropped[mount.name] += turning.dropped - missed
+        scan = self._scans[sensor.name]
+        missed = scan.dropped
+        yield from scan.advance(self.primitives, now)
+        self.dropped[sensor.name] += scan.dropped - missed
 
-    def _is_due(self, mount: Mount, now: float, poses: Mapping[str, np.ndarray]) -> bool:
+    def _is_due(self, sensor: ScheduledSensor, now: float, poses: Mapping[str, np.ndarray]) -> bool:
         """Whether a sensor has something to do at simulation time ``now``; counts the frames it has missed."""
-        name = mount.name
-        if name not in poses or not mount.wanted():
-            self._due[name] = -np.inf  # whoever comes back is served at once, and missed nothing
-            if name in self._turning:
-                self._turning[name].stop(now)
+        name = sensor.name
+        if name not in poses or not sensor.is_wanted():
+            self._next_time[name] = -np.inf  # whoever comes back is served at once, and missed nothing
+            if name in self._scans:
+                self._scans[name].cancel(now)
             return False
-        if name in self._turning:
-            return self._turning[name].due(now)
-        due, period = self._due[name], 1.0 / (mount.rate or mount.sensor.rate)
+        if name in self._scans:
+            return self._scans[name].is_due(now)
+        due, period = self._next_time[name], 1.0 / (sensor.rate or sensor.sensor.rate)
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf
         if now < due - 1e-6:
             return False
         if not np.isfinite(due):
-            self._due[name] = now + period
+            self._next_time[name] = now + period
             return True
         late = int((now - due + 1e-6) / period)
         self.dropped[name] += late
-        self._due[name] = due + (late + 1) * period
+        self._next_time[name] = due + (late + 1) * period
         return True

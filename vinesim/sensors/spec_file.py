@@ -10,8 +10,8 @@ from typing import Literal, TypeVar
 import msgspec
 import numpy as np
 
-from vinesim.scene.data_files import find
-from vinesim.scene.toml_loader import DataError, read
+from vinesim.scene.data_files import find_data_file
+from vinesim.scene.toml_loader import DataError, load_toml
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -34,8 +34,8 @@ def load(folder: str, name: str, kind: type[T]) -> T:
 
     Its fields say what is checked: ``Annotated[Number, unit, (lowest, highest)]``.
     """
-    path = find(folder, name, ".toml")
-    spec = read(path, kind, SensorError)
+    path = find_data_file(folder, name, ".toml")
+    spec = load_toml(path, kind, SensorError)
     _check(path, spec)
     return spec
 
@@ -56,6 +56,6 @@ def _check(path: pathlib.Path, spec: msgspec.Struct, place: str = "") -> None:
             _check(path, found, f"{place}{field}.")
 
 
-def dice(seed: int, name: str, number: int) -> np.random.Generator:
+def noise_rng(seed: int, name: str, number: int) -> np.random.Generator:
     """Random numbers of one image or revolution: the same for the same (seed, sensor, number), on every machine."""
     return np.random.default_rng([seed & 0xFFFFFFFF, zlib.crc32(name.encode()), number & 0xFFFFFFFF])

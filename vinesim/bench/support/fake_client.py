@@ -26,10 +26,10 @@ from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.exchange import Exchange
 from vinesim.net.transport.bus import Bus
-from vinesim.scene.builder import Tree, Wood, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import is_tree
 from vinesim.scene.model import Model
-from vinesim.scene.values import POINTS, HumanPose, HumanUpdate, RobotUpdate
+from vinesim.scene.values import POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
 TICK = 0.01
 """A client's tick [s]."""
@@ -46,9 +46,9 @@ def row(count: int = 12, *, apart: float = 1.0) -> Model:
     """Trees of six bodies and a bunch along x, the first at half their distance [m], and a box below each."""
     trees = []
     for number in range(count):
-        tree = Tree(frames.pose(np.array([(number + 0.5) * apart, 0.0, 1.5])))
-        tip = tree.rod(-1, 0.6, (0.006, 0.004), Wood(2e9, 900.0), 6)[-1]
-        tree.bunch(tip, 0.4, clusters=False)
+        tree = TreeBuilder(frames.pose(np.array([(number + 0.5) * apart, 0.0, 1.5])))
+        tip = tree.add_rod(-1, 0.6, (0.006, 0.004), RodMaterial(2e9, 900.0), 6)[-1]
+        tree.add_bunch(tip, 0.4, clusters=False)
         trees.append(tree)
     boxes = np.array([frames.pose([(number + 0.5) * apart, 0.5, 0.12]) for number in range(count)])
     return assemble(trees, box_pose=boxes, box_size=np.tile([0.4, 0.3, 0.24], (count, 1)), box_mass=np.full(count, 1.0))
@@ -143,9 +143,9 @@ class Puppet:
     def pose(self, now: float) -> RobotUpdate | HumanUpdate:
         """What it would say of itself at ``now``."""
         if self.exchange.me.kind == "human":
-            points = np.tile(frames.pose(self.place), (len(POINTS), 1))
+            points = np.tile(frames.pose(self.place), (len(POINT_NAMES), 1))
             points[:, 2] = (0.0, 1.65, 1.1 + 0.2 * np.sin(2.0 * now), 1.1, 0.9, 0.1, 0.1)
-            velocity = np.zeros((len(POINTS), 6))
+            velocity = np.zeros((len(POINT_NAMES), 6))
             velocity[2, 2] = 0.4 * np.cos(2.0 * now)
             return HumanUpdate(self.name, now, HumanPose(*points), velocity)
         phase = np.arange(self.joints) + (2.0 * now if self.restless else 0.0)

@@ -1,6 +1,9 @@
 """Robots, people and crates set down in a vineyard for a picture: what a simulation would show at that instant.
 
-    view = Stage(robots=(RobotAt("vinebot", 1.5, 0.8),), crates=(CrateAt(3.0, 0.5, fill=0.6),)).set(model)
+    composer = SceneComposer(
+        robots=(RobotPlacement("vinebot", 1.5, 0.8),), crates=(CratePlacement(3.0, 0.5, fill=0.6),)
+    )
+    snapshot = composer.compose(model)
 
 Bunches in a crate were picked from the nearest vines and fell in one after another, by the rigid world that clients
 simulate.
@@ -22,24 +25,24 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import HumanSpec, View
-from vinesim.sensors.scene.primitives import still_view
+from vinesim.sensors.scene.primitives import rest_snapshot
 
-BULK = 330.0
+HEAP_DENSITY = 330.0
 """Of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
-WALL, MASS = 0.012, 1.6
+CRATE_WALL, CRATE_MASS = 0.012, 1.6
 """[m] and [kg] of a crate: how thick its walls are, and how heavy it is when empty."""
-CLEAR = 0.01
+MAX_PENETRATION = 0.01
 """[m] Whoever stands deeper than this in something else stands in it."""
-FALL, REST, TRIES = 25, 100, 3
+FALL_STEPS, SETTLE_STEPS, MAX_REFILLS = 25, 100, 3
 """[tick] between bunches that fall into a crate; for the heap to settle; how often what rolled out is put back."""
 
 
-class NoRoom(ValueError):
+class PlacementError(ValueError):
     """Something cannot stand where it is asked to. The text is one line."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class RobotAt:
+class RobotPlacement:
     """A robot by the name of its description, as it stands at ``x``, ``y`` [m], ``yaw`` [rad]."""
 
     robot: str
@@ -49,7 +52,7 @@ class RobotAt:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class PersonAt:
+class PersonPlacement:
     """A person in a posture of ``data/figures/postures.toml``."""
 
     x: float
@@ -61,7 +64,7 @@ class PersonAt:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class CrateAt:
+class CratePlacement:
     """A crate on the ground, ``fill`` of its inside heaped with bunches."""
 
     x: float
@@ -74,28 +77,28 @@ class CrateAt:
     @property
     def pose(self) -> np.ndarray:
         """[7] in the world."""
-        return _at(self.x, self.y, self.yaw)
+        return _ground_pose(self.x, self.y, self.yaw)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Stage:
+class SceneComposer:
     """Who and what is in a picture beside the vineyard; labels count from 0 in the order given here."""
 
-    robots: tuple[RobotAt, ...] = ()
-    people: tuple[PersonAt, ...] = ()
-    crates: tuple[CrateAt, ...] = ()
+    robots: tuple[RobotPlacement, ...] = ()
+    people: tuple[PersonPlacement, ...] = ()
+    crates: tuple[CratePlacement, ...] = ()
     """After those of the scene."""
 
-    def set(self, model: Model) -> View:
-        """The vineyard with all of it at rest; :class:`NoRoom` if two would stand in each other."""
-        furnished = self.furnished(model)
+    def compose(self, model: Model) -> View:
+        """The vineyard with all of it at rest; :class:`PlacementError` if two would stand in each other."""
+        furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
-            return self.enter(Physics(furnished))
+            return self.populate(Physics(furnished))
         rigid = Rigid(furnished)  # plants that nobody picks from need not be ready to move
-        self._admit(rigid)
-        return still_view(model, rigid.links(), rigid.link_q())
+        self._add_actors(rigid)
+        return rest_snapshot(model, rigid.links(), rigid.link_q())
 
-    def furnished(self, model: Model) -> Model:
+    def with_crates(self, model: Model) -> Model:
         """The same vineyard with the crates after its own boxes."""
         count = len(self.crates)
         pose, size = np.array([c.pose for c in self.crates]), np.array([c.size for c in self.crates])
@@ -103,70 +106,76 @@ class Stage:
             model,
             box_pose=np.concatenate([model.box_pose, pose.reshape(count, 7)]).astype(model.box_pose.dtype),
             box_size=np.concatenate([model.box_size, size.reshape(count, 3)]).astype(model.box_size.dtype),
-            box_mass=np.append(model.box_mass, [MASS] * count).astype(model.box_mass.dtype),
+            box_mass=np.append(model.box_mass, [CRATE_MASS] * count).astype(model.box_mass.dtype),
         )
 
-    def enter(self, physics: Physics) -> View:
+    def populate(self, physics: Physics) -> View:
         """In a world that is furnished: fill the crates, then let everybody in."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
-            heap(physics, number, crate)
-        self._admit(physics.rigid)
+            fill_crate(physics, number, crate)
+        self._add_actors(physics.rigid)
         return physics.view()
 
-    def _admit(self, rigid: Rigid) -> None:
+    def _add_actors(self, rigid: Rigid) -> None:
         """Let robots and people in."""
         for index, one in enumerate(self.robots):
-            pose = _at(one.x, one.y, one.yaw)
-            rigid.add_robot(description.load(one.robot).spec(f"robot_{index}", index=index, pose=pose))
+            pose = _ground_pose(one.x, one.y, one.yaw)
+            rigid.add_robot(description.load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
-            pose = appearance.posed(standing(_at(one.x, one.y, one.yaw), one.height), one.posture, one.height)
+            pose = appearance.apply_posture(
+                standing(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height
+            )
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
-        _apart(rigid)
+        _check_clearance(rigid)
 
-    def told(self, model: Model) -> list[dict]:
+    def actor_records(self, model: Model) -> list[dict]:
         """Everything that is set down in a vineyard, as JSON: label, kind, where."""
-        told = []
+        records = []
         for organ, things, start in (
             (Organ.ROBOT, self.robots, 0), (Organ.HUMAN, self.people, 0), (Organ.BOX, self.crates, len(model.box_size)),
         ):  # fmt: skip
             for number, one in enumerate(things, start):
-                told.append({"kind": organ.name.lower(), "label": label(organ, number), **dataclasses.asdict(one)})
-        return told
+                records.append({"kind": organ.name.lower(), "label": label(organ, number), **dataclasses.asdict(one)})
+        return records
 
 
-def _at(x: float, y: float, yaw: float) -> np.ndarray:
-    return frames.pose(np.array([x, y, 0.0]), frames.yaw(yaw))
+def _ground_pose(x: float, y: float, yaw: float) -> np.ndarray:
+    return frames.pose(np.array([x, y, 0.0]), frames.from_yaw(yaw))
 
 
-def weights(model: Model) -> np.ndarray:
+def bunch_masses(model: Model) -> np.ndarray:
     """Of all bunches [kg]."""
     return model.bunch_berries * np.array([v.mass for v in VARIETIES])[model.bunch_variety]
 
 
-def heap(physics: Physics, number: int, crate: CrateAt) -> list[int]:
+def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int]:
     """Let the bunches that hang nearest to a crate fall into it until they fill their share; returns which."""
     model, rigid = physics.model, physics.rigid
-    inside = np.array(crate.size) - [2.0 * WALL, 2.0 * WALL, WALL]
-    wanted = crate.fill * BULK * float(np.prod(inside))
+    inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
+    wanted = crate.fill * HEAP_DENSITY * float(np.prod(inside))
     where = physics.state.body_q[model.bunch_body, :3]
     away = np.hypot(where[:, 0] - crate.x, where[:, 1] - crate.y)
     near = np.argsort(np.where(physics.state.bunch_attached, away, np.inf), kind="stable")
     near = near[: int(physics.state.bunch_attached.sum())]
-    chosen = near[: int(np.searchsorted(np.cumsum(weights(model)[near]), wanted))]
+    chosen = near[: int(np.searchsorted(np.cumsum(bunch_masses(model)[near]), wanted))]
     if len(chosen) == len(near) and wanted > 0.0:
-        raise NoRoom(f"crate {number} wants {wanted:.1f} kg of bunches, more than the vineyard bears; fill it less")
+        raise PlacementError(
+            f"crate {number} wants {wanted:.1f} kg of bunches, more than the vineyard bears; fill it less"
+        )
     rng = np.random.default_rng([number, model.bunch_seed[0] if len(model.bunch_seed) else 0])
     waiting, inside_it = chosen.tolist(), []
-    for _ in range(TRIES):
+    for _ in range(MAX_REFILLS):
         for bunch in waiting:
             if physics.state.bunch_attached[bunch]:
                 physics.pick(bunch)
-            top = max([WALL, *(_top(physics, other) for other in inside_it)])
-            rigid.place_bunch(bunch, frames.compose(crate.pose, _above(model, bunch, inside, top, rng)), np.zeros(6))
+            top = max([CRATE_WALL, *(_top_height(physics, other) for other in inside_it)])
+            rigid.place_bunch(
+                bunch, frames.compose(crate.pose, _drop_pose(model, bunch, inside, top, rng)), np.zeros(6)
+            )
             inside_it.append(bunch)
-            _fall(rigid, FALL)
-        _fall(rigid, REST)
-        middle = {bunch: _ends(physics, bunch).mean(0) - crate.pose[:3] for bunch in inside_it}
+            _step_rigid(rigid, FALL_STEPS)
+        _step_rigid(rigid, SETTLE_STEPS)
+        middle = {bunch: _rachis_ends(physics, bunch).mean(0) - crate.pose[:3] for bunch in inside_it}
         level = {bunch: frames.rotate(frames.conjugate(crate.pose[3:]), at)[:2] for bunch, at in middle.items()}
         waiting = [bunch for bunch, at in level.items() if (np.abs(at) > 0.5 * inside[:2]).any()]
         inside_it = [bunch for bunch in inside_it if bunch not in waiting]
@@ -175,42 +184,42 @@ def heap(physics: Physics, number: int, crate: CrateAt) -> list[int]:
     return chosen.tolist()
 
 
-def _above(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.random.Generator) -> np.ndarray:
+def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.random.Generator) -> np.ndarray:
     """Pose [7] of a bunch that lies just above ``top`` [m] of a heap in a crate, in the crate's frame."""
     length, radius = float(model.bunch_length[bunch]), float(model.bunch_radius[bunch])
     room = np.maximum(0.5 * inside[:2] - [0.5 * length + 0.02, radius + 0.01], 0.0)
     yaw = rng.choice([0.0, np.pi]) + rng.uniform(-0.35, 0.35)
     start = rng.uniform(-room, room) - 0.5 * length * np.array([np.cos(yaw), np.sin(yaw)])
     roll = frames.exp(np.array([rng.uniform(-np.pi, np.pi), 0.0, 0.0]))
-    return frames.pose(np.array([*start, top + radius + 0.01]), frames.multiply(frames.yaw(yaw), roll))
+    return frames.pose(np.array([*start, top + radius + 0.01]), frames.multiply(frames.from_yaw(yaw), roll))
 
 
-def _ends(physics: Physics, bunch: int) -> np.ndarray:
+def _rachis_ends(physics: Physics, bunch: int) -> np.ndarray:
     """Both ends [2, 3] m of a loose bunch's rachis."""
     reach = np.array([[0.0, 0.0, 0.0], [float(physics.model.bunch_length[bunch]), 0.0, 0.0]])
     pose = physics.rigid.bunch_pose(bunch)
     return pose[:3] + frames.rotate(pose[3:], reach)
 
 
-def _top(physics: Physics, bunch: int) -> float:
+def _top_height(physics: Physics, bunch: int) -> float:
     """[m] Height of the highest point that a bunch may reach."""
-    return float(_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
+    return float(_rachis_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 
-def _fall(rigid: Rigid, ticks: int) -> None:
+def _step_rigid(rigid: Rigid, ticks: int) -> None:
     """Let loose things fall, without the plants."""
     for _ in range(ticks):
         rigid.prep()
         rigid.finish()
 
 
-def _apart(rigid: Rigid) -> None:
-    """:class:`NoRoom` if whoever has come stands in somebody or something."""
+def _check_clearance(rigid: Rigid) -> None:
+    """:class:`PlacementError` if whoever has come stands in somebody or something."""
     rigid.prep()
     for names in rigid.overlaps():
         one, other = sorted(names[:2], key=rigid.actors.__contains__, reverse=True)
-        if names[2] > CLEAR and one in rigid.actors:
+        if names[2] > MAX_PENETRATION and one in rigid.actors:
             kind, _, number = other.partition("/")
             if kind == "fixed":
                 other = Organ(int(rigid.model.fixed_organ[int(number)])).name.lower()
-            raise NoRoom(f"{one} stands {100.0 * names[2]:.0f} cm deep in {other}; move one of them")
+            raise PlacementError(f"{one} stands {100.0 * names[2]:.0f} cm deep in {other}; move one of them")

@@ -10,7 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.client.composition.composer import CrateAt, NoRoom, PersonAt, RobotAt, Stage
+from vinesim.client.composition.composer import (
+    CratePlacement,
+    PersonPlacement,
+    PlacementError,
+    RobotPlacement,
+    SceneComposer,
+)
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
 from vinesim.scene import appearance
@@ -18,95 +24,95 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import View
 
-ROBOTS = ("vinebot", "logistic")
-ROOM = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
+ROBOT_NAMES = ("vinebot", "logistic")
+FOOTPRINT_RADIUS = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
 """[m] Radius of the ground that each takes up, arms and hands included."""
-NEAREST, FARTHEST = 0.5, 3.5
+MIN_DISTANCE, MAX_DISTANCE = 0.5, 3.5
 """[m] From below the bunch that is looked at to where somebody stands."""
-HEIGHTS = (0.15, 0.20, 0.24, 0.30)
+CRATE_HEIGHTS = (0.15, 0.20, 0.24, 0.30)
 """Of crates [m]."""
-WINDY = 0.6
+WIND_SHARE = 0.6
 """Share of the lively images in which wind blows."""
-BREEZE = (0.5, 3.5)
+WIND_SPEED = (0.5, 3.5)
 """Mean wind in the canopy [m/s]: GUESSED, calm to a fresh breeze above it."""
-BLOWN = (50, 130)
+WIND_STEPS = (50, 130)
 """[tick] from calm to the picture."""
-_TRIES = 40
+_MAX_TRIES = 40
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Life:
-    """What may happen in an image; see :class:`vinesim.sensors.export.dataset.Life`."""
+class SceneRandomizer:
+    """What may happen in an image; see :class:`vinesim.sensors.export.dataset.SnapshotSource`."""
 
     share: float = 0.4
     """Of the images in which anything does."""
 
     def settings(self) -> dict[str, Any]:
         """All that decides what happens, as JSON."""
-        return {"share": self.share, "robots": list(ROBOTS)}
+        return {"share": self.share, "robots": list(ROBOT_NAMES)}
 
-    def view(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
-        """See :meth:`vinesim.sensors.export.dataset.Life.view`."""
+    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
+        """See :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
         if rng.uniform() >= self.share:
             return None
         bunch = int(rng.integers(len(model.bunch_body)))
-        middle = model.forward(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
-        for _ in range(_TRIES):
-            stage = company(model, middle, rng)
-            physics = Physics(stage.furnished(model))
+        middle = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
+        for _ in range(_MAX_TRIES):
+            stage = random_composition(model, middle, rng)
+            physics = Physics(stage.with_crates(model))
             try:
-                stage.enter(physics)
-            except NoRoom:
+                stage.populate(physics)
+            except PlacementError:
                 continue
-            happens: dict[str, Any] = {"actors": stage.told(model)}
-            if rng.uniform() < WINDY:
-                happens["wind"] = _blow(physics, rng)
+            happens: dict[str, Any] = {"actors": stage.actor_records(model)}
+            if rng.uniform() < WIND_SHARE:
+                happens["wind"] = _simulate_wind(physics, rng)
             return physics.view(), middle, happens
         return None
 
 
-def company(model: Model, middle: np.ndarray, rng: np.random.Generator) -> Stage:
+def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generator) -> SceneComposer:
     """Who is about a point [2] m of the ground: each where there is room, clear of wood and of one another."""
     wood = np.isin(model.fixed_organ, [Organ.POLE, Organ.TRUNK])
     taken = [(spot, 0.12) for spot in model.fixed_start[wood, :2].astype(float)]
-    taken += [(spot, ROOM["crate"]) for spot in model.box_pose[:, :2].astype(float)]
-    kinds = [ROBOTS[rng.integers(len(ROBOTS))] for _ in range(rng.integers(0, 2))]
+    taken += [(spot, FOOTPRINT_RADIUS["crate"]) for spot in model.box_pose[:, :2].astype(float)]
+    kinds = [ROBOT_NAMES[rng.integers(len(ROBOT_NAMES))] for _ in range(rng.integers(0, 2))]
     kinds += ["person"] * int(rng.integers(0, 3)) + ["crate"] * int(rng.integers(0, 3))
     robots, people, crates = [], [], []
     for kind in kinds or ["person"]:
-        spot = _room(middle, taken, ROOM[kind], rng)
+        spot = _free_place(middle, taken, FOOTPRINT_RADIUS[kind], rng)
         yaw = float(rng.uniform(-np.pi, np.pi))
         if spot is None:
             continue
-        taken.append((spot, ROOM[kind]))
+        taken.append((spot, FOOTPRINT_RADIUS[kind]))
         x, y = (round(float(v), 4) for v in spot)
         if kind == "person":
-            posture = appearance.postures()[rng.integers(len(appearance.postures()))]
-            people.append(PersonAt(x, y, round(yaw, 4), posture, round(float(rng.normal(1.72, 0.07)), 3)))
+            posture = appearance.posture_names()[rng.integers(len(appearance.posture_names()))]
+            people.append(PersonPlacement(x, y, round(yaw, 4), posture, round(float(rng.normal(1.72, 0.07)), 3)))
         elif kind == "crate":
             fill = round(float(rng.choice([0.0, rng.uniform(0.1, 0.5)])), 3)
-            crates.append(CrateAt(x, y, round(yaw, 4), fill, (0.6, 0.4, float(rng.choice(HEIGHTS)))))
+            crates.append(CratePlacement(x, y, round(yaw, 4), fill, (0.6, 0.4, float(rng.choice(CRATE_HEIGHTS)))))
         else:
-            robots.append(RobotAt(kind, x, y, round(yaw, 4)))
-    return Stage(tuple(robots), tuple(people), tuple(crates))
+            robots.append(RobotPlacement(kind, x, y, round(yaw, 4)))
+    return SceneComposer(tuple(robots), tuple(people), tuple(crates))
 
 
-def _room(
+def _free_place(
     middle: np.ndarray, taken: list[tuple[np.ndarray, float]], radius: float, rng: np.random.Generator
 ) -> np.ndarray | None:
     """A place [2] m for a disc, at which no other is."""
-    for _ in range(_TRIES):
-        away, around = rng.uniform(NEAREST, FARTHEST), rng.uniform(0.0, 2.0 * np.pi)
+    for _ in range(_MAX_TRIES):
+        away, around = rng.uniform(MIN_DISTANCE, MAX_DISTANCE), rng.uniform(0.0, 2.0 * np.pi)
         spot = middle + away * np.array([np.cos(around), np.sin(around)])
         if all(np.hypot(*(spot - other)) > radius + reach for other, reach in taken):
             return spot
     return None
 
 
-def _blow(physics: Physics, rng: np.random.Generator) -> dict[str, Any]:
+def _simulate_wind(physics: Physics, rng: np.random.Generator) -> dict[str, Any]:
     """Let wind blow for a while; what it was."""
-    speed, heading = float(rng.uniform(*BREEZE)), float(rng.uniform(-np.pi, np.pi))
-    ticks, seed = int(rng.integers(*BLOWN)), int(rng.integers(1 << 31))
+    speed, heading = float(rng.uniform(*WIND_SPEED)), float(rng.uniform(-np.pi, np.pi))
+    ticks, seed = int(rng.integers(*WIND_STEPS)), int(rng.integers(1 << 31))
     mean = np.array([speed * np.cos(heading), speed * np.sin(heading), 0.0])
     physics.wind = Wind(mean, gusts=0.4 * speed, seed=seed)
     for _ in range(ticks):

@@ -194,7 +194,7 @@ class ObjectSync:
                 state.joint_x[body] = x
             state.joint_x[body] += blend * (x - state.joint_x[body])
             state.joint_xd[body] = xd
-        plants.pull(update.tree, update.joint_q, update.joint_qd, blend)
+        plants.blend_towards(update.tree, update.joint_q, update.joint_qd, blend)
 
     # ------------------------------------------------------------------ what is to be said
 
@@ -242,7 +242,7 @@ class ObjectSync:
     @property
     def moving(self) -> list[int]:
         """All that moves: trees that are not asleep, and what does not rest in its parent's frame."""
-        return [*self.physics.sleep.moving.tolist(), *self.physics.riding.moving]
+        return [*self.physics.sleep.restless.tolist(), *self.physics.riding.moving]
 
     def read_state(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """State of a thing, as :meth:`Exchange.send` wants it."""

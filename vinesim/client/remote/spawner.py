@@ -12,13 +12,13 @@ from vinesim.client.humans import RemotePerson, spec_of
 from vinesim.net.codec.messages import Hello, valid_name
 from vinesim.physics.rigid.rigid_world import Draft, Rigid
 from vinesim.robot.description import description as descriptions
-from vinesim.robot.description.description import Description, DescriptionError
+from vinesim.robot.description.description import DescriptionError, RobotDescription
 from vinesim.robot.drives import RemoteRobot
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
 
-Prepared = tuple[Description | None, Draft]
+Prepared = tuple[RobotDescription | None, Draft]
 """A robot's description, or None for a person, and the world with it."""
 
 
@@ -26,7 +26,7 @@ class RemoteSpawner:
     """Who is expected, and how far that is."""
 
     def __init__(
-        self, rigid: Rigid, own: Description | None, executor: concurrent.futures.Executor | None = None
+        self, rigid: Rigid, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
     ) -> None:
         """``own``: a description that needs not be read again, if any; without ``executor`` all is done at once."""
         self.rigid, self.own = rigid, own
@@ -67,7 +67,7 @@ class RemoteSpawner:
         self.cancel(name)
         if description is None or not isinstance(update, RobotUpdate):
             return RemotePerson(self.rigid, name)
-        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, here=True)
+        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, is_in_world=True)
         self.rigid.place(name, update.base_q, update.position)
         return other
 
@@ -87,16 +87,16 @@ class RemoteSpawner:
         description = resolve_description(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
-        return description, self.rigid.prepare(description.spec(hello.name, hello.index, update.base_q))
+        return description, self.rigid.prepare(description.to_spec(hello.name, hello.index, update.base_q))
 
 
-def resolve_description(hello: Hello, own: Description | None) -> Description:
+def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDescription:
     """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
     if own is not None and hello.urdf == own.urdf:
         return own
     name = hello.robot if valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
     try:
-        known = descriptions.load(name)
+        known = descriptions.load_description(name)
         if known.urdf == hello.urdf:
             return known
     except DescriptionError:
@@ -104,4 +104,4 @@ def resolve_description(hello: Hello, own: Description | None) -> Description:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return descriptions.load(file)
+        return descriptions.load_description(file)

@@ -20,8 +20,8 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.sensing.latest_value import LatestValue, poller
 from vinesim.client.sensing.sensor_worker import SensorConfig, StepSnapshot, run_sensor_worker
-from vinesim.client.tasks.tasks import Obey
-from vinesim.robot.description.description import Description
+from vinesim.client.tasks.tasks import RosCommandHandler
+from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives import Robot
 from vinesim.ros import ros_setup
 from vinesim.ros.commands.types import Command
@@ -54,7 +54,7 @@ class SensorProcess:
         name: str,
         scene: Scene,
         model: Model,
-        description: Description,
+        description: RobotDescription,
         *,
         namespace: str = "",
         ros: bool = True,
@@ -71,7 +71,7 @@ class SensorProcess:
         """
         self.name = name
         self._attached = False
-        if ros and (reason := ros_setup.available()) is not None:
+        if ros and (reason := ros_setup.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
         self._ros = ros
@@ -103,7 +103,7 @@ class SensorProcess:
         self._attached = True
         client.post_step.append(self._every_tick)
         if self._ros:
-            client.pre_step.insert(0, Obey(self.robot, self._take_commands))
+            client.pre_step.insert(0, RosCommandHandler(self.robot, self._take_commands))
 
     # ------------------------------------------------------------------ the tick
 

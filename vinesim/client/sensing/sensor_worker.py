@@ -19,7 +19,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.sensing.latest_value import LatestValue, poller
-from vinesim.robot.description.description import Description
+from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -42,7 +42,7 @@ class SensorConfig:
 
     name: str
     model: Model
-    description: Description
+    description: RobotDescription
     sun: SunPath
     namespace: str
     ros: bool
@@ -117,7 +117,7 @@ class SensorWorker:
         from vinesim.ros.node import Node
 
         setup, description = self.setup, self.setup.description
-        fixed = [(p, c, q) for (p, c), q in zip(description.fixed, description.fixed_q, strict=True)]
+        fixed = [(p, c, q) for (p, c), q in zip(description.fixed_frames, description.fixed_poses, strict=True)]
         node = stack.enter_context(
             Node(
                 setup.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=setup.namespace,
@@ -135,7 +135,7 @@ class SensorWorker:
         from vinesim.sensors.camera.camera import Camera, CameraSpec
         from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
         from vinesim.sensors.scene.primitives import Primitives
-        from vinesim.sensors.scheduler import Eyes, Mount, load_kernels
+        from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
 
         load_kernels()
         setup, mounts = self.setup, []
@@ -145,15 +145,15 @@ class SensorWorker:
             camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, quality="fast", seed=seed)
             wanted = self._wanted(place.name, always=setup.keep_pictures and i == 0)
             depth = self._wanted(f"{place.name}/depth", always=setup.keep_pictures and i == 0)
-            mounts.append(Mount(camera, self._deliver_camera, wanted, depth, setup.sensor_hz))
+            mounts.append(ScheduledSensor(camera, self._deliver_camera, wanted, depth, setup.sensor_hz))
         for place in setup.description.lidars:
             lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame, seed=seed)
-            mounts.append(Mount(lidar, self._deliver_lidar, self._wanted(place.name), rate=setup.sensor_hz))
+            mounts.append(ScheduledSensor(lidar, self._deliver_lidar, self._wanted(place.name), rate=setup.sensor_hz))
         primitives = Primitives(setup.model, renderer=setup.renderer)
-        return stack.enter_context(Eyes(setup.model, mounts, primitives=primitives, nice=RENDER_NICE))
+        return stack.enter_context(SensorScheduler(setup.model, mounts, primitives=primitives, nice=RENDER_NICE))
 
     def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:
-        return lambda: always or (self.node is not None and self.node.wanted(name))
+        return lambda: always or (self.node is not None and self.node.has_subscribers(name))
 
     # ------------------------------------------------------------------ running
 
@@ -186,12 +186,12 @@ class SensorWorker:
                 letter.time, letter.tick, self._state.body_q.copy(), self._state.bunch_attached.copy(), self._links,
                 letter.link_q, letter.trees,
             )  # fmt: skip
-            self.eyes.see(view, letter.poses)
+            self.eyes.submit(view, letter.poses)
         if letter.bodies is not None:
             self.pipe.send(("read", (letter.number, letter.links is not None)))
         if self.node is not None:
-            self.node.publish_tick(letter.time, letter.sample)
-            if letter.tick % 10 == 0 and letter.bodies is not None and self.node.wanted("tf_environment"):
+            self.node.publish_robot_state(letter.time, letter.sample)
+            if letter.tick % 10 == 0 and letter.bodies is not None and self.node.has_subscribers("tf_environment"):
                 self._publish_truth(letter.time)
             if commands := self.node.commands():
                 self.pipe.send(("commands", commands))
@@ -209,7 +209,7 @@ class SensorWorker:
     def _figures(self) -> dict[str, Any]:
         figures = {
             "sent": {},
-            "eyes": any(mount.wanted() for mount in self.eyes.mounts),
+            "eyes": any(sensor.is_wanted() for sensor in self.eyes.sensors),
             "frames": dict(self.eyes.frames),
             "frames_dropped": dict(self.eyes.dropped),
         }
@@ -217,7 +217,7 @@ class SensorWorker:
             figures |= {
                 "sent": self.node.sent,
                 "ros_dropped": self.node.dropped,
-                "truth": self.node.wanted("tf_environment"),
+                "truth": self.node.has_subscribers("tf_environment"),
             }
         return figures
 
@@ -237,6 +237,6 @@ class SensorWorker:
         if self._kept is not None:
             from vinesim.sensors.export import images
 
-            images.save(self._kept, folder, "")
+            images.save_frame(self._kept, folder, "")
         self.pipe.send(("figures", self._figures()))
         self.pipe.send(("saved", None))

@@ -10,23 +10,23 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Spawn
 
-REACH = (0.35, 0.85)
+PUSH_REACH = (0.35, 0.85)
 """How far a bunch may be ahead of a robot's base to be pushed by an arm [m]."""
-HEIGHT = (1.2, 1.75)
+PUSH_HEIGHT = (1.2, 1.75)
 """Height of a bunch's centre that an arm reaches [m]."""
 
 
-ROOM = 0.55
+BASE_CLEARANCE = 0.55
 """A robot's base needs this much around its middle [m]."""
 
 
-QUEUE = 1.5
+QUEUE_SPACING = 1.5
 """Between robots of one client that wait behind one another [m]."""
-CANDIDATES = 200
+MAX_CANDIDATES = 200
 """So many of the nearest bunches are tried."""
 
 
-class NoPlace(ValueError):
+class PlacementError(ValueError):
     """A start place or a bunch that the scene does not have; the text says what it has."""
 
 
@@ -36,54 +36,59 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
         return frames.pose([-2.0 - back, 1.5 * number, 0.0])
     if number >= len(scene.spawns):
         known = ", ".join(f"{i} {spawn.name}" for i, spawn in enumerate(scene.spawns))
-        raise NoPlace(f"scene {scene.name!r} has no start place {number}; it has: {known}")
+        raise PlacementError(f"scene {scene.name!r} has no start place {number}; it has: {known}")
     spawn = scene.spawns[number]
     ahead = np.array([np.cos(spawn.yaw), np.sin(spawn.yaw), 0.0])
-    return frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.yaw(spawn.yaw))
+    return frames.pose(np.array([spawn.x, spawn.y, 0.0]) - back * ahead, frames.from_yaw(spawn.yaw))
 
 
 def start_pose(scene: Scene, number: int, back: float = 0.0, queue: int = 0) -> np.ndarray:
     """Pose [7] of the ``queue``-th robot of a client: the next start places, then in line behind the first ones."""
     lap, place = divmod(number + queue, max(len(scene.spawns), 1)) if queue else (0, number)
-    return spawn_pose(scene, place, back + QUEUE * lap)
+    return spawn_pose(scene, place, back + QUEUE_SPACING * lap)
 
 
-def placed(scene: Scene, x: float, y: float, yaw: float) -> Scene:
+def with_start_pose(scene: Scene, x: float, y: float, yaw: float) -> Scene:
     """The same scene with one start place, at (x, y) [m] with ``yaw`` [rad]."""
     return msgspec.structs.replace(scene, spawns=(Spawn(name="given", x=x, y=y, yaw=yaw),))
 
 
 def bunch_centres(model: Model) -> np.ndarray:
     """Centres of all bunches at rest [bunch, 3] m."""
-    body_q = model.forward(model.joint_settled)[model.bunch_body]
+    body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     return body_q[:, :3] + 0.5 * model.bunch_length[:, None] * axis
 
 
-def bunch_in_reach(model: Model, pose: np.ndarray) -> int:
+def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
     """The bunch that an arm reaches best from a base at ``pose`` [7]: in front, at arm's height, nearest to 0.6 m."""
     local = frames.rotate(frames.conjugate(pose[3:]), bunch_centres(model) - pose[:3])
     distance = np.hypot(local[:, 0], local[:, 1])
     sideways = np.abs(np.arctan2(local[:, 1], local[:, 0]))
-    fits = (distance > REACH[0]) & (distance < REACH[1]) & (local[:, 2] > HEIGHT[0]) & (local[:, 2] < HEIGHT[1])
+    fits = (
+        (distance > PUSH_REACH[0])
+        & (distance < PUSH_REACH[1])
+        & (local[:, 2] > PUSH_HEIGHT[0])
+        & (local[:, 2] < PUSH_HEIGHT[1])
+    )
     fits &= sideways < 0.7
     if not fits.any():
         x, y = pose[:2]
-        raise NoPlace(
-            f"no bunch within reach of a robot at ({x:.2f}, {y:.2f}): none {REACH[0]} to {REACH[1]} m ahead "
-            f"at {HEIGHT[0]} to {HEIGHT[1]} m height; choose another start place or seed"
+        raise PlacementError(
+            f"no bunch within reach of a robot at ({x:.2f}, {y:.2f}): none {PUSH_REACH[0]} to {PUSH_REACH[1]} m ahead "
+            f"at {PUSH_HEIGHT[0]} to {PUSH_HEIGHT[1]} m height; choose another start place or seed"
         )
     return int(np.argmin(np.where(fits, np.abs(distance - 0.6) + 0.2 * sideways, np.inf)))
 
 
-def checked_bunch(model: Model, bunch: int | None) -> int | None:
+def validate_bunch(model: Model, bunch: int | None) -> int | None:
     """The bunch, if the vineyard has it."""
     if bunch is not None and not 0 <= bunch < len(model.bunch_body):
-        raise NoPlace(f"no bunch {bunch}: this vineyard has 0 to {len(model.bunch_body) - 1}")
+        raise PlacementError(f"no bunch {bunch}: this vineyard has 0 to {len(model.bunch_body) - 1}")
     return bunch
 
 
-def free_room(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
+def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
     """Distance on the ground from points [n, 2] to the nearest post, trunk or box [n] m (infinite if there is none).
 
     ``without``: a box that does not count.
@@ -101,27 +106,27 @@ def free_room(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndar
     return room
 
 
-def stand_before_a_bunch(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
+def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
     """A bunch that an arm can push, and a pose [7] of a base before it with room around; nearest to ``near`` [2]."""
     centres = bunch_centres(model)
-    high = np.flatnonzero((centres[:, 2] > HEIGHT[0]) & (centres[:, 2] < HEIGHT[1]))
-    high = high[np.argsort(np.linalg.norm(centres[high, :2] - near, axis=1), kind="stable")][:CANDIDATES]
+    high = np.flatnonzero((centres[:, 2] > PUSH_HEIGHT[0]) & (centres[:, 2] < PUSH_HEIGHT[1]))
+    high = high[np.argsort(np.linalg.norm(centres[high, :2] - near, axis=1), kind="stable")][:MAX_CANDIDATES]
     centres = centres[high]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     ahead = np.stack([np.cos(heading), np.sin(heading)], -1)
     places = centres[:, None, :2] - 0.6 * ahead
-    fits = (free_room(model, places.reshape(-1, 2)) > ROOM).reshape(places.shape[:2])
+    fits = (ground_clearance(model, places.reshape(-1, 2)) > BASE_CLEARANCE).reshape(places.shape[:2])
     if not fits.any():
-        raise NoPlace(
-            f"no bunch of this vineyard can be pushed: none hangs {HEIGHT[0]} to {HEIGHT[1]} m high with {ROOM} m of "
+        raise PlacementError(
+            f"no bunch of this vineyard can be pushed: none hangs {PUSH_HEIGHT[0]} to {PUSH_HEIGHT[1]} m high with {BASE_CLEARANCE} m of "
             "room for a robot before it; choose another scene or seed"
         )
     distance = np.where(fits, np.linalg.norm(places - near, axis=-1), np.inf)
     bunch, turn = np.unravel_index(int(np.argmin(distance)), distance.shape)
-    return int(high[bunch]), frames.pose(np.append(places[bunch, turn], 0.0), frames.yaw(heading[turn]))
+    return int(high[bunch]), frames.pose(np.append(places[bunch, turn], 0.0), frames.from_yaw(heading[turn]))
 
 
-def way_to(model: Model, place: np.ndarray, length: float) -> np.ndarray:
+def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.ndarray:
     """A pose [7] 1.6 m from a robot at ``place`` [7], where a straight free way of ``length`` [m] ends."""
     heading = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     best, most = place, -np.inf
@@ -130,7 +135,9 @@ def way_to(model: Model, place: np.ndarray, length: float) -> np.ndarray:
         for angle in heading:
             back = np.array([np.cos(angle), np.sin(angle)])
             way = goal - np.linspace(0.0, length, 40)[:, None] * back
-            room = min(float(free_room(model, way).min()), float(np.linalg.norm(way - place[:2], axis=1).min()) - 0.6)
+            room = min(
+                float(ground_clearance(model, way).min()), float(np.linalg.norm(way - place[:2], axis=1).min()) - 0.6
+            )
             if room > most:
-                best, most = frames.pose(np.append(goal, 0.0), frames.yaw(angle)), room
+                best, most = frames.pose(np.append(goal, 0.0), frames.from_yaw(angle)), room
     return best

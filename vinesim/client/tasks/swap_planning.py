@@ -5,54 +5,59 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.tasks.pick_planning import way
-from vinesim.client.tasks.start_poses import NoPlace, free_room
+from vinesim.client.tasks.pick_planning import find_path
+from vinesim.client.tasks.start_poses import PlacementError, ground_clearance
 from vinesim.physics.step import Physics
-from vinesim.robot.tasks.swap_boxes import Swap
+from vinesim.robot.tasks.swap_boxes import SwapPlan
 from vinesim.scene.model import Model
 
-ROOM = 0.92
+TURNING_RADIUS = 0.92
 """A carrier with a box at either end needs this much around its middle to turn [m]."""
-BEFORE = (1.20, 1.35, 1.50)
+TURNING_DISTANCES = (1.20, 1.35, 1.50)
 """It turns so far from the middle of a box [m]; the first that has room."""
-LANE = 0.40
+LANE_HALF_WIDTH = 0.40
 """What it needs on either side of its middle as it goes straight [m]."""
-LAYER = 6
+BUNCHES_PER_LAYER = 6
 """Bunches that lie side by side in a box."""
 
 
-def swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> Swap:
-    """Exchange two boxes, from a base at ``start`` [7]; :class:`NoPlace` if there is no room for it."""
+def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> SwapPlan:
+    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room for it."""
     if max(full, empty) >= len(model.box_pose):
-        raise NoPlace(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
+        raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
     here, legs = start[:2], []
     for box in (empty, full):
-        ways = [way(model, here, place, ROOM) for place in _before(model, box)]
+        ways = [find_path(model, here, place, TURNING_RADIUS) for place in _turning_places(model, box)]
         ways = [points for points in ways if points is not None]
         if not ways:
-            raise NoPlace(f"no way for a carrier to turn before box {box}: it needs {ROOM} m around it; move the box")
+            raise PlacementError(
+                f"no way for a carrier to turn before box {box}: it needs {TURNING_RADIUS} m around it; move the box"
+            )
         shortest = min(ways, key=lambda points: float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
         legs.append(shortest[1:])
         here = shortest[-1]
-    return Swap(start, full, empty, *legs)
+    return SwapPlan(start, full, empty, *legs)
 
 
-def _before(model: Model, box: int) -> list[np.ndarray]:
+def _turning_places(model: Model, box: int) -> list[np.ndarray]:
     """Places [2] m straight before the long sides of a box, with room to turn and a free lane to the box."""
     pose, size = model.box_pose[box].astype(float), model.box_size[box].astype(float)
     across = np.array([0.0, 1.0, 0.0]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.0])
     normal, places = frames.rotate(pose[3:], across)[:2], []
     for side in (1.0, -1.0):
-        for far in BEFORE:
+        for far in TURNING_DISTANCES:
             place = pose[:2] + far * side * normal
             lane = pose[:2] + np.linspace(0.1, far, 12)[:, None] * side * normal
-            if free_room(model, place[None])[0] > ROOM and free_room(model, lane, without=box).min() > LANE:
+            if (
+                ground_clearance(model, place[None])[0] > TURNING_RADIUS
+                and ground_clearance(model, lane, without=box).min() > LANE_HALF_WIDTH
+            ):
                 places.append(place)
                 break
     return places
 
 
-def fill(physics: Physics, box: int, count: int = 6) -> None:
+def fill_box(physics: Physics, box: int, count: int = 6) -> None:
     """Take ``count`` bunches off their vines and lay them into a box, in layers: a full box to begin with.
 
     Between ticks. The bunches farthest from the box are taken, so that those around it still hang.
@@ -62,14 +67,14 @@ def fill(physics: Physics, box: int, count: int = 6) -> None:
     apart = np.linalg.norm(physics.state.body_q[model.bunch_body, :2] - pose[:2], axis=1)
     attached = np.flatnonzero(physics.state.bunch_attached)
     chosen = attached[np.argsort(-apart[attached], kind="stable")][:count]
-    columns = LAYER // 2
+    columns = BUNCHES_PER_LAYER // 2
     for i, bunch in enumerate(chosen.tolist()):
-        layer, place = divmod(i, LAYER)
+        layer, place = divmod(i, BUNCHES_PER_LAYER)
         column, row = place % columns, place // columns
         x = (column - 0.5 * (columns - 1)) * (size[0] - 0.04) / columns
         y = (row - 0.5) * 0.5 * (size[1] - 0.04)
         # each lies along y, its middle at (x, y)
         start = np.array([x, y - 0.5 * float(model.bunch_length[bunch]), 0.10 + 0.14 * layer])
         physics.pick(bunch)
-        turned = frames.pose(start, frames.yaw(0.5 * np.pi))
+        turned = frames.pose(start, frames.from_yaw(0.5 * np.pi))
         physics.rigid.place_bunch(bunch, frames.compose(pose, turned), np.zeros(6))

@@ -13,68 +13,68 @@ from vinesim.client.tasks import pick_planning, swap_planning
 from vinesim.physics.step import Physics
 from vinesim.robot.control.trajectory_controller import Trajectory, TrajectoryController
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.pick import Pick
-from vinesim.robot.tasks.swap_boxes import Exchange, Swap
-from vinesim.robot.tasks.task import Script
+from vinesim.robot.tasks.pick import PickBunch
+from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
+from vinesim.robot.tasks.task import Task
 from vinesim.ros.commands.types import BaseVelocity, Command, JointPositions
 from vinesim.scene.model import Model
 
 log = logging.getLogger(__name__)
 
 
-JOBS = ("pick", "exchange")
-"""What :func:`plan_job` knows."""
+TASKS = ("pick", "exchange")
+"""What :func:`plan_task` knows."""
 
 
-class UnknownJob(ValueError):
+class UnknownTask(ValueError):
     """A job that no robot here knows; the text says which it knows."""
 
 
-def checked_job(job: str | None) -> str | None:
+def validate_task_name(job: str | None) -> str | None:
     """The job, if there is one of that name."""
-    if job is not None and job not in JOBS:
-        raise UnknownJob(f"no job {job!r}; give {' or '.join(JOBS)}")
+    if job is not None and job not in TASKS:
+        raise UnknownTask(f"no job {job!r}; give {' or '.join(TASKS)}")
     return job
 
 
-def plan_job(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Script], np.ndarray]:
+def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
     """How to begin a job once physics and robot are there, and the pose [7] where the robot starts.
 
     ``near`` [7]: where it would be otherwise. Planning takes a second or two: not for the tick.
     """
-    if checked_job(job) == "pick":
-        task = next(pick_planning.tasks(model, near[:2]))
-        return functools.partial(Pick, task=task), task.stand
-    boxes = swap_planning.swap(model, near)
-    return functools.partial(_exchange, swap=boxes), near
+    if validate_task_name(job) == "pick":
+        task = next(pick_planning.plan_picks(model, near[:2]))
+        return functools.partial(PickBunch, plan=task), task.base_pose
+    boxes = swap_planning.plan_swap(model, near)
+    return functools.partial(_begin_swap, swap=boxes), near
 
 
-def _exchange(physics: Physics, robot: Robot, swap: Swap) -> Exchange:
+def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
     """Fill the box that is to be full, and exchange it."""
-    swap_planning.fill(physics, swap.full)
-    return Exchange(physics, robot, swap)
+    swap_planning.fill_box(physics, swap.full_box)
+    return SwapBoxes(physics, robot, swap)
 
 
 class DriveTo:
     """Drive the base to a place that lies about straight ahead, and stop there."""
 
-    ARRIVED = 0.05
+    POSITION_TOLERANCE = 0.05
     """This near is there [m]."""
 
     def __init__(self, robot: Robot, place: np.ndarray, *, speed: float = 1.2) -> None:
         """``place`` [7]: pose of the base in the world."""
         self.robot, self.speed = robot, speed
-        self.done = False
+        self.is_done = False
         self._place = np.asarray(place, float)[:2]
 
     def __call__(self, time: float) -> None:
-        if self.done:
+        if self.is_done:
             return
         base, _ = self.robot.rigid.base(self.robot.name)
         way = frames.rotate(frames.conjugate(base[3:]), np.append(self._place - base[:2], 0.0))
         distance = float(np.hypot(way[0], way[1]))
-        if distance < self.ARRIVED or way[0] < 0.0:
-            self.done = True
+        if distance < self.POSITION_TOLERANCE or way[0] < 0.0:
+            self.is_done = True
             self.robot.command_base(0.0, 0.0, time)
             return
         turn = float(np.arctan2(way[1], way[0]))
@@ -93,7 +93,9 @@ class LookAt:
         """``point`` gives the place to look at [3] m in the world. Does nothing without a head and a camera on it."""
         description = robot.description
         self.robot, self.point = robot, point
-        self._joints = description.indices("head") if "head" in description.groups and description.cameras else None
+        self._joints = (
+            description.joint_indices("head") if "head" in description.groups and description.cameras else None
+        )
         self._camera = description.cameras[0].frame if description.cameras else ""
         self._tick = 0
 
@@ -111,13 +113,13 @@ class LookAt:
         robot.command_position(robot.setpoint[self._joints] + self.EVERY * robot.rigid.dt * rate, self._joints)
 
 
-class Obey:
+class RosCommandHandler:
     """Do what ROS asks: drive the base, hold joint positions, follow trajectories (straight between their points)."""
 
     def __init__(self, robot: Robot, commands: Callable[[], Iterable[Command]]) -> None:
         """``commands`` returns what was asked since the last call."""
         self.robot = robot
-        self.refused = 0
+        self.rejected_count = 0
         """Commands that no joint of this robot can take."""
         self._commands = commands
         self._controllers: dict[str, TrajectoryController] = {}
@@ -125,15 +127,15 @@ class Obey:
     def __call__(self, time: float) -> None:
         for command in self._commands():
             try:
-                self._take(command, time)
+                self._apply(command, time)
             except CommandError as error:
-                self.refused += 1
-                if self.refused == 1:
+                self.rejected_count += 1
+                if self.rejected_count == 1:
                     log.warning("refused a command, further ones are only counted: %s", error)
         for controller in self._controllers.values():
             controller(time)
 
-    def _take(self, command: Command, time: float) -> None:
+    def _apply(self, command: Command, time: float) -> None:
         robot = self.robot
         if isinstance(command, BaseVelocity):
             robot.command_base(float(command.linear[0]), float(command.angular[2]), time)
@@ -146,7 +148,7 @@ class Obey:
                 self._controllers[command.controller] = TrajectoryController(robot, robot.description.joints)
             controller = self._controllers[command.controller]
             if len(command.times):
-                way = Trajectory(command.joints, command.times, command.positions, start=command.time)
+                way = Trajectory(command.joints, command.times, command.positions, start_time=command.time)
                 controller.start(way, time)
             else:
                 controller.cancel()

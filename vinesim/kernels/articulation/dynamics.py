@@ -44,17 +44,17 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-AIR = wp.constant(1.2)
+AIR_DENSITY = wp.constant(1.2)
 """[kg/m^3] density of air at 20 degrees"""
 
-WILD = wp.constant(0.1)
+STICKY_ON = wp.constant(0.1)
 """Share of ``limit``: a tree with phi = 1 of which a joint turns faster keeps it, until all are ``CALM``. Thrown, a limp
 thread under a heavy load gains energy at any other phi: going back and forth it would thrash for ever."""
 
-CALM = wp.constant(0.06)
+STICKY_OFF = wp.constant(0.06)
 """Share of ``limit`` below which all joints of a wild tree must turn for a second."""
 
-TOUCHED = wp.constant(4)
+STICKY_COUNT = wp.constant(4)
 """[tick] A count above this is a wild tree's; a touch begins with less."""
 
 
@@ -88,7 +88,7 @@ def logarithm(q: wp.quat):
 
 
 @wp.func
-def turned(frame: wp.mat33, v: wp.vec3):
+def rotated_diagonal(frame: wp.mat33, v: wp.vec3):
     """The matrix that is diag(v) in the axes of frame (its columns): frame diag(v) frame^T."""
     x = wp.vec3(frame[0, 0], frame[1, 0], frame[2, 0])
     y = wp.vec3(frame[0, 1], frame[1, 1], frame[2, 1])
@@ -96,13 +96,13 @@ def turned(frame: wp.mat33, v: wp.vec3):
 
 
 @wp.func
-def crossed(A: wp.mat33, d: wp.vec3):
+def cross_rows(A: wp.mat33, d: wp.vec3):
     """A [d]x: every row of A crossed with d."""
     return wp.matrix_from_rows(wp.cross(A[0], d), wp.cross(A[1], d), wp.cross(A[2], d))
 
 
 @wp.func
-def taut(lever: wp.vec3, force: wp.vec3):
+def tension_stiffness(lever: wp.vec3, force: wp.vec3):
     """Stiffness [N m/rad] against turning that a steady force lends to a lever it draws out; none if it pushes."""
     pull = wp.dot(lever, force)
     stiffness = wp.mat33()
@@ -113,23 +113,23 @@ def taut(lever: wp.vec3, force: wp.vec3):
 
 
 @wp.func
-def across(lever: wp.vec3, force: wp.vec3):
+def shear_stiffness(lever: wp.vec3, force: wp.vec3):
     """What :func:`taut` leaves out of the symmetric part of (d.F) 1 - d F^T: what pushes, and what pulls across."""
     return (
         wp.dot(lever, force) * wp.identity(n=3, dtype=float)
         - 0.5 * (wp.outer(lever, force) + wp.outer(force, lever))
-        - taut(lever, force)
+        - tension_stiffness(lever, force)
     )
 
 
 @wp.func
-def borne(frame: wp.mat33, stiffness: wp.vec3, q: wp.quat, share: float):
+def spring_moment(frame: wp.mat33, stiffness: wp.vec3, q: wp.quat, share: float):
     """A share of the moment that a spring bears, in world axes."""
     return share * (frame * wp.cw_mul(stiffness, logarithm(q)))
 
 
 @wp.func
-def couple(
+def couple_bending_and_twist(
     k: int,
     parent: int,
     reach: float,
@@ -148,10 +148,10 @@ def couple(
     alpha x moment of a parent's acceleration alpha, and its own asks as much of the parent (DJ knows of the first).
     """
     H_more = wp.skew(-moment) * DH[k]
-    H_arm = crossed(H_more, lever[k])
+    H_arm = cross_rows(H_more, lever[k])
     J_out[parent] = (
         J_out[parent]
-        + reach * across(lever[k], drawn[k])
+        + reach * shear_stiffness(lever[k], drawn[k])
         + wp.skew(-moment) * DJ[k]
         + wp.skew(moment)
         - H_arm
@@ -163,15 +163,15 @@ def couple(
 
 
 @wp.func
-def at_lever(mass: float, lever: wp.vec3):
+def point_mass_inertia(mass: float, lever: wp.vec3):
     """Moment of inertia about the origin [kg m^2] of a point mass at a lever."""
     return mass * (wp.dot(lever, lever) * wp.identity(n=3, dtype=float) - wp.outer(lever, lever))
 
 
 @wp.func
-def tensor(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
+def world_inertia(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
     """Inertia in world axes from its diagonal and its entries yz, zx, xy in the body's axes."""
-    inertia = turned(rotation, moments)
+    inertia = rotated_diagonal(rotation, moments)
     if wp.length_sq(products) > 0.0:
         mixed = wp.mat33(
             0.0, products[2], products[1], products[2], 0.0, products[0], products[1], products[0], 0.0
@@ -181,19 +181,19 @@ def tensor(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
 
 
 @wp.func
-def remaining(damping: float, stiffness: float, phi: float, dt: float):
+def residual_damping(damping: float, stiffness: float, phi: float, dt: float):
     """Damper that is left to add when the scheme damps a spring as if beta were larger by (2 phi - 1) dt."""
     return wp.max(damping - (2.0 * phi - 1.0) * dt * stiffness, 0.0)
 
 
 @wp.func
-def tied(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3, phi: float, dt: float):
+def tie_force(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3, phi: float, dt: float):
     """Force [N] of a tie whose point moves on at its present speed; ``damping`` is the remaining one."""
     return -stiffness * (stretch + phi * dt * speed) - damping * speed
 
 
 @wp.func
-def tie(
+def add_tie(
     k: int,
     at: wp.vec3,
     anchor: wp.vec3,
@@ -212,11 +212,13 @@ def tie(
     """Tie one body at a point: spring and damper as a mass there, and what they pull."""
     omega = wp.spatial_bottom(motion)
     stretch = wp.transform_get_translation(pose) + at - anchor
-    damper = remaining(damping, stiffness, phi, dt)
+    damper = residual_damping(damping, stiffness, phi, dt)
     grip = phi * dt * (phi * dt * stiffness + damper)
     swing = wp.cross(omega, at)
-    hold = tied(stiffness, damper, stretch, wp.spatial_top(motion) + swing, phi, dt) - grip * wp.cross(omega, swing)
-    J_out[k] = J_out[k] + at_lever(grip, at)
+    hold = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing, phi, dt) - grip * wp.cross(
+        omega, swing
+    )
+    J_out[k] = J_out[k] + point_mass_inertia(grip, at)
     H_out[k] = H_out[k] + grip * wp.skew(at)
     M_out[k] = M_out[k] + grip * wp.identity(n=3, dtype=float)
     bias_out[k] = bias_out[k] + wp.spatial_vector(-hold, -wp.cross(at, hold))
@@ -224,13 +226,13 @@ def tie(
 
 
 @wp.func
-def blown(area: float, wind: wp.vec3):
+def drag_coefficient(area: float, wind: wp.vec3):
     """Drag [N s/m] per relative speed, of a drag area Cd A [m^2] in a wind relative to it."""
-    return 0.5 * AIR * area * wp.length(wind)
+    return 0.5 * AIR_DENSITY * area * wp.length(wind)
 
 
 @wp.func
-def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int, pitch: int):
+def max_joint_rate(rates: wp.array(dtype=wp.vec3), first: int, size: int, pitch: int):
     """Fastest of some joint rates [rad/s]; NaN enters, and stays. (A function, since an adjoint does not repeat the
     loops of its kernel before it goes back, but calls functions.)
     """
@@ -243,7 +245,7 @@ def fastest(rates: wp.array(dtype=wp.vec3), first: int, size: int, pitch: int):
 
 
 @wp.func
-def fleeing(
+def max_root_speed(
     places: wp.array(dtype=wp.vec3),
     speeds: wp.array(dtype=wp.vec3),
     body_parent: wp.array(dtype=wp.int32),
@@ -263,7 +265,7 @@ def fleeing(
 
 
 @wp.kernel
-def place(
+def forward_kinematics(
     # model
     pitch: int,
     tree_first: wp.array(dtype=wp.int32),
@@ -306,7 +308,7 @@ def place(
 
 
 @wp.kernel
-def free(
+def predict(
     # model
     dt: float,
     brisk: float,
@@ -371,7 +373,7 @@ def free(
 
     # outward: poses and velocities at the start of the tick, each body's own inertia and bias
     phi = tree_phi[tree]
-    if fastest(joint_qd, first, size, pitch) > brisk or tree_onset[tree] > 0:
+    if max_joint_rate(joint_qd, first, size, pitch) > brisk or tree_onset[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
     ahead = tension * (1.0 - phi) * dt
@@ -402,7 +404,7 @@ def free(
         mass = body_mass[k]
         rotation = wp.quat_to_matrix(pose)
         com = rotation * body_com[k]
-        inertia = tensor(rotation, body_inertia[k], body_product[k])
+        inertia = world_inertia(rotation, body_inertia[k], body_product[k])
         load = body_load[k]
         slip = wp.cross(omega, com)
         drag = dt * wp.max(wp.length_sq(omega) - brisk * brisk, 0.0)
@@ -424,24 +426,24 @@ def free(
         )
         bias_out[k] = wp.spatial_vector(force, moment) - load
         drawn_out[k] = drawing + wp.spatial_top(load) + wp.spatial_top(body_wrench[k])
-        J_out[k] = burden * (inertia + at_lever(mass, com)) + reach * taut(com, drawing)
+        J_out[k] = burden * (inertia + point_mass_inertia(mass, com)) + reach * tension_stiffness(com, drawing)
         H_out[k] = burden * mass * wp.skew(com)
         M_out[k] = burden * mass * wp.identity(n=3, dtype=float)
 
         if keeping:
-            J_out[k] = J_out[k] + reach * across(com, drawing)
+            J_out[k] = J_out[k] + reach * shear_stiffness(com, drawing)
         area = body_drag[k]
         if area > 0.0:
             wind = tree_air[tree] - velocity - slip
-            c = blown(area, wind)
-            J_out[k] = J_out[k] + at_lever(dt * c, com) + reach * taut(com, c * wind)
+            c = drag_coefficient(area, wind)
+            J_out[k] = J_out[k] + point_mass_inertia(dt * c, com) + reach * tension_stiffness(com, c * wind)
             H_out[k] = H_out[k] + dt * c * wp.skew(com)
             M_out[k] = M_out[k] + dt * c * wp.identity(n=3, dtype=float)
             bias_out[k] = bias_out[k] + wp.spatial_vector(-c * wind, -c * wp.cross(com + ahead * slip, wind))
             drawn_out[k] = drawn_out[k] + c * wind
         ties = tie_span[k]
         for t in range(ties[0], ties[1]):
-            tie(
+            add_tie(
                 k, rotation * tie_point[t], tie_anchor[t], tie_stiffness[t], tie_damping[t], phi, dt, body_q_out[k],
                 body_qd_out[k], J_out, H_out, M_out, bias_out, drawn_out,
             )  # fmt: skip
@@ -457,7 +459,7 @@ def free(
         stiffness = joint_stiffness[k]
         artificial = (2.0 * phi - 1.0) * dt  # [s] the scheme damps as if beta were larger by this
         damping = wp.max(joint_damping[k] - artificial * stiffness, wp.vec3())
-        metric = turned(frame, phi * dt * (phi * dt * stiffness + damping))
+        metric = rotated_diagonal(frame, phi * dt * (phi * dt * stiffness + damping))
         rate = joint_qd[k]
         spring = wp.cw_mul(stiffness, logarithm(joint_q[k]) + phi * dt * rate) + wp.cw_mul(damping, rate)
         bias = bias_out[k]
@@ -468,11 +470,11 @@ def free(
         u = metric * wp.cross(turning, wp.spatial_bottom(body_qd_out[k])) - frame * spring - wp.spatial_bottom(bias)
         if keeping:
             turns = turning + wp.spatial_bottom(body_qd_out[k])
-            u = u - wp.cross(turns, borne(frame, stiffness, joint_q[k], 0.5 * ahead))
+            u = u - wp.cross(turns, spring_moment(frame, stiffness, joint_q[k], 0.5 * ahead))
         D = wp.inverse(J + metric)
         DJ = D * J
         if keeping and parent >= 0:
-            DJ = DJ - crossed(D, borne(frame, stiffness, joint_q[k], 0.5 * reach))
+            DJ = DJ - cross_rows(D, spring_moment(frame, stiffness, joint_q[k], 0.5 * reach))
         DH = D * H
         Du = D * u
         D_out[k] = D
@@ -489,13 +491,13 @@ def free(
             moment = wp.spatial_bottom(bias) + J * Du + H_left * centripetal + wp.cross(lever, force)
             drawn = drawn_out[k]
             drawn_out[parent] = drawn_out[parent] + drawn
-            M_arm = wp.transpose(crossed(M_left, lever))
-            H_arm = crossed(H_left, lever)
+            M_arm = wp.transpose(cross_rows(M_left, lever))
+            H_arm = cross_rows(H_left, lever)
             J_out[parent] = (
                 J_out[parent]
-                + reach * taut(lever, drawn)
+                + reach * tension_stiffness(lever, drawn)
                 + J_left
-                + crossed(M_arm, lever)
+                + cross_rows(M_arm, lever)
                 - H_arm
                 - wp.transpose(H_arm)
             )
@@ -505,8 +507,8 @@ def free(
                 force, moment - ahead * wp.cross(wp.cross(turning, lever), drawn)
             )
             if keeping:
-                couple(
-                    k, parent, reach, borne(frame, stiffness, joint_q[k], 0.5 * reach), centripetal, lever_out, drawn_out,
+                couple_bending_and_twist(
+                    k, parent, reach, spring_moment(frame, stiffness, joint_q[k], 0.5 * reach), centripetal, lever_out, drawn_out,
                     DJ_out, DH_out, Du_out, J_out, H_out, bias_out,
                 )  # fmt: skip
         else:
@@ -543,7 +545,7 @@ def free(
 
 
 @wp.kernel
-def response(
+def impulse_response(
     # model
     pitch: int,
     tree_first: wp.array(dtype=wp.int32),
@@ -649,7 +651,7 @@ def response(
 
 
 @wp.kernel
-def push(
+def apply_wrenches(
     # model
     dt: float,
     pitch: int,
@@ -743,12 +745,14 @@ def integrate(
         return
     first = tree_first[tree]
     size = tree_moving[tree]
-    turning = fastest(joint_qd_free, first, size, pitch)
-    most = wp.length(wp.vec2(turning, fleeing(joint_x, joint_xd_free, body_parent, body_root, first, size, pitch)))
+    turning = max_joint_rate(joint_qd_free, first, size, pitch)
+    most = wp.length(
+        wp.vec2(turning, max_root_speed(joint_x, joint_xd_free, body_parent, body_root, first, size, pitch))
+    )
     tree_rate_out[tree] = most
     onset = wp.max(tree_onset_out[tree] - 1, 0)
     phi = tree_phi[tree]
-    if (phi == 1.0 and turning > WILD * limit) or (onset > TOUCHED and turning > CALM * limit):
+    if (phi == 1.0 and turning > STICKY_ON * limit) or (onset > STICKY_COUNT and turning > STICKY_OFF * limit):
         onset = wp.max(onset, int(1.0 / dt))
     tree_onset_out[tree] = onset
     sound = most <= bound
@@ -778,7 +782,7 @@ def integrate(
 
 
 @wp.func
-def held(
+def tie_and_drag_wrench(
     k: int,
     dt: float,
     phi: float,
@@ -804,17 +808,17 @@ def held(
     if area > 0.0:
         com = wp.quat_rotate(wp.transform_get_rotation(pose), body_com[k])
         wind = air - velocity - wp.cross(omega, com)
-        force = blown(area, wind) * (wind - dt * (a + wp.cross(alpha, com)))
+        force = drag_coefficient(area, wind) * (wind - dt * (a + wp.cross(alpha, com)))
         wrench += wp.spatial_vector(force, wp.cross(com, force))
     ties = tie_span[k]
     for t in range(ties[0], ties[1]):
         at = wp.quat_rotate(wp.transform_get_rotation(pose), tie_point[t])
         stretch = wp.transform_get_translation(pose) + at - tie_anchor[t]
         tie = tie_stiffness[t]
-        damper = remaining(tie_damping[t], tie, phi, dt)
+        damper = residual_damping(tie_damping[t], tie, phi, dt)
         grip = phi * dt * (phi * dt * tie + damper)
         swing = wp.cross(omega, at)
-        force = tied(tie, damper, stretch, velocity + swing, phi, dt)
+        force = tie_force(tie, damper, stretch, velocity + swing, phi, dt)
         force = force - grip * (a + wp.cross(alpha, at) + wp.cross(omega, swing))
         wrench += wp.spatial_vector(force, wp.cross(at, force))
     return wrench
@@ -832,7 +836,7 @@ def least_change(inertia: wp.mat33, momentum: wp.vec3, missing: wp.vec3, dt: flo
 
 
 @wp.kernel
-def conserve(
+def correct_floating_momentum(
     # model
     dt: float,
     limit: float,
@@ -908,14 +912,14 @@ def conserve(
             com = rotation * body_com[k]
             momentum = body_mass[k] * (velocity + wp.cross(omega, com))
             given = body_load[k] + body_wrench[k]
-            given += held(
+            given += tie_and_drag_wrench(
                 k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_span, tie_point, tie_anchor,
                 tie_stiffness, tie_damping, pose, body_qd[k], body_acceleration[k],
             )  # fmt: skip
             mass += body_mass[k]
             lean += body_mass[k] * (arm + com)
             linear += momentum
-            angular += wp.cross(arm + com, momentum) + tensor(rotation, body_inertia[k], body_product[k]) * omega
+            angular += wp.cross(arm + com, momentum) + world_inertia(rotation, body_inertia[k], body_product[k]) * omega
             force += wp.spatial_top(given)
             moment += wp.cross(arm, wp.spatial_top(given)) + wp.spatial_bottom(given)
     com = lean / mass
@@ -947,15 +951,15 @@ def conserve(
             later_qd_out[k] = wp.spatial_vector(velocity, omega)
             rotation = wp.quat_to_matrix(turned_by)
             com_k = rotation * body_com[k]
-            inertia = tensor(rotation, body_inertia[k], body_product[k])
+            inertia = world_inertia(rotation, body_inertia[k], body_product[k])
             momentum = body_mass[k] * (velocity + wp.cross(omega, com_k))
             lean += body_mass[k] * (arm + com_k)
             linear += momentum
             angular += wp.cross(arm + com_k, momentum) + inertia * omega
-            locked += inertia + at_lever(body_mass[k], arm + com_k)
+            locked += inertia + point_mass_inertia(body_mass[k], arm + com_k)
     com = lean / mass
     angular = angular - wp.cross(com, linear)
-    locked = locked - at_lever(mass, com)
+    locked = locked - point_mass_inertia(mass, com)
     twist = wp.quat_identity()
     rate = joint_qd_out[root]
     turn = wp.vec3()
@@ -1029,14 +1033,14 @@ def joint_wrench(
         if up == body:
             pose = body_q[k]
             rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-            inertia = tensor(rotation, body_inertia[k], body_product[k])
+            inertia = world_inertia(rotation, body_inertia[k], body_product[k])
             com = rotation * body_com[k]
             omega = wp.spatial_bottom(body_qd[k])
             alpha = wp.spatial_bottom(body_acceleration[k])
             a = wp.spatial_top(body_acceleration[k]) + wp.cross(alpha, com) + wp.cross(omega, wp.cross(omega, com))
             own = body_mass[k] * (a - gravity)
             given = body_load[k] + body_wrench[k]
-            given += held(
+            given += tie_and_drag_wrench(
                 k, dt, tree_phi[tree], tree_air[tree], body_com, body_drag, tie_span, tie_point, tie_anchor,
                 tie_stiffness, tie_damping, pose, body_qd[k], body_acceleration[k],
             )  # fmt: skip

@@ -6,7 +6,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def carry(
+def copy_rows(
     # model
     threads: int,
     pitch: int,

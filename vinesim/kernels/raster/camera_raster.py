@@ -19,37 +19,37 @@ from vinesim.kernels.raster.primitives import (
     hit_cone,
     hit_cylinder,
     hit_leaf,
-    hit_sheet,
+    hit_leaf_rectangle,
     hit_sphere,
     hit_triangle,
     inside_outline,
     leaf_bulge,
     leaf_extent,
     leaf_height,
-    squeeze,
+    scale_along,
     xyz,
 )
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-EMPTY = wp.constant(wp.int64(1 << 62))
+EMPTY_KEY = wp.constant(wp.int64(1 << 62))
 """Key of a pixel that sees no primitive."""
-LOW = wp.constant(wp.int64(0x7FFFFFFF))
+PRIMITIVE_MASK = wp.constant(wp.int64(0x7FFFFFFF))
 UNBOUND = wp.constant(1.0e6)
 """A tangent beyond any picture."""
-CLOSE = wp.constant(0.05)
+NEAR_DEPTH = wp.constant(0.05)
 """Nearer than this [m] bounds are taken from spheres, which know no plane."""
-RUN = wp.constant(64)
+BATCH = wp.constant(64)
 """Pixels of a row that are taken at once; loops over them are written so that LLVM takes eight at a time."""
 SMOOTH_SIZE = wp.constant(120.0)
 """From this size in pixels on a leaf's outline is interpolated between texels."""
 
 
-Depths = wp.types.vector(length=64, dtype=wp.float32)
+FloatBatch = wp.types.vector(length=64, dtype=wp.float32)
 """Scratch for one run of pixels."""
 
 
-Pixels = wp.types.vector(length=64, dtype=wp.int32)
+IntBatch = wp.types.vector(length=64, dtype=wp.int32)
 
 
 @wp.struct
@@ -57,7 +57,7 @@ class Pinhole:
     """Where a camera is and how it projects. Pixel centres have whole coordinates (sensor_msgs/CameraInfo)."""
 
     eye: wp.vec3
-    turn: wp.mat33
+    rotation: wp.mat33
     """Rows: right, down, forward, in the world."""
     fx: float
     fy: float
@@ -65,33 +65,33 @@ class Pinhole:
     cy: float
     width: int
     height: int
-    reach: float
+    max_depth: float
     """Farthest depth that is drawn [m]."""
-    close: float
+    near_radius: float
     """Radius of a ball around the eye that holds all of the view within the depth CLOSE [m]."""
 
 
 @wp.func
-def ray_of(lens: Pinhole, x: int, y: int) -> wp.vec3:
+def pixel_ray(lens: Pinhole, x: int, y: int) -> wp.vec3:
     """Ray of a pixel in the optical frame, 1 along the axis."""
     return wp.vec3((float(x) - lens.cx) / lens.fx, (float(y) - lens.cy) / lens.fy, 1.0)
 
 
 @wp.func
-def key_of(t: float, i: int) -> wp.int64:
+def depth_key(t: float, i: int) -> wp.int64:
     """What a hit is kept as: the least is the nearest."""
     return (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i)
 
 
 @wp.func
-def keep(pixel: int, t: float, i: int, reach: float, keys_out: wp.array(dtype=wp.int64)):
+def depth_test(pixel: int, t: float, i: int, reach: float, keys_out: wp.array(dtype=wp.int64)):
     """Enter a hit."""
     if t < reach:
-        wp.atomic_min(keys_out, pixel, key_of(t, i))
+        wp.atomic_min(keys_out, pixel, depth_key(t, i))
 
 
 @wp.func
-def tangents(x: float, z: float, r: float) -> wp.vec2:
+def circle_tangents(x: float, z: float, r: float) -> wp.vec2:
     """Both tangents (x / z) from the origin to a circle; beyond +-90 degrees they are unbound, with the right sign."""
     free = x * x + z * z - r * r
     low = -UNBOUND
@@ -109,17 +109,17 @@ def tangents(x: float, z: float, r: float) -> wp.vec2:
 
 
 @wp.func
-def ball_bound(lens: Pinhole, p: wp.vec3, r: float) -> wp.vec4:
+def sphere_bounds(lens: Pinhole, p: wp.vec3, r: float) -> wp.vec4:
     """Lowest and highest x, lowest and highest y of a sphere's picture [pixel]."""
-    h = tangents(p[0], p[2], r)
-    v = tangents(p[1], p[2], r)
+    h = circle_tangents(p[0], p[2], r)
+    v = circle_tangents(p[1], p[2], r)
     return wp.vec4(
         h[0] * lens.fx + lens.cx, h[1] * lens.fx + lens.cx, v[0] * lens.fy + lens.cy, v[1] * lens.fy + lens.cy
     )
 
 
 @wp.func
-def pixels(lens: Pinhole, bound: wp.vec4) -> wp.vec4i:
+def clip_to_image(lens: Pinhole, bound: wp.vec4) -> wp.vec4i:
     """Bound cut to the picture: first and last + 1 column, first and last + 1 row."""
     w = float(lens.width)
     h = float(lens.height)
@@ -132,7 +132,7 @@ def pixels(lens: Pinhole, bound: wp.vec4) -> wp.vec4i:
 
 
 @wp.kernel
-def cull(
+def cull_clusters(
     # in
     ball: wp.array(dtype=wp.vec4),
     lens: Pinhole,
@@ -142,10 +142,10 @@ def cull(
     """One thread tells how near one cluster may come to the eye, or FAR if no pixel can see it."""
     i = wp.tid()
     r = ball[i][3]
-    p = lens.turn * (xyz(ball[i]) - lens.eye)
+    p = lens.rotation * (xyz(ball[i]) - lens.eye)
     distance = wp.length(p) - r
-    bound = ball_bound(lens, p, r)
-    seen = r > 0.0 and p[2] > -r and p[2] - r < lens.reach
+    bound = sphere_bounds(lens, p, r)
+    seen = r > 0.0 and p[2] > -r and p[2] - r < lens.max_depth
     seen = seen and bound[1] > -1.0 and bound[0] < float(lens.width)
     seen = seen and bound[3] > -1.0 and bound[2] < float(lens.height)
     distance_out[i] = wp.where(seen, wp.max(distance, 0.0), FAR)
@@ -167,26 +167,26 @@ def raster_spheroids(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
-    xs = Pixels()
-    ys = Pixels()
-    depths = Depths()
+    xs = IntBatch()
+    ys = IntBatch()
+    depths = FloatBatch()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
-        p = lens.turn * (xyz(a4) - lens.eye)
+        p = lens.rotation * (xyz(a4) - lens.eye)
         r = a4[3] * wp.max(b4[3], 1.0)
         if p[2] > -r:
-            box = pixels(lens, ball_bound(lens, p, r))
+            box = clip_to_image(lens, sphere_bounds(lens, p, r))
             if box[0] < box[1] and box[2] < box[3]:
-                axis = lens.turn * xyz(b4)
+                axis = lens.rotation * xyz(b4)
                 stretch = 1.0 / b4[3] - 1.0
-                centre = squeeze(p, axis, stretch)
+                centre = scale_along(p, axis, stretch)
                 nearest = wp.int64(int(wp.max(p[2] - r, 0.0) * 1.0e6)) << wp.int64(32)
                 x = box[0]
                 y = box[2]
                 while y < box[3]:
                     n = wp.int32(0)
-                    while n < RUN and y < box[3]:
+                    while n < BATCH and y < box[3]:
                         if keys_out[y * lens.width + x] > nearest:
                             xs[n] = x
                             ys[n] = y
@@ -198,10 +198,10 @@ def raster_spheroids(
                     whole = (n + 7) // 8 * 8
                     m = wp.int32(0)
                     while m < whole:
-                        depths[m] = hit_sphere(centre, a4[3], squeeze(ray_of(lens, xs[m], ys[m]), axis, stretch))
+                        depths[m] = hit_sphere(centre, a4[3], scale_along(pixel_ray(lens, xs[m], ys[m]), axis, stretch))
                         m += 1
                     for m in range(n):
-                        keep(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
+                        depth_test(ys[m] * lens.width + xs[m], depths[m], i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -220,14 +220,14 @@ def raster_cones(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
-    xs = Pixels()
-    ys = Pixels()
-    depths = Depths()
+    xs = IntBatch()
+    ys = IntBatch()
+    depths = FloatBatch()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         b4 = shapes.b[i]
-        a = lens.turn * (xyz(a4) - lens.eye)
-        b = lens.turn * (xyz(b4) - lens.eye)
+        a = lens.rotation * (xyz(a4) - lens.eye)
+        b = lens.rotation * (xyz(b4) - lens.eye)
         r = wp.max(a4[3], b4[3])
         if wp.max(a[2], b[2]) > -r:
             # What reaches no farther than CLOSE is in view only within a small ball around the eye. An axis that
@@ -235,21 +235,21 @@ def raster_cones(
             ca = a
             cb = b
             ba = b - a
-            cut = CLOSE - r
+            cut = NEAR_DEPTH - r
             clear = True
             if wp.min(a[2], b[2]) < cut:
                 h = wp.clamp(-wp.dot(a, ba) / wp.dot(ba, ba), 0.0, 1.0)
-                clear = wp.length(a + ba * h) - r > lens.close
+                clear = wp.length(a + ba * h) - r > lens.near_radius
                 if a[2] < cut and b[2] > cut:
                     ca = a + ba * ((cut - a[2]) / ba[2])
                 if b[2] < cut and a[2] > cut:
                     cb = a + ba * ((cut - a[2]) / ba[2])
             bound = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
-            fa = ball_bound(lens, ca, wp.where(a[2] < cut, r, a4[3]))
-            fb = ball_bound(lens, cb, wp.where(b[2] < cut, r, b4[3]))
+            fa = sphere_bounds(lens, ca, wp.where(a[2] < cut, r, a4[3]))
+            fb = sphere_bounds(lens, cb, wp.where(b[2] < cut, r, b4[3]))
             if clear:
                 bound = wp.vec4(wp.min(fa[0], fb[0]), wp.max(fa[1], fb[1]), wp.min(fa[2], fb[2]), wp.max(fa[3], fb[3]))
-            box = pixels(lens, bound)
+            box = clip_to_image(lens, bound)
             # In one row a slanted cone covers only a band around the line between the pictures of its ends, as wide as
             # these ellipses reach across it: support^2 = (n_x h_x)^2 + (n_y h_y)^2 + 2 n_x n_y h_x h_y correlation.
             ya = 0.5 * (fa[2] + fa[3])
@@ -272,7 +272,7 @@ def raster_cones(
             last = wp.int32(0)
             while y < box[3]:
                 n = wp.int32(0)
-                while n < RUN and y < box[3]:
+                while n < BATCH and y < box[3]:
                     if x < last:
                         if keys_out[y * lens.width + x] > nearest:
                             xs[n] = x
@@ -291,10 +291,10 @@ def raster_cones(
                 whole = (n + 7) // 8 * 8
                 m = wp.int32(0)
                 while m < whole:
-                    depths[m] = hit_cone(a, a4[3], b, b4[3], ray_of(lens, xs[m], ys[m]))
+                    depths[m] = hit_cone(a, a4[3], b, b4[3], pixel_ray(lens, xs[m], ys[m]))
                     m += 1
                 for m in range(n):
-                    keep(ys[m] * lens.width + xs[m], depths[m], i, lens.reach, keys_out)
+                    depth_test(ys[m] * lens.width + xs[m], depths[m], i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -313,19 +313,19 @@ def raster_leaves(
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
-    xs = Pixels()
-    ys = Pixels()
-    depths = Depths()
+    xs = IntBatch()
+    ys = IntBatch()
+    depths = FloatBatch()
     for i in range(first + lane, first + clusters.size[cluster], lanes):
         a4 = shapes.a[i]
         size = a4[3]
-        p = lens.turn * (xyz(a4) - lens.eye)
+        p = lens.rotation * (xyz(a4) - lens.eye)
         if p[2] > -1.6 * size:
             b4 = shapes.b[i]
             bend = shapes.d[i]
             number = int(b4[3])
-            rib = lens.turn * xyz(b4)
-            up = lens.turn * xyz(shapes.c[i])
+            rib = lens.rotation * xyz(b4)
+            up = lens.rotation * xyz(shapes.c[i])
             side = wp.cross(rib, up)
             # octagon around the picture of the blade: bounds of x, y, x + y, x - y
             x_low = float(UNBOUND)
@@ -357,10 +357,10 @@ def raster_leaves(
                     dif_low = wp.min(dif_low, qx - qy)
                     dif_high = wp.max(dif_high, qx - qy)
             bound = wp.vec4(x_low, x_high, y_low, y_high)
-            crossing = z_low < CLOSE
+            crossing = z_low < NEAR_DEPTH
             if crossing:
-                bound = ball_bound(lens, p + rib * (0.25 * size), 1.45 * size)
-            box = pixels(lens, bound)
+                bound = sphere_bounds(lens, p + rib * (0.25 * size), 1.45 * size)
+            box = clip_to_image(lens, bound)
             if box[0] < box[1] and box[2] < box[3]:
                 inv = 1.0 / size
                 eye = wp.vec3(-wp.dot(p, side), -wp.dot(p, rib), -wp.dot(p, up)) * inv
@@ -377,7 +377,7 @@ def raster_leaves(
                 last = wp.int32(0)
                 while y < box[3]:
                     n = wp.int32(0)
-                    while n < RUN and y < box[3]:
+                    while n < BATCH and y < box[3]:
                         if x < last:
                             if keys_out[y * lens.width + x] > nearest:
                                 xs[n] = x
@@ -396,21 +396,21 @@ def raster_leaves(
                     whole = (n + 7) // 8 * 8
                     m = wp.int32(0)
                     while m < whole:
-                        depths[m] = hit_sheet(bend, extent, eye, dz + dx * float(xs[m]) + dy * float(ys[m]))
+                        depths[m] = hit_leaf_rectangle(bend, extent, eye, dz + dx * float(xs[m]) + dy * float(ys[m]))
                         m += 1
                     for k in range(n):
                         t = depths[k]
-                        if t < lens.reach:
+                        if t < lens.max_depth:
                             at = ys[k] * lens.width + xs[k]
                             ray = dz + dx * float(xs[k]) + dy * float(ys[k])
                             if t < 0.0:
                                 t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
-                                keep(at, t, i, lens.reach, keys_out)
-                            elif key_of(t, i) < keys_out[at]:
+                                depth_test(at, t, i, lens.max_depth, keys_out)
+                            elif depth_key(t, i) < keys_out[at]:
                                 u = eye[0] + t * ray[0]
                                 v = eye[1] + t * ray[1]
                                 if inside_outline(shapes.outline, number, u, v, smooth):
-                                    keep(at, t, i, lens.reach, keys_out)
+                                    depth_test(at, t, i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -434,7 +434,7 @@ def raster_solids(
         a4 = shapes.a[i]
         b4 = shapes.b[i]
         c4 = shapes.c[i]
-        p = lens.turn * (xyz(a4) - lens.eye)
+        p = lens.rotation * (xyz(a4) - lens.eye)
         half = wp.vec3(a4[3], c4[0], c4[1])
         q = as_quat(b4)
         end = p
@@ -443,15 +443,15 @@ def raster_solids(
         if kind == ELLIPSOID:
             r = wp.max(wp.max(half[0], half[1]), half[2])
         if kind == CYLINDER:
-            end = lens.turn * (xyz(b4) - lens.eye)
+            end = lens.rotation * (xyz(b4) - lens.eye)
             centre = (p + end) * 0.5
             r = wp.length(wp.vec2(wp.length(end - p) * 0.5, a4[3]))
         if centre[2] > -r:
-            bound = ball_bound(lens, centre, r)
-            if kind == BOX and centre[2] - r > CLOSE:
-                ex = lens.turn * wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
-                ey = lens.turn * wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
-                ez = lens.turn * wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
+            bound = sphere_bounds(lens, centre, r)
+            if kind == BOX and centre[2] - r > NEAR_DEPTH:
+                ex = lens.rotation * wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
+                ey = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
+                ez = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
                 bound = wp.vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND)
                 for n in range(8):
                     corner = (
@@ -463,9 +463,9 @@ def raster_solids(
                     x = corner[0] / corner[2] * lens.fx + lens.cx
                     y = corner[1] / corner[2] * lens.fy + lens.cy
                     bound = wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
-            box = pixels(lens, bound)
+            box = clip_to_image(lens, bound)
             if box[0] < box[1] and box[2] < box[3]:
-                back = wp.transpose(lens.turn)
+                back = wp.transpose(lens.rotation)
                 eye = wp.vec3(0.0, 0.0, 0.0)
                 ax = eye
                 ay = eye
@@ -480,7 +480,7 @@ def raster_solids(
                     for px in range(box[0], box[1]):
                         at = py * lens.width + px
                         if keys_out[at] > nearest:
-                            d = ray_of(lens, px, py)
+                            d = pixel_ray(lens, px, py)
                             ray = ax * d[0] + ay * d[1] + az
                             t = FAR
                             if kind == BOX:
@@ -489,7 +489,7 @@ def raster_solids(
                                 t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
                             else:
                                 t = hit_cylinder(p, end, a4[3], d)
-                            keep(at, t, i, lens.reach, keys_out)
+                            depth_test(at, t, i, lens.max_depth, keys_out)
 
 
 @wp.kernel
@@ -509,14 +509,14 @@ def raster_triangles(
     cluster = visible[k]
     first = clusters.first[cluster]
     for i in range(first + lane, first + clusters.size[cluster], lanes):
-        p = lens.turn * (xyz(shapes.a[i]) - lens.eye)
-        q = lens.turn * (xyz(shapes.b[i]) - lens.eye)
-        r = lens.turn * (xyz(shapes.c[i]) - lens.eye)
+        p = lens.rotation * (xyz(shapes.a[i]) - lens.eye)
+        q = lens.rotation * (xyz(shapes.b[i]) - lens.eye)
+        r = lens.rotation * (xyz(shapes.c[i]) - lens.eye)
         n = wp.cross(q - p, r - p)
         if wp.dot(p, n) < 0.0 and wp.max(wp.max(p[2], q[2]), r[2]) > 0.0:
             bound = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
             z_low = wp.min(wp.min(p[2], q[2]), r[2])
-            if z_low > CLOSE:
+            if z_low > NEAR_DEPTH:
                 bound = wp.vec4(
                     wp.min(wp.min(p[0] / p[2], q[0] / q[2]), r[0] / r[2]) * lens.fx + lens.cx,
                     wp.max(wp.max(p[0] / p[2], q[0] / q[2]), r[0] / r[2]) * lens.fx + lens.cx,
@@ -526,28 +526,28 @@ def raster_triangles(
             else:
                 middle = (p + q + r) / 3.0
                 away = wp.max(wp.max(wp.length(p - middle), wp.length(q - middle)), wp.length(r - middle))
-                bound = ball_bound(lens, middle, away * 1.001)
-            box = pixels(lens, bound)
+                bound = sphere_bounds(lens, middle, away * 1.001)
+            box = clip_to_image(lens, bound)
             nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)
             for y in range(box[2], box[3]):
                 for x in range(box[0], box[1]):
                     at = y * lens.width + x
                     if keys_out[at] > nearest:
-                        keep(at, hit_triangle(p, q, r, ray_of(lens, x, y)), i, lens.reach, keys_out)
+                        depth_test(at, hit_triangle(p, q, r, pixel_ray(lens, x, y)), i, lens.max_depth, keys_out)
 
 
 @wp.func
 def ground_depth(lens: Pinhole, x: int, y: int) -> float:
     """Depth at which a pixel's ray meets the ground, z = 0."""
-    d = ray_of(lens, x, y)
-    fall = lens.turn[0, 2] * d[0] + lens.turn[1, 2] * d[1] + lens.turn[2, 2]
+    d = pixel_ray(lens, x, y)
+    fall = lens.rotation[0, 2] * d[0] + lens.rotation[1, 2] * d[1] + lens.rotation[2, 2]
     meets = fall < -1.0e-6 and lens.eye[2] > 0.0
     t = -lens.eye[2] / wp.where(meets, fall, -1.0)
-    return wp.where(meets and t < lens.reach, t, FAR)
+    return wp.where(meets and t < lens.max_depth, t, FAR)
 
 
 @wp.kernel
-def resolve(
+def resolve_keys(
     # model
     label: wp.array(dtype=wp.int32),
     # in
@@ -573,11 +573,11 @@ def resolve(
         t = ground_depth(lens, column + pixel - first, row)
         i = wp.where(t < FAR, -2, -1)
         name = wp.where(t < FAR, ground_label, 0)
-        if key < EMPTY:
+        if key < EMPTY_KEY:
             z = float(key >> wp.int64(32)) * 1.0e-6
             if z < t:
                 t = z
-                i = int(key & LOW)
+                i = int(key & PRIMITIVE_MASK)
                 name = label[i]
         primitive_out[pixel] = i
         labels_out[pixel] = name

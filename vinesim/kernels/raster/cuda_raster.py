@@ -8,7 +8,16 @@ No kernel asks the host how long the lists have become: a frame is two launches.
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import CLOSE, SMOOTH_SIZE, UNBOUND, Pinhole, ball_bound, keep, pixels, ray_of
+from vinesim.kernels.raster.camera_raster import (
+    NEAR_DEPTH,
+    SMOOTH_SIZE,
+    UNBOUND,
+    Pinhole,
+    clip_to_image,
+    depth_test,
+    pixel_ray,
+    sphere_bounds,
+)
 from vinesim.kernels.raster.primitives import (
     BOX,
     CONE,
@@ -21,21 +30,21 @@ from vinesim.kernels.raster.primitives import (
     Clusters,
     Shapes,
     as_quat,
-    hit,
+    hit_primitive,
     leaf_heights,
     xyz,
 )
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-SIDE = wp.constant(16)
+TILE_SIZE = wp.constant(16)
 """Of a piece [pixel]; twice that for what is larger than LARGE, since one thread lists all pieces of a primitive."""
-LARGE = wp.constant(256)
-LISTS = wp.constant(64)
+LARGE_PRIMITIVE = wp.constant(256)
+TILE_LISTS = wp.constant(64)
 """Pieces are kept in so many lists: threads that append to one must take turns."""
-NOTHING = wp.constant(wp.vec4(1.0e6, -1.0e6, 1.0e6, -1.0e6))
+EMPTY_BOUNDS = wp.constant(wp.vec4(1.0e6, -1.0e6, 1.0e6, -1.0e6))
 """Bound of what is not in the picture [pixel]."""
-ANYWHERE = wp.constant(wp.vec3(0.0, -1.0e6, 1.0e6))
+UNBOUNDED_STRIP = wp.constant(wp.vec3(0.0, -1.0e6, 1.0e6))
 """A strip that holds every pixel: slope, low, high."""
 
 
@@ -53,7 +62,7 @@ class Outline:
 
 
 @wp.func
-def holding(lens: Pinhole, bound: wp.vec4, p: wp.vec3) -> wp.vec4:
+def extend_bounds(lens: Pinhole, bound: wp.vec4, p: wp.vec3) -> wp.vec4:
     """Lowest and highest x and y [pixel], widened to hold the picture of a point in front of the camera."""
     x = p[0] / p[2] * lens.fx + lens.cx
     y = p[1] / p[2] * lens.fy + lens.cy
@@ -61,12 +70,12 @@ def holding(lens: Pinhole, bound: wp.vec4, p: wp.vec3) -> wp.vec4:
 
 
 @wp.func
-def outline(lens: Pinhole, bound: wp.vec4, depth: float, rising: wp.vec3, falling: wp.vec3) -> Outline:
+def make_outline(lens: Pinhole, bound: wp.vec4, depth: float, rising: wp.vec3, falling: wp.vec3) -> Outline:
     o = Outline()
-    o.box = pixels(lens, bound)
+    o.box = clip_to_image(lens, bound)
     o.rising = rising
     o.falling = falling
-    o.depth = wp.clamp(depth, 0.0, lens.reach)
+    o.depth = wp.clamp(depth, 0.0, lens.max_depth)
     return o
 
 
@@ -75,13 +84,13 @@ def leaf_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
     a4 = s.a[i]
     b4 = s.b[i]
     size = a4[3]
-    p = lens.turn * (xyz(a4) - lens.eye)
-    rib = lens.turn * xyz(b4)
-    up = lens.turn * xyz(s.c[i])
+    p = lens.rotation * (xyz(a4) - lens.eye)
+    rib = lens.rotation * xyz(b4)
+    up = lens.rotation * xyz(s.c[i])
     side = wp.cross(rib, up)
     heights = leaf_heights(s.d[i])
     depth = float(FAR)
-    bound = NOTHING
+    bound = EMPTY_BOUNDS
     turned = bound  # of x - y and x + y
     for n in range(16):
         corner = s.hull[int(b4[3]), n >> 1]
@@ -93,40 +102,40 @@ def leaf_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
         turned = wp.vec4(
             wp.min(turned[0], x - y), wp.max(turned[1], x - y), wp.min(turned[2], x + y), wp.max(turned[3], x + y)
         )
-    if depth < CLOSE:
+    if depth < NEAR_DEPTH:
         turned = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
-        bound = ball_bound(lens, p + rib * (0.25 * size), 1.45 * size)
+        bound = sphere_bounds(lens, p + rib * (0.25 * size), 1.45 * size)
         if p[2] < -1.6 * size:
-            bound = NOTHING
-    return outline(lens, bound, depth, wp.vec3(1.0, turned[0], turned[1]), wp.vec3(-1.0, turned[2], turned[3]))
+            bound = EMPTY_BOUNDS
+    return make_outline(lens, bound, depth, wp.vec3(1.0, turned[0], turned[1]), wp.vec3(-1.0, turned[2], turned[3]))
 
 
 @wp.func
 def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
     a4 = s.a[i]
     b4 = s.b[i]
-    a = lens.turn * (xyz(a4) - lens.eye)
-    b = lens.turn * (xyz(b4) - lens.eye)
+    a = lens.rotation * (xyz(a4) - lens.eye)
+    b = lens.rotation * (xyz(b4) - lens.eye)
     r = wp.max(a4[3], b4[3])
-    bound = NOTHING
-    strip = ANYWHERE
+    bound = EMPTY_BOUNDS
+    strip = UNBOUNDED_STRIP
     if wp.max(a[2], b[2]) > -r:
         # What reaches no farther than CLOSE is in view only within a small ball around the eye. An axis that
         # stays clear of that ball may be cut there: a wire that passes the camera keeps a narrow bound.
         axis = b - a
-        cut = CLOSE - r
+        cut = NEAR_DEPTH - r
         start = a
         end = b
         clear = True
         if wp.min(a[2], b[2]) < cut:
             h = wp.clamp(-wp.dot(a, axis) / wp.dot(axis, axis), 0.0, 1.0)
-            clear = wp.length(a + axis * h) - r > lens.close
+            clear = wp.length(a + axis * h) - r > lens.near_radius
             if a[2] < cut and b[2] > cut:
                 start = a + axis * ((cut - a[2]) / axis[2])
             if b[2] < cut and a[2] > cut:
                 end = a + axis * ((cut - a[2]) / axis[2])
-        f = ball_bound(lens, start, r)
-        g = ball_bound(lens, end, r)
+        f = sphere_bounds(lens, start, r)
+        g = sphere_bounds(lens, end, r)
         bound = wp.vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
         if clear:
             bound = wp.vec4(wp.min(f[0], g[0]), wp.max(f[1], g[1]), wp.min(f[2], g[2]), wp.max(f[3], g[3]))
@@ -136,24 +145,24 @@ def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
                 middle = 0.5 * (f[0] + f[1] - slope * (f[2] + f[3]))
                 half = 0.5 * (wp.max(f[1] - f[0], g[1] - g[0]) + wp.abs(slope) * wp.max(f[3] - f[2], g[3] - g[2]))
                 strip = wp.vec3(slope, middle - half, middle + half)
-    return outline(lens, bound, wp.min(a[2], b[2]) - r, strip, ANYWHERE)
+    return make_outline(lens, bound, wp.min(a[2], b[2]) - r, strip, UNBOUNDED_STRIP)
 
 
 @wp.func
 def triangle_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
-    a = lens.turn * (xyz(s.a[i]) - lens.eye)
-    b = lens.turn * (xyz(s.b[i]) - lens.eye)
-    c = lens.turn * (xyz(s.c[i]) - lens.eye)
+    a = lens.rotation * (xyz(s.a[i]) - lens.eye)
+    b = lens.rotation * (xyz(s.b[i]) - lens.eye)
+    c = lens.rotation * (xyz(s.c[i]) - lens.eye)
     depth = wp.min(wp.min(a[2], b[2]), c[2])
-    bound = NOTHING
+    bound = EMPTY_BOUNDS
     if wp.dot(a, wp.cross(b - a, c - a)) < 0.0 and wp.max(wp.max(a[2], b[2]), c[2]) > 0.0:
-        if depth > CLOSE:
-            bound = holding(lens, holding(lens, holding(lens, bound, a), b), c)
+        if depth > NEAR_DEPTH:
+            bound = extend_bounds(lens, extend_bounds(lens, extend_bounds(lens, bound, a), b), c)
         else:
             middle = (a + b + c) / 3.0
             away = wp.max(wp.max(wp.length(a - middle), wp.length(b - middle)), wp.length(c - middle))
-            bound = ball_bound(lens, middle, away * 1.001)
-    return outline(lens, bound, depth, ANYWHERE, ANYWHERE)
+            bound = sphere_bounds(lens, middle, away * 1.001)
+    return make_outline(lens, bound, depth, UNBOUNDED_STRIP, UNBOUNDED_STRIP)
 
 
 @wp.func
@@ -161,7 +170,7 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
     a4 = s.a[i]
     b4 = s.b[i]
     c4 = s.c[i]
-    centre = lens.turn * (xyz(a4) - lens.eye)
+    centre = lens.rotation * (xyz(a4) - lens.eye)
     half = wp.vec3(a4[3], c4[0], c4[1])
     reach = wp.length(half)
     if kind == SPHEROID:
@@ -169,20 +178,20 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
     elif kind == ELLIPSOID:
         reach = wp.max(wp.max(half[0], half[1]), half[2])
     elif kind == CYLINDER:
-        end = lens.turn * (xyz(b4) - lens.eye)
+        end = lens.rotation * (xyz(b4) - lens.eye)
         reach = wp.length(wp.vec2(wp.length(end - centre) * 0.5, a4[3]))
         centre = (centre + end) * 0.5
     depth = centre[2] - reach
-    bound = NOTHING
+    bound = EMPTY_BOUNDS
     if centre[2] > -reach:
-        if kind == BOX and depth > CLOSE:
+        if kind == BOX and depth > NEAR_DEPTH:
             for n in range(8):
                 corner = wp.vec3(float(n & 1) * 2.0 - 1.0, float(n & 2) - 1.0, float(n & 4) * 0.5 - 1.0)
                 away = wp.quat_rotate(as_quat(b4), wp.cw_mul(half, corner))
-                bound = holding(lens, bound, centre + lens.turn * away)
+                bound = extend_bounds(lens, bound, centre + lens.rotation * away)
         else:
-            bound = ball_bound(lens, centre, reach)
-    return outline(lens, bound, depth, ANYWHERE, ANYWHERE)
+            bound = sphere_bounds(lens, centre, reach)
+    return make_outline(lens, bound, depth, UNBOUNDED_STRIP, UNBOUNDED_STRIP)
 
 
 @wp.func
@@ -202,7 +211,7 @@ def outline_of(s: Shapes, i: int, lens: Pinhole) -> Outline:
 
 
 @wp.func
-def columns(o: Outline, top: int, bottom: int) -> wp.vec2i:
+def column_span(o: Outline, top: int, bottom: int) -> wp.vec2i:
     """First and last + 1 column of an outline within the rows from ``top`` up to ``bottom``, not included."""
     first = float(o.box[0])
     last = float(o.box[1])
@@ -216,29 +225,31 @@ def columns(o: Outline, top: int, bottom: int) -> wp.vec2i:
 
 
 @wp.func
-def draw_piece(s: Shapes, lens: Pinhole, piece: wp.vec4i, lane: int, lanes: int, keys_out: wp.array(dtype=wp.int64)):
+def draw_tile(s: Shapes, lens: Pinhole, piece: wp.vec4i, lane: int, lanes: int, keys_out: wp.array(dtype=wp.int64)):
     """Every ``lanes``-th pixel of one piece: primitive, corner and size (x + 65536 y), least depth [um]."""
     i = piece[0]
     left = piece[1] & 0xFFFF
     top = piece[1] >> 16
     wide = piece[2] & 0xFFFF
     nearest = wp.int64(piece[3]) << wp.int64(32)
-    back = wp.transpose(lens.turn)
+    back = wp.transpose(lens.rotation)
     smooth = wp.int32(0)
     if s.kind[i] == LEAF:
         a4 = s.a[i]
-        if a4[3] * lens.fx > wp.dot(lens.turn[2], xyz(a4) - lens.eye) * SMOOTH_SIZE:
+        if a4[3] * lens.fx > wp.dot(lens.rotation[2], xyz(a4) - lens.eye) * SMOOTH_SIZE:
             smooth = 1
     for n in range(lane, wide * (piece[2] >> 16), lanes):
         x = left + n % wide
         y = top + n // wide
         pixel = y * lens.width + x
         if keys_out[pixel] > nearest:
-            keep(pixel, hit(s, i, lens.eye, back * ray_of(lens, x, y), smooth), i, lens.reach, keys_out)
+            depth_test(
+                pixel, hit_primitive(s, i, lens.eye, back * pixel_ray(lens, x, y), smooth), i, lens.max_depth, keys_out
+            )
 
 
 @wp.kernel
-def list_pieces(
+def list_tiles(
     # model
     shapes: Shapes,
     clusters: Clusters,
@@ -256,23 +267,25 @@ def list_pieces(
     k, lane = wp.tid()
     cluster = which[k]
     r = ball[cluster][3]
-    p = lens.turn * (xyz(ball[cluster]) - lens.eye)
-    seen = pixels(lens, ball_bound(lens, p, r))
-    if r > 0.0 and p[2] > -r and p[2] - r < lens.reach and seen[0] < seen[1] and seen[2] < seen[3]:
-        mine = k % LISTS
+    p = lens.rotation * (xyz(ball[cluster]) - lens.eye)
+    seen = clip_to_image(lens, sphere_bounds(lens, p, r))
+    if r > 0.0 and p[2] > -r and p[2] - r < lens.max_depth and seen[0] < seen[1] and seen[2] < seen[3]:
+        mine = k % TILE_LISTS
         first = clusters.first[cluster]
         for i in range(first + lane, first + clusters.size[cluster], lanes):
             o = outline_of(shapes, i, lens)
-            side = wp.where(wp.max(o.box[1] - o.box[0], o.box[3] - o.box[2]) > LARGE, 2 * SIDE, SIDE)
+            side = wp.where(
+                wp.max(o.box[1] - o.box[0], o.box[3] - o.box[2]) > LARGE_PRIMITIVE, 2 * TILE_SIZE, TILE_SIZE
+            )
             needed = wp.int32(0)
             for top in range(o.box[2], o.box[3], side):
-                span = columns(o, top, wp.min(top + side, o.box[3]))
+                span = column_span(o, top, wp.min(top + side, o.box[3]))
                 needed += wp.max(span[1] - span[0] + side - 1, 0) // side
             if needed > 0:
                 slot = wp.atomic_add(count_out, mine, needed)
                 for top in range(o.box[2], o.box[3], side):
                     bottom = wp.min(top + side, o.box[3])
-                    span = columns(o, top, bottom)
+                    span = column_span(o, top, bottom)
                     for left in range(span[0], span[1], side):
                         piece = wp.vec4i(
                             i,
@@ -283,12 +296,12 @@ def list_pieces(
                         if slot < pieces_out.shape[1]:
                             pieces_out[mine, slot] = piece
                         else:
-                            draw_piece(shapes, lens, piece, 0, 1, keys_out)
+                            draw_tile(shapes, lens, piece, 0, 1, keys_out)
                         slot += 1
 
 
 @wp.kernel
-def draw_pieces(
+def draw_tiles(
     # model
     shapes: Shapes,
     # in
@@ -303,6 +316,6 @@ def draw_pieces(
     """One of ``lanes`` threads draws its share of the pixels of every ``groups``-th piece of one list."""
     group = wp.tid() // lanes
     lane = wp.tid() % lanes
-    mine = group % LISTS
-    for slot in range(group // LISTS, wp.min(count[mine], pieces.shape[1]), groups):
-        draw_piece(shapes, lens, pieces[mine, slot], lane, lanes, keys_out)
+    mine = group % TILE_LISTS
+    for slot in range(group // TILE_LISTS, wp.min(count[mine], pieces.shape[1]), groups):
+        draw_tile(shapes, lens, pieces[mine, slot], lane, lanes, keys_out)

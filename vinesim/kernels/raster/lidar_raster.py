@@ -7,7 +7,15 @@ camera's pixels are (:mod:`vinesim.kernels.raster.camera_raster`).
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import EMPTY, LOW, RUN, Depths, Pixels, keep, tangents
+from vinesim.kernels.raster.camera_raster import (
+    BATCH,
+    EMPTY_KEY,
+    PRIMITIVE_MASK,
+    FloatBatch,
+    IntBatch,
+    circle_tangents,
+    depth_test,
+)
 from vinesim.kernels.raster.primitives import (
     BOX,
     CONE,
@@ -19,70 +27,70 @@ from vinesim.kernels.raster.primitives import (
     TRIANGLE,
     Clusters,
     Shapes,
-    hit,
     hit_cone,
     hit_leaf,
-    hit_sheet,
+    hit_leaf_rectangle,
+    hit_primitive,
     hit_sphere,
     inside_outline,
     leaf_extent,
     leaf_heights,
-    squeeze,
+    scale_along,
     xyz,
 )
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-SLOTS = wp.constant(1024)
+ELEVATION_SLOTS = wp.constant(1024)
 """Into so many parts the way from straight down to straight up is cut to find rows."""
-PIECE = wp.constant(0.02)
+BALL_SPACING = wp.constant(0.02)
 """A slender thing is bound by balls about this far apart [rad]."""
 
 
 @wp.struct
-class Head:
+class LidarHead:
     """Where the head is, its rows in the order of elevation, and which columns are fired."""
 
     eye: wp.vec3
-    turn: wp.mat33
+    rotation: wp.mat33
     """Rows: forward, left, up, in the world."""
     tangent: wp.array(dtype=wp.float32)
     """Of the elevation [row]."""
     azimuth: wp.array(dtype=wp.float32)
     """Of the ray in column 0 [row] rad."""
-    number: wp.array(dtype=wp.int32)
+    row_index: wp.array(dtype=wp.int32)
     """Place within a column [row]."""
-    slots: wp.array(dtype=wp.int32)
+    row_slots: wp.array(dtype=wp.int32)
     """First row in each slot or above it [slot]."""
     direction: wp.array2d(dtype=wp.float32)
     """Unit vectors in the head's frame [column * row, 3]."""
     step: float
     """From column to column [rad]."""
-    middle: wp.vec2
+    azimuth_middle: wp.vec2
     """Forward and left component of the middle of the azimuths that are fired."""
-    within: wp.vec2
+    azimuth_half_range: wp.vec2
     """Cosine and sine of how far they reach to either side; cosine -1 for all around."""
-    first: int
-    end: int
-    reach: float
+    first_column: int
+    end_column: int
+    max_range: float
 
 
 @wp.func
-def fired(head: Head, at: int) -> wp.vec3:
+def ray_direction(head: LidarHead, at: int) -> wp.vec3:
     """One ray; read number by number, for LLVM makes nothing of eight vectors."""
     return wp.vec3(head.direction[at, 0], head.direction[at, 1], head.direction[at, 2])
 
 
 @wp.func
-def slot_of(tangent: float) -> int:
+def elevation_slot(tangent: float) -> int:
     """Where an elevation lies between straight down and straight up."""
-    return int((tangent / (1.0 + wp.abs(tangent)) + 1.0) * (0.5 * float(SLOTS) - 0.01))
+    return int((tangent / (1.0 + wp.abs(tangent)) + 1.0) * (0.5 * float(ELEVATION_SLOTS) - 0.01))
 
 
 @wp.func
-def first_row(head: Head, tangent: float) -> int:
+def first_row(head: LidarHead, tangent: float) -> int:
     """First row that is not below an elevation."""
-    row = head.slots[slot_of(tangent)]
+    row = head.row_slots[elevation_slot(tangent)]
     while row < head.tangent.shape[0] and head.tangent[row] < tangent:
         row += 1
     return row
@@ -96,37 +104,39 @@ def half_angle(r: float, away: float) -> float:
 
 
 @wp.func
-def meets(head: Head, p: wp.vec3, r: float) -> int:
+def may_intersect(head: LidarHead, p: wp.vec3, r: float) -> int:
     """1 if a ray that is fired may meet a ball, 0 if surely none does. Without a branch."""
     flat2 = p[0] * p[0] + p[1] * p[1]
     flat = wp.sqrt(flat2)
-    span = tangents(p[2], flat, r)
-    rows = head.slots[slot_of(span[1]) + 2] - head.slots[slot_of(span[0])]
+    span = circle_tangents(p[2], flat, r)
+    rows = head.row_slots[elevation_slot(span[1]) + 2] - head.row_slots[elevation_slot(span[0])]
     free = flat2 - r * r
-    ahead = p[0] * head.middle[0] + p[1] * head.middle[1]
-    inside = free <= 0.0 or ahead >= head.within[0] * wp.sqrt(wp.max(free, 0.0)) - head.within[1] * r
-    return wp.where(rows > 0 and (inside or head.within[0] <= -1.0), 1, 0)
+    ahead = p[0] * head.azimuth_middle[0] + p[1] * head.azimuth_middle[1]
+    inside = (
+        free <= 0.0 or ahead >= head.azimuth_half_range[0] * wp.sqrt(wp.max(free, 0.0)) - head.azimuth_half_range[1] * r
+    )
+    return wp.where(rows > 0 and (inside or head.azimuth_half_range[0] <= -1.0), 1, 0)
 
 
 @wp.kernel
-def cull(
+def cull_clusters(
     # in
     ball: wp.array(dtype=wp.vec4),
-    head: Head,
+    head: LidarHead,
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
     """One thread tells how near one cluster may come to the head, or FAR if no ray can meet it."""
     i = wp.tid()
     r = ball[i][3]
-    p = head.turn * (xyz(ball[i]) - head.eye)
+    p = head.rotation * (xyz(ball[i]) - head.eye)
     away = wp.length(p) - r
-    seen = r > 0.0 and away < head.reach and meets(head, p, r) == 1
+    seen = r > 0.0 and away < head.max_range and may_intersect(head, p, r) == 1
     distance_out[i] = wp.where(seen, wp.max(away, 0.0), FAR)
 
 
 @wp.kernel
-def raster(
+def raster_clusters(
     # model
     shapes: Shapes,
     clusters: Clusters,
@@ -134,7 +144,7 @@ def raster(
     upper: wp.array2d(dtype=wp.float32),
     # in
     visible: wp.array(dtype=wp.int32),
-    head: Head,
+    head: LidarHead,
     lanes: int,
     # out
     keys_out: wp.array(dtype=wp.int64),
@@ -146,17 +156,17 @@ def raster(
     first = clusters.first[cluster]
     rows = head.tangent.shape[0]
     period = 6.2831853 / wp.abs(head.step)
-    spots = Pixels()
-    depths = Depths()
+    spots = IntBatch()
+    depths = FloatBatch()
     size = clusters.size[cluster]
     # most primitives of far clusters lie between two rows
-    found = Pixels()
+    found = IntBatch()
     n = wp.int32(0)
     while n < (size + 7) // 8 * 8:
         i = first + wp.min(n, size - 1)
         lo = wp.vec3(lower[i, 0], lower[i, 1], lower[i, 2])
         hi = wp.vec3(upper[i, 0], upper[i, 1], upper[i, 2])
-        found[n] = meets(head, head.turn * ((lo + hi) * 0.5 - head.eye), wp.length(hi - lo) * 0.5)
+        found[n] = may_intersect(head, head.rotation * ((lo + hi) * 0.5 - head.eye), wp.length(hi - lo) * 0.5)
         n += 1
     for member in range(lane, size, lanes):
         if found[member] == 0:
@@ -164,15 +174,15 @@ def raster(
         i = first + member
         a4 = shapes.a[i]
         b4 = shapes.b[i]
-        a = head.turn * (xyz(a4) - head.eye)
+        a = head.rotation * (xyz(a4) - head.eye)
         b = a
         r = a4[3]
         pieces = wp.int32(1)
         if kind == SPHEROID:
             r *= wp.max(b4[3], 1.0)
         elif kind == LEAF:
-            rib = head.turn * xyz(b4)
-            up = head.turn * xyz(shapes.c[i])
+            rib = head.rotation * xyz(b4)
+            up = head.rotation * xyz(shapes.c[i])
             heights = leaf_heights(shapes.d[i])
             extent = leaf_extent(shapes.hull, int(b4[3]))
             middle = 0.5 * (extent[1] + extent[2])
@@ -184,16 +194,16 @@ def raster(
             b = a
             r *= wp.sqrt(flat * flat + high * high)
         elif kind == CONE or kind == CYLINDER:
-            b = head.turn * (xyz(b4) - head.eye)
+            b = head.rotation * (xyz(b4) - head.eye)
             r = wp.max(r, wp.where(kind == CONE, b4[3], 0.0))
             long = wp.length(b - a)
             along = wp.clamp(-wp.dot(a, b - a) / wp.max(long * long, 1.0e-12), 0.0, 1.0)
             away = wp.length(a + (b - a) * along)
-            pieces = wp.clamp(int(long / wp.max(3.0 * r, PIECE * away)) + 1, 1, 1000)
+            pieces = wp.clamp(int(long / wp.max(3.0 * r, BALL_SPACING * away)) + 1, 1, 1000)
             r += 0.5 * long / float(pieces)
         elif kind == TRIANGLE:
-            q = head.turn * (xyz(b4) - head.eye)
-            s = head.turn * (xyz(shapes.c[i]) - head.eye)
+            q = head.rotation * (xyz(b4) - head.eye)
+            s = head.rotation * (xyz(shapes.c[i]) - head.eye)
             middle_of = (a + q + s) / 3.0
             r = wp.max(wp.max(wp.length(a - middle_of), wp.length(q - middle_of)), wp.length(s - middle_of)) * 1.001
             a = middle_of
@@ -205,7 +215,7 @@ def raster(
         for piece in range(pieces):
             p = a + (b - a) * ((float(piece) + 0.5) / float(pieces))
             around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
-            span = tangents(p[2], around, r)
+            span = circle_tangents(p[2], around, r)
             row = first_row(head, span[0]) - 1
             more = row + 1 < rows
             if more:
@@ -216,12 +226,12 @@ def raster(
                 nearest = wp.int64(int(wp.max(wp.length(p) - r, 0.0) * 1.0e6)) << wp.int64(32)
                 column = wp.int32(0)
                 last = wp.int32(0)
-                begin = float(head.end)
+                begin = float(head.end_column)
                 while more:
                     n = wp.int32(0)
-                    while n < RUN and more:
+                    while n < BATCH and more:
                         if column < last:
-                            at = column * rows + head.number[row]
+                            at = column * rows + head.row_index[row]
                             if keys_out[at] > nearest:
                                 spots[n] = at
                                 n += 1
@@ -229,89 +239,91 @@ def raster(
                         else:
                             # the same row one turn further, or the next row
                             begin += period
-                            if begin >= float(head.end):
+                            if begin >= float(head.end_column):
                                 row += 1
                                 more = row < rows
                                 if more:
                                     more = head.tangent[row] <= span[1]
                                 if more:
                                     begin = (azimuth - head.azimuth[row]) / head.step - half
-                                    begin += wp.ceil((float(head.first) - begin - 2.0 * half) / period) * period
+                                    begin += wp.ceil((float(head.first_column) - begin - 2.0 * half) / period) * period
                             if more:
-                                column = wp.max(int(wp.ceil(begin)), head.first)
-                                last = wp.min(int(wp.floor(begin + 2.0 * half)) + 1, head.end)
+                                column = wp.max(int(wp.ceil(begin)), head.first_column)
+                                last = wp.min(int(wp.floor(begin + 2.0 * half)) + 1, head.end_column)
                     whole = (n + 7) // 8 * 8
                     m = wp.int32(0)
                     if kind == SPHEROID:
-                        axis = head.turn * xyz(b4)
+                        axis = head.rotation * xyz(b4)
                         stretch = 1.0 / b4[3] - 1.0
-                        centre = squeeze(p, axis, stretch)
+                        centre = scale_along(p, axis, stretch)
                         while m < whole:
-                            depths[m] = hit_sphere(centre, a4[3], squeeze(fired(head, spots[m]), axis, stretch))
+                            depths[m] = hit_sphere(
+                                centre, a4[3], scale_along(ray_direction(head, spots[m]), axis, stretch)
+                            )
                             m += 1
                     elif kind == CONE:
                         while m < whole:
-                            depths[m] = hit_cone(a, a4[3], b, b4[3], fired(head, spots[m]))
+                            depths[m] = hit_cone(a, a4[3], b, b4[3], ray_direction(head, spots[m]))
                             m += 1
                     elif kind == LEAF:
                         bend = shapes.d[i]
                         number = int(b4[3])
-                        base = head.turn * (xyz(a4) - head.eye)
-                        rib = head.turn * xyz(b4)
-                        up = head.turn * xyz(shapes.c[i])
+                        base = head.rotation * (xyz(a4) - head.eye)
+                        rib = head.rotation * xyz(b4)
+                        up = head.rotation * xyz(shapes.c[i])
                         side = wp.cross(rib, up)
                         per = 1.0 / a4[3]
                         eye = wp.vec3(-wp.dot(base, side), -wp.dot(base, rib), -wp.dot(base, up)) * per
                         extent = leaf_extent(shapes.hull, number)
                         while m < whole:
-                            d = fired(head, spots[m]) * per
+                            d = ray_direction(head, spots[m]) * per
                             ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
-                            depths[m] = hit_sheet(bend, extent, eye, ray)
+                            depths[m] = hit_leaf_rectangle(bend, extent, eye, ray)
                             m += 1
                         for m in range(n):
                             t = depths[m]
-                            d = fired(head, spots[m]) * per
+                            d = ray_direction(head, spots[m]) * per
                             ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
                             if t < 0.0:
                                 depths[m] = hit_leaf(shapes.outline, number, bend, eye, ray, 0)
-                            elif t < head.reach:
+                            elif t < head.max_range:
                                 u = eye[0] + t * ray[0]
                                 v = eye[1] + t * ray[1]
                                 if not inside_outline(shapes.outline, number, u, v, 0):
                                     depths[m] = FAR
                     else:
-                        back = wp.transpose(head.turn)
+                        back = wp.transpose(head.rotation)
                         for m in range(n):
-                            depths[m] = hit(shapes, i, head.eye, back * fired(head, spots[m]), 0)
+                            depths[m] = hit_primitive(shapes, i, head.eye, back * ray_direction(head, spots[m]), 0)
                     for m in range(n):
-                        keep(spots[m], depths[m], i, head.reach, keys_out)
+                        depth_test(spots[m], depths[m], i, head.max_range, keys_out)
 
 
 @wp.kernel
-def resolve(
+def resolve_keys(
     # in
     keys: wp.array(dtype=wp.int64),
-    head: Head,
+    head: LidarHead,
     run: int,
     # out
     distance_out: wp.array(dtype=wp.float32),
     primitive_out: wp.array(dtype=wp.int32),
 ):
     """One thread reads the keys of ``run`` rays into distance [m] and primitive (-1 nothing, -2 the ground)."""
-    up = wp.vec3(head.turn[0, 2], head.turn[1, 2], head.turn[2, 2])
-    first = head.first * head.tangent.shape[0] + wp.tid() * run
+    up = wp.vec3(head.rotation[0, 2], head.rotation[1, 2], head.rotation[2, 2])
+    first = head.first_column * head.tangent.shape[0] + wp.tid() * run
     for at in range(first, first + run):
-        t = head.reach
+        t = head.max_range
         i = wp.int32(-1)
-        fall = wp.dot(up, fired(head, at))
+        fall = wp.dot(up, ray_direction(head, at))
         if fall < -1.0e-6 and head.eye[2] > 0.0 and -head.eye[2] / fall < t:
             t = -head.eye[2] / fall
             i = -2
         key = keys[at]
-        if key < EMPTY:
+        if key < EMPTY_KEY:
             z = float(key >> wp.int64(32)) * 1.0e-6
             if z < t:
                 t = z
-                i = int(key & LOW)
+                i = int(key & PRIMITIVE_MASK)
         distance_out[at] = wp.where(i == -1, FAR, t)
         primitive_out[at] = i

@@ -36,9 +36,9 @@ FAR = wp.constant(1.0e30)
 OUTLINE_TEXELS = wp.constant(128.0)
 """Texels of a leaf's outline per leaf unit: 256 texels over u in [-1, 1], v in [-0.75, 1.25]."""
 TINY = wp.constant(1.0e-20)
-SLACK = wp.constant(1.0e-3)
+LEAF_BOUND_MARGIN = wp.constant(1.0e-3)
 """By how much bounds of a blade are wider than they need be, leaf units."""
-HIDDEN = wp.constant(-1.0e6)
+HIDDEN_HEIGHT = wp.constant(-1.0e6)
 """Height at which things that are gone lie for the ray caster [m]."""
 
 
@@ -84,7 +84,7 @@ def as_quat(v: wp.vec4) -> wp.quat:
 
 
 @wp.func
-def squeeze(v: wp.vec3, axis: wp.vec3, k: float) -> wp.vec3:
+def scale_along(v: wp.vec3, axis: wp.vec3, k: float) -> wp.vec3:
     """``v`` scaled by 1 + k along ``axis``: a spheroid becomes a sphere."""
     return v + axis * (k * wp.dot(v, axis))
 
@@ -236,7 +236,7 @@ def leaf_bulge(hull: wp.array2d(dtype=wp.vec2), number: int, bend: wp.vec4) -> w
     long = 0.5 * (extent[2] - extent[1])
     across = wide * wide * bend[0]
     along = long * long * bend[1]
-    off = wp.abs(bend[2]) * wp.max(wp.abs(hull[number, 3][0]), wp.abs(hull[number, 7][0])) + SLACK
+    off = wp.abs(bend[2]) * wp.max(wp.abs(hull[number, 3][0]), wp.abs(hull[number, 7][0])) + LEAF_BOUND_MARGIN
     above = wp.max(-across, 0.0) + wp.max(-along, 0.0) + off
     below = wp.max(across, 0.0) + wp.max(along, 0.0) + off
     return wp.vec2(above, below)
@@ -290,7 +290,7 @@ def hit_leaf(
 
 
 @wp.func
-def on_sheet(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, t: float) -> float:
+def within_leaf_rectangle(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, t: float) -> float:
     """``t`` if a ray is then over the half of ``sign`` of a blade's rectangle, else :data:`FAR`."""
     u = sign * (o[0] + t * d[0])
     v = o[1] + t * d[1]
@@ -298,7 +298,7 @@ def on_sheet(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, t: float) -> 
 
 
 @wp.func
-def sheet_roots(bend: wp.vec4, extent: wp.vec3, sign: float, o: wp.vec3, d: wp.vec3) -> wp.vec2:
+def leaf_surface_roots(bend: wp.vec4, extent: wp.vec3, sign: float, o: wp.vec3, d: wp.vec3) -> wp.vec2:
     """Both hits with one half of a blade's rectangle; :data:`FAR` for none."""
     q2 = -(bend[0] * d[0] * d[0] + bend[1] * d[1] * d[1])
     q1 = d[2] - 2.0 * (bend[0] * o[0] * d[0] + bend[1] * o[1] * d[1]) - bend[2] * sign * d[0]
@@ -306,19 +306,19 @@ def sheet_roots(bend: wp.vec4, extent: wp.vec3, sign: float, o: wp.vec3, d: wp.v
     h = q1 * q1 - 4.0 * q2 * q0
     root = wp.sqrt(wp.max(h, 0.0))
     q = -0.5 * (q1 + wp.where(q1 > 0.0, root, -root))
-    one = on_sheet(sign, extent, o, d, q0 / wp.where(wp.abs(q) > TINY, q, TINY))
-    other = on_sheet(sign, extent, o, d, q / wp.where(wp.abs(q2) > TINY, q2, TINY))
+    one = within_leaf_rectangle(sign, extent, o, d, q0 / wp.where(wp.abs(q) > TINY, q, TINY))
+    other = within_leaf_rectangle(sign, extent, o, d, q / wp.where(wp.abs(q2) > TINY, q2, TINY))
     return wp.vec2(wp.where(h >= 0.0, one, FAR), wp.where(h >= 0.0, other, FAR))
 
 
 @wp.func
-def hit_sheet(bend: wp.vec4, extent: wp.vec3, o: wp.vec3, d: wp.vec3) -> float:
+def hit_leaf_rectangle(bend: wp.vec4, extent: wp.vec3, o: wp.vec3, d: wp.vec3) -> float:
     """First hit with the rectangle |u| < x, y < v < z that a blade is cut from; negative if there are several hits.
 
     Without a branch, so that a compiler can take several rays at once.
     """
-    right = sheet_roots(bend, extent, 1.0, o, d)
-    left = sheet_roots(bend, extent, -1.0, o, d)
+    right = leaf_surface_roots(bend, extent, 1.0, o, d)
+    left = leaf_surface_roots(bend, extent, -1.0, o, d)
     first = wp.min(wp.min(right[0], right[1]), wp.min(left[0], left[1]))
     # several, if the nearest two differ: max-min of each pair, and of the pairs
     second = wp.min(
@@ -329,7 +329,7 @@ def hit_sheet(bend: wp.vec4, extent: wp.vec3, o: wp.vec3, d: wp.vec3) -> float:
 
 
 @wp.func
-def hit(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> float:
+def hit_primitive(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> float:
     """First hit of a world ray with primitive ``i``; :data:`FAR` if there is none."""
     kind = s.kind[i]
     a4 = s.a[i]
@@ -347,7 +347,7 @@ def hit(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> float:
         )
     elif kind == SPHEROID:
         k = 1.0 / b4[3] - 1.0
-        t = hit_sphere(squeeze(a, xyz(b4), k), a4[3], squeeze(d, xyz(b4), k))
+        t = hit_sphere(scale_along(a, xyz(b4), k), a4[3], scale_along(d, xyz(b4), k))
     elif kind == CONE:
         t = hit_cone(a, a4[3], xyz(b4) - o, b4[3], d)
     elif kind == TRIANGLE:
@@ -386,7 +386,7 @@ def normal_at(s: Shapes, i: int, p: wp.vec3) -> wp.vec3:
         n = side * (-2.0 * bend[0] * u - wp.where(u > 0.0, bend[2], -bend[2])) + rib * (-2.0 * bend[1] * v) + up
     elif kind == SPHEROID:
         k = 1.0 / b4[3] - 1.0
-        n = squeeze(squeeze(p - a, xyz(b4), k), xyz(b4), k)
+        n = scale_along(scale_along(p - a, xyz(b4), k), xyz(b4), k)
     elif kind == CONE or kind == CYLINDER:
         ba = xyz(b4) - a
         h = wp.dot(p - a, ba) / wp.dot(ba, ba)
@@ -493,7 +493,7 @@ def pose_clusters(
             hi = a + reach
             b4 = wp.vec4(turn[0], turn[1], turn[2], turn[3])
         if clusters.shown[cluster] == 0:
-            lo = wp.vec3(0.0, 0.0, HIDDEN)
+            lo = wp.vec3(0.0, 0.0, HIDDEN_HEIGHT)
             hi = lo
         a_out[i] = a4
         b_out[i] = b4

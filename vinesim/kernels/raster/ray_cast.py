@@ -6,12 +6,12 @@ under refits, and a robot that drives through the rows does not stretch it.
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import SMOOTH_SIZE, Pinhole, ray_of
+from vinesim.kernels.raster.camera_raster import SMOOTH_SIZE, Pinhole, pixel_ray
 from vinesim.kernels.raster.primitives import (
     FAR,
     LEAF,
     Shapes,
-    hit,
+    hit_primitive,
     xyz,
 )
 
@@ -36,7 +36,7 @@ class Hit:
 
 
 @wp.func
-def smooth_from(s: Shapes, i: int, depth_scale: float, forward: wp.vec3, eye: wp.vec3) -> int:
+def needs_smooth_outline(s: Shapes, i: int, depth_scale: float, forward: wp.vec3, eye: wp.vec3) -> int:
     """Whether a leaf's outline is interpolated, by the rasteriser's rule; never without a focal length."""
     a4 = s.a[i]
     smooth = wp.int32(0)
@@ -60,7 +60,7 @@ def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, f
     i = wp.int32(0)
     query = wp.bvh_query_ray(h.plants, o, d)
     while wp.bvh_query_next(query, i, best.t):
-        t = hit(s, i, o, d, smooth_from(s, i, focal, forward, o))
+        t = hit_primitive(s, i, o, d, needs_smooth_outline(s, i, focal, forward, o))
         if t < best.t:
             best.t = t
             best.primitive = i
@@ -68,7 +68,7 @@ def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, f
         j = wp.int32(0)
         other = wp.bvh_query_ray(h.rigid, o, d)
         while wp.bvh_query_next(other, j, best.t):
-            t = hit(s, h.first_rigid + j, o, d, 0)
+            t = hit_primitive(s, h.first_rigid + j, o, d, 0)
             if t < best.t:
                 best.t = t
                 best.primitive = h.first_rigid + j
@@ -76,7 +76,7 @@ def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, f
 
 
 @wp.kernel
-def cast(
+def cast_rays(
     # model
     shapes: Shapes,
     # in
@@ -108,8 +108,8 @@ def cast_camera(
 ):
     """One thread follows the ray of one pixel: what the rasteriser must find too."""
     pixel = wp.tid()
-    back = wp.transpose(lens.turn)
-    d = back * ray_of(lens, pixel % lens.width, pixel // lens.width)
-    best = first_hit(hierarchies, shapes, lens.eye, d, lens.reach, lens.fx, back * wp.vec3(0.0, 0.0, 1.0))
+    back = wp.transpose(lens.rotation)
+    d = back * pixel_ray(lens, pixel % lens.width, pixel // lens.width)
+    best = first_hit(hierarchies, shapes, lens.eye, d, lens.max_depth, lens.fx, back * wp.vec3(0.0, 0.0, 1.0))
     depth_out[pixel] = wp.where(best.primitive == -1, FAR, best.t)
     primitive_out[pixel] = best.primitive

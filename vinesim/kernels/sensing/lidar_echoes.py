@@ -6,7 +6,7 @@ from vinesim.kernels.raster.primitives import Shapes, normal_at
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-Beam = wp.types.vector(length=8, dtype=wp.float32)
+RayValues = wp.types.vector(length=8, dtype=wp.float32)
 """One number for each ray of a shot; an echo is (signal, range, brightness, which ray shows most of it)."""
 
 
@@ -32,19 +32,19 @@ class Receiver:
 
 
 @wp.func
-def measured(r: Receiver, echo: wp.vec4, luck: float) -> float:
+def measured_range(r: Receiver, echo: wp.vec4, noise: float) -> float:
     """Range of an echo [m]: noise grows as the signal comes near the weakest that is noticed."""
     sigma = r.noise
     if r.weakest > 0.0:
         sigma = wp.max(sigma, r.weak_noise * wp.sqrt(r.weakest / echo[0]))
-    range = echo[1] + sigma * luck
+    range = echo[1] + sigma * noise
     if r.step > 0.0:
         range = wp.round(range / r.step) * r.step
     return range
 
 
 @wp.func
-def name_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) -> int:
+def label_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) -> int:
     """Label of what a ray has met."""
     if primitive < 0:
         return ground_label
@@ -52,7 +52,7 @@ def name_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) 
 
 
 @wp.kernel
-def receive(
+def detect_returns(
     # model
     shapes: Shapes,
     label: wp.array(dtype=wp.int32),
@@ -66,7 +66,7 @@ def receive(
     primitive: wp.array(dtype=wp.int32),
     ground_label: int,
     ground_organ: int,
-    luck: wp.array2d(dtype=wp.float32),
+    noise: wp.array2d(dtype=wp.float32),
     # out
     xyz_out: wp.array2d(dtype=wp.vec3),
     intensity_out: wp.array2d(dtype=wp.float32),
@@ -75,9 +75,9 @@ def receive(
     """One thread makes one or two returns of one shot's rays; label -1 where there is none."""
     shot = first + wp.tid()
     rays = receiver.rays
-    t = Beam()
-    bright = Beam()
-    name = Beam()  # which ray, sorted with the others
+    t = RayValues()
+    bright = RayValues()
+    name = RayValues()  # which ray, sorted with the others
     count = wp.int32(0)
     for k in range(rays):
         ray = shot * rays + k
@@ -124,7 +124,7 @@ def receive(
                 shown = name[k]
             end = t[k]
             k += 1
-        if signal > 0.0 and signal * wp.exp(receiver.flicker * luck[shot, 2]) > receiver.weakest:
+        if signal > 0.0 and signal * wp.exp(receiver.flicker * noise[shot, 2]) > receiver.weakest:
             last = wp.vec4(signal, moment / signal, sum_light, shown)
             if signal > strongest[0]:
                 second = strongest
@@ -137,14 +137,14 @@ def receive(
         echo = last
     label_out[shot, 0] = -1
     if echo[0] > 0.0:
-        label_out[shot, 0] = name_of(primitive[int(echo[3])], label, ground_label)
-        xyz_out[shot, 0] = d * measured(receiver, echo, luck[shot, 0])
+        label_out[shot, 0] = label_of(primitive[int(echo[3])], label, ground_label)
+        xyz_out[shot, 0] = d * measured_range(receiver, echo, noise[shot, 0])
         intensity_out[shot, 0] = wp.clamp(100.0 * echo[2], 0.0, 255.0)
     if receiver.returns == 2:
         if last[1] == strongest[1]:
             last = second
         label_out[shot, 1] = -1
         if last[0] > 0.0 and wp.abs(last[1] - strongest[1]) >= receiver.separation:
-            label_out[shot, 1] = name_of(primitive[int(last[3])], label, ground_label)
-            xyz_out[shot, 1] = d * measured(receiver, last, luck[shot, 1])
+            label_out[shot, 1] = label_of(primitive[int(last[3])], label, ground_label)
+            xyz_out[shot, 1] = d * measured_range(receiver, last, noise[shot, 1])
             intensity_out[shot, 1] = wp.clamp(100.0 * last[2], 0.0, 255.0)

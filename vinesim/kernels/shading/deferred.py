@@ -11,24 +11,24 @@ from vinesim.kernels.raster.camera_raster import Pinhole
 from vinesim.kernels.raster.primitives import LEAF, SPHEROID, Shapes
 from vinesim.kernels.shading.materials import (
     BERRY,
-    Looks,
+    Materials,
     Surface,
     berry_surface,
     ground_surface,
     leaf_surface,
     mix,
-    smooth,
+    sample_bilinear,
     smoothstep,
     solid_surface,
 )
-from vinesim.kernels.shading.shadow_maps import ShadowMap, lit_share
+from vinesim.kernels.shading.shadow_maps import ShadowMap, sun_visibility
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-WHITE = wp.constant(3.0)
+WHITE_POINT = wp.constant(3.0)
 """Light, after exposure, that the tone curve shows as nearly white."""
-DARKEST = wp.constant(0.02)
-BRIGHTEST = wp.constant(2.0)
+MIN_METERED_LUMINANCE = wp.constant(0.02)
+MAX_METERED_LUMINANCE = wp.constant(2.0)
 """What is darker or brighter counts as this when light is metered."""
 
 
@@ -39,22 +39,22 @@ class Light:
     sun: wp.vec3
     sun_colour: wp.vec3
     sky_colour: wp.vec3
-    bounce: wp.vec3
+    ground_colour: wp.vec3
     """From the ground."""
-    leaves: wp.vec3
+    canopy_colour: wp.vec3
     """Through the canopy."""
-    haze: wp.vec3
-    taps: int
+    haze_colour: wp.vec3
+    shadow_taps: int
     """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""
-    spiral: wp.array(dtype=wp.vec2)
+    sample_spiral: wp.array(dtype=wp.vec2)
     """[taps] Vogel's spiral in the unit disc."""
-    turns: wp.array(dtype=wp.vec2)
+    sample_rotations: wp.array(dtype=wp.vec2)
     """[64] cosine and sine of 64 angles."""
-    table: wp.array2d(dtype=wp.vec3)
+    sky_table: wp.array2d(dtype=wp.vec3)
 
 
 @wp.func
-def arctangent(y: float, x: float) -> float:
+def fast_atan2(y: float, x: float) -> float:
     """atan2 to 1e-4 rad."""
     ax = wp.abs(x)
     ay = wp.abs(y)
@@ -69,40 +69,40 @@ def arctangent(y: float, x: float) -> float:
 
 
 @wp.func
-def sky_light(light: Light, d: wp.vec3) -> wp.vec3:
-    rows = light.table.shape[0]
-    columns = light.table.shape[1]
-    x = (arctangent(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
+def sky_radiance(light: Light, d: wp.vec3) -> wp.vec3:
+    rows = light.sky_table.shape[0]
+    columns = light.sky_table.shape[1]
+    x = (fast_atan2(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
     y = wp.sqrt(wp.max(d[2], 0.0)) * float(rows - 1)
     i = wp.clamp(int(x), 0, columns - 2)
     j = wp.clamp(int(y), 0, rows - 2)
     fx = x - float(i)
     fy = y - float(j)
-    low = light.table[j, i] * (1.0 - fx) + light.table[j, i + 1] * fx
-    high = light.table[j + 1, i] * (1.0 - fx) + light.table[j + 1, i + 1] * fx
+    low = light.sky_table[j, i] * (1.0 - fx) + light.sky_table[j, i + 1] * fx
+    high = light.sky_table[j + 1, i] * (1.0 - fx) + light.sky_table[j + 1, i + 1] * fx
     return low * (1.0 - fy) + high * fy
 
 
 @wp.func
-def ambient(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
+def ambient_light(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
     """Cool sky through the gaps, green light through leaves, warm bounce from the ground."""
     up = 0.5 + 0.5 * n[2]
-    above = light.sky_colour * (sky * sky) + light.leaves * (1.0 - sky)
-    return above * (0.25 + 0.75 * up) + light.bounce * ((1.0 - up) * (0.35 + 0.65 * sky))
+    above = light.sky_colour * (sky * sky) + light.canopy_colour * (1.0 - sky)
+    return above * (0.25 + 0.75 * up) + light.ground_colour * ((1.0 - up) * (0.35 + 0.65 * sky))
 
 
 @wp.func
-def mirrored(looks: Looks, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
+def reflected_light(materials: Materials, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
     """What a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
-    t = smooth(looks.noise, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
+    t = sample_bilinear(materials.noise_texture, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
     hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, t[1])
-    above = mix(light.leaves * 0.4, light.sky_colour * 1.3, hole)
-    return mix(light.bounce * 0.8, above, smoothstep(-0.25, 0.25, r[2]))
+    above = mix(light.canopy_colour * 0.4, light.sky_colour * 1.3, hole)
+    return mix(light.ground_colour * 0.8, above, smoothstep(-0.25, 0.25, r[2]))
 
 
 @wp.func
-def shine(
-    looks: Looks,
+def shade_surface(
+    materials: Materials,
     light: Light,
     near: ShadowMap,
     far: ShadowMap,
@@ -115,19 +115,19 @@ def shine(
 ) -> wp.vec3:
     """Light that leaves a surface at ``p`` against the unit ray ``d``."""
     n = s.normal
-    plain = s.plain
+    plain = s.geometric_normal
     if kind == LEAF and wp.dot(plain, d) > 0.0:
         n = -n
         plain = -plain
     ndl = wp.dot(n, light.sun)
     lit = float(0.0)
-    if ndl > 0.0 or s.through[0] > 0.0 or s.wrap[0] > 0.0:
+    if ndl > 0.0 or s.transmission[0] > 0.0 or s.wrap[0] > 0.0:
         away = plain
         if wp.dot(plain, light.sun) < 0.0:
             away = -plain
-        lit = lit_share(near, p, away, turn, light.spiral, light.taps)
+        lit = sun_visibility(near, p, away, turn, light.sample_spiral, light.shadow_taps)
         if lit < 0.0:
-            lit = lit_share(far, p, away, turn, light.spiral, light.taps)
+            lit = sun_visibility(far, p, away, turn, light.sample_spiral, light.shadow_taps)
             if lit < 0.0:
                 lit = wp.where(s.sky > 0.7, 1.0, s.sky)
     direct = wp.vec3(
@@ -138,45 +138,50 @@ def shine(
     colour = wp.cw_mul(
         s.albedo,
         wp.cw_mul(direct, light.sun_colour) * (lit * (0.35 + 0.65 * s.occlusion))
-        + ambient(light, n, s.sky) * s.occlusion,
+        + ambient_light(light, n, s.sky) * s.occlusion,
     )
-    if s.through[0] > 0.0:
+    if s.transmission[0] > 0.0:
         if kind == SPHEROID:  # a long way through the berry: saturated, brightest at the rim
             rim = wp.clamp(0.55 - 0.75 * ndl, 0.0, 1.0)
             sunny = rim * rim * 0.30 * (0.15 + 0.85 * lit) * s.occlusion * (0.25 + 0.75 * s.sky)
-            colour += wp.cw_mul(s.through, light.sun_colour * sunny + ambient(light, -n, s.sky) * (0.35 * s.occlusion))
+            colour += wp.cw_mul(
+                s.transmission, light.sun_colour * sunny + ambient_light(light, -n, s.sky) * (0.35 * s.occlusion)
+            )
         else:
             colour += wp.cw_mul(
-                s.through,
-                light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55) + ambient(light, -n, s.sky) * (0.30 * s.occlusion),
+                s.transmission,
+                light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55)
+                + ambient_light(light, -n, s.sky) * (0.30 * s.occlusion),
             )
-    if s.gloss > 0.0:
+    if s.specular > 0.0:
         grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
         g2 = grazing * grazing
-        fresnel = s.gloss + (1.0 - s.gloss) * g2 * g2 * grazing * wp.min(s.gloss * 14.0, 1.0) * 0.8
+        fresnel = s.specular + (1.0 - s.specular) * g2 * g2 * grazing * wp.min(s.specular * 14.0, 1.0) * 0.8
         if lit > 0.0 and ndl > -0.05:
             half = wp.normalize(light.sun - d)
             peak = 1.0 - wp.max(wp.dot(n, half), 0.0)
-            if s.polish * peak < 8.0:
+            if s.shininess * peak < 8.0:
                 colour += light.sun_colour * (
-                    fresnel * wp.exp(-s.polish * peak) * (s.polish * 0.14 + 0.4) * lit * (ndl + 0.05)
+                    fresnel * wp.exp(-s.shininess * peak) * (s.shininess * 0.14 + 0.4) * lit * (ndl + 0.05)
                 )
-        if s.mirror * fresnel > 0.006:
+        if s.reflectivity * fresnel > 0.006:
             r = d - n * (2.0 * wp.dot(n, d))
             if kind == LEAF:
-                above = mix(light.leaves * 0.45, light.sky_colour, s.sky * s.sky)
-                colour += mix(light.bounce, above, 0.5 + 0.5 * r[2]) * (wp.min(fresnel, 0.16) * s.mirror * s.occlusion)
+                above = mix(light.canopy_colour * 0.45, light.sky_colour, s.sky * s.sky)
+                colour += mix(light.ground_colour, above, 0.5 + 0.5 * r[2]) * (
+                    wp.min(fresnel, 0.16) * s.reflectivity * s.occlusion
+                )
             else:
-                colour += mirrored(looks, light, r, s.sky) * (fresnel * s.mirror * s.occlusion)
-    colour += s.albedo * s.glow
-    return mix(colour, light.haze, 0.6 * (1.0 - wp.exp(-t * 0.006)))
+                colour += reflected_light(materials, light, r, s.sky) * (fresnel * s.reflectivity * s.occlusion)
+    colour += s.albedo * s.emission
+    return mix(colour, light.haze_colour, 0.6 * (1.0 - wp.exp(-t * 0.006)))
 
 
 @wp.kernel
-def shade(
+def shade_pixels(
     # model
     shapes: Shapes,
-    looks: Looks,
+    materials: Materials,
     # in
     light: Light,
     near: ShadowMap,
@@ -194,7 +199,7 @@ def shade(
     across = (lens.width + half) >> half
     first = wp.tid() * run
     corners = block * block
-    back = wp.transpose(lens.turn)
+    back = wp.transpose(lens.rotation)
     for n in range(first, first + run):
         down = n // across
         left = (n - down * across) * block
@@ -232,27 +237,27 @@ def shade(
                 d = ray / scale
                 colour = wp.vec3(0.0, 0.0, 0.0)
                 if i == -1:
-                    colour = sky_light(light, d)
+                    colour = sky_radiance(light, d)
                 else:
                     p = lens.eye + ray * z
                     footprint = z * float(block) / lens.fx
                     # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
                     f = 0.06711056 * float(left) + 0.00583715 * float(top)
                     f = 52.9829189 * (f - wp.floor(f))
-                    turn = light.turns[int((f - wp.floor(f)) * 64.0) & 63]
+                    turn = light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
                     kind = wp.int32(-1)
                     s = Surface()
                     if i >= 0:
                         kind = shapes.kind[i]
                         if kind == LEAF:
-                            s = leaf_surface(shapes, looks, i, p, d, footprint)
-                        elif kind == SPHEROID and looks.material[i] == BERRY:
-                            s = berry_surface(shapes, looks, i, p, footprint)
+                            s = leaf_surface(shapes, materials, i, p, d, footprint)
+                        elif kind == SPHEROID and materials.material[i] == BERRY:
+                            s = berry_surface(shapes, materials, i, p, footprint)
                         else:
-                            s = solid_surface(shapes, looks, i, p, footprint)
+                            s = solid_surface(shapes, materials, i, p, footprint)
                     else:
-                        s = ground_surface(looks, p, footprint, footprint * z * scale / lens.eye[2])
-                    colour = shine(looks, light, near, far, s, kind, p, d, z * scale, turn)
+                        s = ground_surface(materials, p, footprint, footprint * z * scale / lens.eye[2])
+                    colour = shade_surface(materials, light, near, far, s, kind, p, d, z * scale, turn)
                 for k in range(c, corners):
                     x = left + (k & half)
                     y = top + (k >> half)
@@ -262,7 +267,7 @@ def shade(
 
 
 @wp.kernel
-def meter(
+def meter_luminance(
     # in
     radiance: wp.array(dtype=wp.vec3),
     width: int,
@@ -278,13 +283,13 @@ def meter(
     y = (i // across) * step + step / 2
     if y < height:
         c = radiance[y * width + x]
-        light = wp.clamp(0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2], DARKEST, BRIGHTEST)
+        light = wp.clamp(0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2], MIN_METERED_LUMINANCE, MAX_METERED_LUMINANCE)
         wp.atomic_add(sum_out, 0, wp.int64(int(wp.log2(light) * 65536.0)))
         wp.atomic_add(sum_out, 1, wp.int64(1))
 
 
 @wp.kernel
-def expose(
+def update_exposure(
     # in
     usual: float,
     key: float,
@@ -306,7 +311,7 @@ def expose(
 
 
 @wp.kernel
-def develop(
+def tone_map(
     # in
     radiance: wp.array(dtype=wp.vec3),
     width: int,
@@ -329,6 +334,6 @@ def develop(
         for k in range(samples * samples):
             c = wp.cw_mul(gain, radiance[(top + k // samples) * width * samples + left + k % samples])
             # what is brighter than white counts as white: edges against the sky stay smooth
-            colour += wp.min(c, wp.vec3(WHITE, WHITE, WHITE))
+            colour += wp.min(c, wp.vec3(WHITE_POINT, WHITE_POINT, WHITE_POINT))
         for k in range(3):
             rgb_out[pixel, k] = tone[wp.clamp(int(wp.sqrt(wp.max(colour[k] * per, 0.0)) * 1024.0), 0, 4095)]

@@ -13,7 +13,7 @@ from vinesim.kernels.raster.primitives import (
     TRIANGLE,
     Shapes,
     as_quat,
-    squeeze,
+    scale_along,
     xyz,
 )
 
@@ -40,16 +40,16 @@ GLASS = wp.constant(17)
 
 
 @wp.struct
-class Looks:
+class Materials:
     """Materials of all primitives and the tables they draw on."""
 
     material: wp.array(dtype=wp.int32)
     tint: wp.array(dtype=wp.vec3)
     sky: wp.array(dtype=wp.float32)
     """Share of the sky each primitive sees through the canopy."""
-    blade: wp.array3d(dtype=wp.vec4)
-    noise: wp.array2d(dtype=wp.vec4)
-    soil: wp.array2d(dtype=wp.vec4)
+    leaf_texture: wp.array3d(dtype=wp.vec4)
+    noise_texture: wp.array2d(dtype=wp.vec4)
+    soil_texture: wp.array2d(dtype=wp.vec4)
     rows: wp.vec2
     """Where the first row of vines stands, and their spacing [m], along y."""
     ground_sky: wp.array2d(dtype=wp.float32)
@@ -70,7 +70,7 @@ def mix(a: wp.vec3, b: wp.vec3, t: float) -> wp.vec3:
 
 
 @wp.func
-def smooth(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
+def sample_bilinear(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
     """Bilinear sample of a 256 x 256 table of period 1."""
     fx = (x - wp.floor(x)) * 256.0
     fy = (y - wp.floor(y)) * 256.0
@@ -86,7 +86,7 @@ def smooth(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
 
 
 @wp.func
-def texel_of(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
+def sample_nearest(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
     """Nearest sample of a 256 x 256 table of period 1."""
     return table[int((y - wp.floor(y)) * 256.0) & 255, int((x - wp.floor(x)) * 256.0) & 255]
 
@@ -96,92 +96,94 @@ class Surface:
     """What one point reflects."""
 
     normal: wp.vec3
-    plain: wp.vec3
+    geometric_normal: wp.vec3
     """Normal of the shape, without relief."""
     albedo: wp.vec3
-    through: wp.vec3
+    transmission: wp.vec3
     """Colour of the light that passes."""
     wrap: wp.vec3
     """How far light creeps round the terminator, by colour."""
     sky: float
     occlusion: float
-    gloss: float
+    specular: float
     """Fresnel reflectance at normal incidence."""
-    polish: float
+    shininess: float
     """Sharpness of the highlight."""
-    mirror: float
-    glow: float
+    reflectivity: float
+    emission: float
 
 
 @wp.func
-def matte(n: wp.vec3, albedo: wp.vec3, sky: float) -> Surface:
+def diffuse_surface(n: wp.vec3, albedo: wp.vec3, sky: float) -> Surface:
     s = Surface()
     s.normal = n
-    s.plain = n
+    s.geometric_normal = n
     s.albedo = albedo
-    s.through = wp.vec3(0.0, 0.0, 0.0)
+    s.transmission = wp.vec3(0.0, 0.0, 0.0)
     s.wrap = wp.vec3(0.0, 0.0, 0.0)
     s.sky = sky
     s.occlusion = 1.0
-    s.gloss = 0.03
-    s.polish = 12.0
-    s.mirror = 0.0
-    s.glow = 0.0
+    s.specular = 0.03
+    s.shininess = 12.0
+    s.reflectivity = 0.0
+    s.emission = 0.0
     return s
 
 
 @wp.func
-def ground_surface(looks: Looks, p: wp.vec3, pixel: float, slant: float) -> Surface:
+def ground_surface(materials: Materials, p: wp.vec3, pixel: float, slant: float) -> Surface:
     """Soil and sod at ``p``; ``slant`` is the length that one pixel covers along the line of sight [m]."""
     # seen at a grazing angle, spots would be drawn out into bands: far away only their mean is left
     blur = 1.0 / (1.0 + slant * slant * 1.5)
     mean = wp.vec4(0.5, 0.5, 0.5, 0.5)
     coarse = mean
     if blur > 0.01:
-        coarse = (smooth(looks.noise, p[0] * 0.21, p[1] * 0.21) - mean) * blur + mean
+        coarse = (sample_bilinear(materials.noise_texture, p[0] * 0.21, p[1] * 0.21) - mean) * blur + mean
     detail = 1.0 / (1.0 + pixel * pixel * 20000.0)
     tone = float(0.5)
     sod = float(0.5)
     n = wp.vec3(0.0, 0.0, 1.0)
     if detail > 0.08:
-        t = smooth(looks.soil, p[0] * 0.8, p[1] * 0.8)
+        t = sample_bilinear(materials.soil_texture, p[0] * 0.8, p[1] * 0.8)
         tone = 0.5 + (t[0] - 0.5) * detail
         sod = 0.5 + (t[1] - 0.5) * detail
         n = wp.normalize(wp.vec3(t[2] * detail, t[3] * detail, 1.0))
-    s = matte(n, wp.vec3(0.0, 0.0, 0.0), 0.75)
+    s = diffuse_surface(n, wp.vec3(0.0, 0.0, 0.0), 0.75)
     inside = float(0.0)
-    x = (p[0] - looks.ground_x) / looks.ground_cell
-    y = (p[1] - looks.ground_y) / looks.ground_cell
-    wide = float(looks.ground_sky.shape[1] - 1)
-    high = float(looks.ground_sky.shape[0] - 1)
+    x = (p[0] - materials.ground_x) / materials.ground_cell
+    y = (p[1] - materials.ground_y) / materials.ground_cell
+    wide = float(materials.ground_sky.shape[1] - 1)
+    high = float(materials.ground_sky.shape[0] - 1)
     if x > 0.0 and y > 0.0 and x < wide and y < high:
         i = int(x)
         j = int(y)
         fx = x - float(i)
         fy = y - float(j)
-        low = looks.ground_sky[j, i] * (1.0 - fx) + looks.ground_sky[j, i + 1] * fx
-        above = looks.ground_sky[j + 1, i] * (1.0 - fx) + looks.ground_sky[j + 1, i + 1] * fx
+        low = materials.ground_sky[j, i] * (1.0 - fx) + materials.ground_sky[j, i + 1] * fx
+        above = materials.ground_sky[j + 1, i] * (1.0 - fx) + materials.ground_sky[j + 1, i + 1] * fx
         s.sky = low * (1.0 - fy) + above * fy
-        edge = wp.min(wp.min(x, wide - x), wp.min(y, high - y)) * looks.ground_cell
+        edge = wp.min(wp.min(x, wide - x), wp.min(y, high - y)) * materials.ground_cell
         inside = smoothstep(0.0, 3.0, edge)
     green = smoothstep(
-        0.38, 0.60, 0.55 * coarse[0] + 0.2 * coarse[2] + 0.25 * sod + sown(looks.rows, p[1]) * inside * blur
+        0.38,
+        0.60,
+        0.55 * coarse[0] + 0.2 * coarse[2] + 0.25 * sod + row_greenness(materials.rows, p[1]) * inside * blur,
     )
     green = green * 0.85
     earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
     turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
     if inside < 1.0:
-        fields = smooth(looks.noise, p[0] * 0.011, p[1] * 0.011 + 0.37)
+        fields = sample_bilinear(materials.noise_texture, p[0] * 0.011, p[1] * 0.011 + 0.37)
         green = wp.min(green + (0.22 + 0.45 * smoothstep(0.35, 0.65, fields[1])) * (1.0 - inside), 0.92)
         turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), (1.0 - inside) * smoothstep(0.35, 0.6, fields[2]))
     s.albedo = mix(earth, turf, green) * (0.8 + 0.4 * coarse[1])
     s.occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
-    s.gloss = 0.0
+    s.specular = 0.0
     return s
 
 
 @wp.func
-def sown(rows: wp.vec2, y: float) -> float:
+def row_greenness(rows: wp.vec2, y: float) -> float:
     """How much greener than elsewhere the ground is across rows (first row [m], spacing [m]): bare under the vines and
     in the tracks of wheels, green between.
     """
@@ -192,32 +194,34 @@ def sown(rows: wp.vec2, y: float) -> float:
 
 
 @wp.func
-def berry_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
+def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: float) -> Surface:
     a4 = g.a[i]
     b4 = g.b[i]
     c4 = g.c[i]
     block = g.d[i]
     axis = xyz(b4)
     stretch = 1.0 / b4[3] - 1.0
-    e = squeeze(p - xyz(a4), axis, stretch)
-    n = wp.normalize(squeeze(e, axis, stretch))
-    tint = looks.tint[i]
-    s = matte(n, tint, looks.sky[i])
+    e = scale_along(p - xyz(a4), axis, stretch)
+    n = wp.normalize(scale_along(e, axis, stretch))
+    tint = materials.tint[i]
+    s = diffuse_surface(n, tint, materials.sky[i])
     # neighbours: a baked cosine lobe of what stands around
     s.occlusion = wp.clamp(1.0 - block[3] - wp.dot(xyz(block), n), 0.12, 1.0) * (0.4 + 0.6 * c4[1])
     light = tint[1] * 2.2  # pale berries let light through, dark ones carry the bloom
     pale = wp.clamp(light, 0.0, 1.0)
     red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
     s.wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
-    s.through = wp.vec3(0.95, 0.76, 0.12) * pale + wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
+    s.transmission = wp.vec3(0.95, 0.76, 0.12) * pale + wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
     bloom = 0.46 - 0.32 * pale - 0.10 * red
-    s.gloss = 0.045
+    s.specular = 0.045
     bm = bloom * 0.6
     if pixel < a4[3] * 0.35:
         w = wp.normalize(e)
         seed = c4[0]
-        wide = smooth(looks.noise, w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3)
-        fine = smooth(looks.noise, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
+        wide = sample_bilinear(
+            materials.noise_texture, w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3
+        )
+        fine = sample_bilinear(materials.noise_texture, w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
         s.albedo = tint * (0.86 + 0.28 * wide[1])
         s.albedo = mix(s.albedo, wp.vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide[0] + 0.15 * n[2]))
         s.albedo = s.albedo * (1.0 + pale * (0.14 * fine[2] - 0.07) + red * wp.where(fine[3] > 0.82, 0.22, 0.0))
@@ -227,13 +231,13 @@ def berry_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
         s.albedo = mix(s.albedo, wp.vec3(0.07, 0.045, 0.025), scar)
         s.albedo = mix(s.albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
     s.albedo = mix(s.albedo, wp.vec3(0.40, 0.43, 0.60), wp.clamp(bm, 0.0, 0.8))
-    s.polish = 260.0 - 300.0 * wp.min(bm, 0.75)
-    s.mirror = 1.0 - wp.min(bm * 1.6, 0.85)
+    s.shininess = 260.0 - 300.0 * wp.min(bm, 0.75)
+    s.reflectivity = 1.0 - wp.min(bm * 1.6, 0.85)
     return s
 
 
 @wp.func
-def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel: float) -> Surface:
+def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3, pixel: float) -> Surface:
     a4 = g.a[i]
     b4 = g.b[i]
     c4 = g.c[i]
@@ -248,12 +252,12 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
     slope_u = -2.0 * bend[0] * u - wp.where(u > 0.0, bend[2], -bend[2])
     slope_v = -2.0 * bend[1] * v
     plain = wp.normalize(side * slope_u + rib * slope_v + up)
-    s = matte(plain, looks.tint[i], looks.sky[i])
-    grass = looks.material[i] == GRASS
+    s = diffuse_surface(plain, materials.tint[i], materials.sky[i])
+    grass = materials.material[i] == GRASS
     if grass:
         s.albedo = s.albedo * (0.35 + 0.75 * (0.5 + 0.5 * v))
-        s.through = s.albedo * 0.7
-        s.gloss = 0.012
+        s.transmission = s.albedo * 0.7
+        s.specular = 0.012
         s.normal = wp.normalize(plain * 0.5 + wp.vec3(0.0, 0.0, 0.8))
         s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, v)
     else:
@@ -268,8 +272,11 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
             n = int(y)
             fx = x - float(m)
             fy = y - float(n)
-            low = looks.blade[number, n, m] * (1.0 - fx) + looks.blade[number, n, m + 1] * fx
-            high = looks.blade[number, n + 1, m] * (1.0 - fx) + looks.blade[number, n + 1, m + 1] * fx
+            low = materials.leaf_texture[number, n, m] * (1.0 - fx) + materials.leaf_texture[number, n, m + 1] * fx
+            high = (
+                materials.leaf_texture[number, n + 1, m] * (1.0 - fx)
+                + materials.leaf_texture[number, n + 1, m + 1] * fx
+            )
             t = low * (1.0 - fy) + high * fy
             clear = wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
             vein = t[0] * clear
@@ -277,7 +284,7 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
             s.normal = wp.normalize(side * (slope_u - t[1] * relief) + rib * (slope_v - t[2] * relief) + up)
             s.albedo = s.albedo * (0.72 + 0.5 * t[3])
         if age > 0.02:
-            spot = texel_of(looks.noise, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
+            spot = sample_nearest(materials.noise_texture, u * 0.13 + c4[3] * 5.3, v * 0.13 + c4[3] * 2.7)
             edge = (
                 float(
                     g.outline[
@@ -293,22 +300,22 @@ def leaf_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, d: wp.vec3, pixel:
             s.albedo = mix(s.albedo, wp.vec3(0.40, 0.34, 0.05), wp.clamp(yellow, 0.0, 1.0))
             brown = smoothstep(0.03, 0.0, edge - 0.05 * spot[2] * age) * smoothstep(0.35, 0.6, age)
             s.albedo = mix(s.albedo, wp.vec3(0.16, 0.085, 0.03), brown)
-        s.through = wp.cw_mul(s.albedo, wp.vec3(2.3, 2.0, 0.75)) * (1.0 - 0.7 * vein)
+        s.transmission = wp.cw_mul(s.albedo, wp.vec3(2.3, 2.0, 0.75)) * (1.0 - 0.7 * vein)
         if wp.dot(plain, d) > 0.0:  # from below: paler, felted, veins stand out
             s.albedo = mix(s.albedo * 1.05, wp.vec3(0.22, 0.27, 0.16), 0.42)
             s.albedo = mix(s.albedo, wp.vec3(0.34, 0.38, 0.20), vein * 0.7)
-            s.gloss = 0.012
-            s.polish = 6.0
+            s.specular = 0.012
+            s.shininess = 6.0
         else:
             s.albedo = mix(s.albedo, wp.vec3(0.20, 0.28, 0.08), vein * 0.40)
-            s.gloss = 0.05
-            s.polish = 22.0
-            s.mirror = 0.55
+            s.specular = 0.05
+            s.shininess = 22.0
+            s.reflectivity = 0.55
     return s
 
 
 @wp.func
-def unpacked(code: float) -> wp.vec3:
+def unpack_normal(code: float) -> wp.vec3:
     """A unit vector from one float: octahedral, two times eleven bits, plus one."""
     k = int(code) - 1
     x = float(k % 2047) * (2.0 / 2046.0) - 1.0
@@ -332,13 +339,13 @@ def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
         whole = wp.dot(n, n)
         v = wp.clamp(wp.dot(wp.cross(ap, ac), n) / whole, 0.0, 1.0)
         w = wp.clamp(wp.dot(wp.cross(ab, ap), n) / whole, 0.0, 1.0)
-        mixed = unpacked(a4[3]) * (1.0 - v - w) + unpacked(b4[3]) * v + unpacked(c4[3]) * w
+        mixed = unpack_normal(a4[3]) * (1.0 - v - w) + unpack_normal(b4[3]) * v + unpack_normal(c4[3]) * w
         n = wp.quat_rotate(as_quat(g.d[i]), mixed)
     return wp.normalize(n)
 
 
 @wp.func
-def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> Surface:
+def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: float) -> Surface:
     kind = g.kind[i]
     a4 = g.a[i]
     b4 = g.b[i]
@@ -346,7 +353,7 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
     a = xyz(a4)
     n = wp.vec3(0.0, 0.0, 1.0)
     grain = p  # position along and across the grain
-    sky = looks.sky[i]
+    sky = materials.sky[i]
     if kind == CONE or kind == CYLINDER:
         ba = xyz(b4) - a
         h = wp.clamp(wp.dot(p - a, ba) / wp.dot(ba, ba), 0.0, 1.0)
@@ -386,85 +393,93 @@ def solid_surface(g: Shapes, looks: Looks, i: int, p: wp.vec3, pixel: float) -> 
             n = wp.quat_rotate(q, wp.normalize(n))
         else:
             n = wp.normalize(wp.quat_rotate(q, wp.cw_div(grain, wp.cw_mul(half, half))))
-    material = looks.material[i]
-    tint = looks.tint[i]
-    s = matte(n, tint, sky)
+    material = materials.material[i]
+    tint = materials.tint[i]
+    s = diffuse_surface(n, tint, sky)
     seed = c4[1]
     near = pixel < 0.004
     if material == CANE:
         if near:
-            t = smooth(looks.noise, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 1.6 + seed * 3.1)
+            t = sample_bilinear(
+                materials.noise_texture, grain[0] * 9.0 + grain[1] * 7.0 + seed, grain[2] * 1.6 + seed * 3.1
+            )
             s.albedo = mix(tint * (0.55 + 0.9 * t[2]), wp.vec3(0.20, 0.10, 0.045), 0.5 * smoothstep(0.45, 0.7, t[0]))
             s.normal = wp.normalize(n + wp.vec3(t[1] - 0.5, t[2] - 0.5, t[3] - 0.5) * (0.7 / (1.0 + pixel * 500.0)))
-        s.polish = 14.0
+        s.shininess = 14.0
     elif material == BARK:
-        wide = smooth(
-            looks.noise, grain[0] * 2.6 + grain[2] * 0.24 + seed, grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4
+        wide = sample_bilinear(
+            materials.noise_texture,
+            grain[0] * 2.6 + grain[2] * 0.24 + seed,
+            grain[1] * 2.6 - grain[2] * 0.10 + grain[0] * 0.4,
         )
-        fine = texel_of(looks.noise, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed)
+        fine = sample_nearest(
+            materials.noise_texture, grain[0] * 6.0 + grain[2] * 0.45, grain[1] * 6.0 + grain[2] * 0.32 + seed
+        )
         height = wide[2] * 0.6 + fine[1] * 0.4
         s.albedo = mix(wp.vec3(0.085, 0.063, 0.045), wp.vec3(0.23, 0.175, 0.125), smoothstep(0.25, 0.80, height))
         s.occlusion = 0.6 + 0.4 * smoothstep(0.3, 0.55, height)
         s.normal = wp.normalize(n + wp.vec3(wide[2] - 0.5, fine[1] - 0.5, (wide[3] - 0.5) * 0.3) * 1.0)
-        s.gloss = 0.01
+        s.specular = 0.01
     elif material == POST:
-        wide = smooth(looks.noise, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
-        fine = texel_of(looks.noise, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)
+        wide = sample_bilinear(materials.noise_texture, grain[0] * 1.7 + grain[1] * 1.3 + seed, grain[2] * 0.35)
+        fine = sample_nearest(materials.noise_texture, grain[0] * 6.0 + grain[1] * 5.0, grain[2] * 0.9 + seed)
         s.albedo = (
             tint * (0.55 + 0.55 * wide[1] + 0.35 * fine[2]) * (1.0 - 0.45 * smoothstep(0.35, 0.0, p[2]) * wide[0])
         )
         s.normal = wp.normalize(n + wp.vec3(fine[1] - 0.5, fine[2] - 0.5, 0.0) * 0.5)
-        s.gloss = 0.02
+        s.specular = 0.02
     elif material == WIRE:
-        s.gloss = 0.35
-        s.polish = 30.0
-        s.mirror = 0.5
+        s.specular = 0.35
+        s.shininess = 30.0
+        s.reflectivity = 0.5
     elif material == PLASTIC:
-        t = texel_of(looks.noise, grain[0] * 2.0 + grain[2], grain[1] * 2.0 + grain[2])
+        t = sample_nearest(materials.noise_texture, grain[0] * 2.0 + grain[2], grain[1] * 2.0 + grain[2])
         s.albedo = tint * (0.85 + 0.3 * t[1])
-        s.gloss = 0.045
-        s.polish = 45.0
-        s.mirror = 0.6
+        s.specular = 0.045
+        s.shininess = 45.0
+        s.reflectivity = 0.6
     elif material == CLOTH:
-        wide = smooth(looks.noise, grain[0] * 1.4 + seed, grain[2] * 1.1 + grain[1] * 0.9)
+        wide = sample_bilinear(materials.noise_texture, grain[0] * 1.4 + seed, grain[2] * 1.1 + grain[1] * 0.9)
         s.albedo = tint * (0.78 + 0.45 * wide[0])
         s.normal = wp.normalize(n + wp.vec3(wide[0] - 0.5, wide[1] - 0.5, (wide[2] - 0.5) * 0.7) * 0.9)
-        s.gloss = 0.008
+        s.specular = 0.008
         s.wrap = wp.vec3(0.15, 0.15, 0.15)
     elif material == SKIN:
         s.wrap = wp.vec3(0.35, 0.15, 0.10)
-        s.polish = 14.0
+        s.shininess = 14.0
     elif material == PAINT:
-        s.gloss = 0.05
-        s.polish = 80.0
-        s.mirror = 0.4
+        s.specular = 0.05
+        s.shininess = 80.0
+        s.reflectivity = 0.4
     elif material == LAMP:
-        s.glow = 3.0
+        s.emission = 3.0
     elif material == RUBBER:
-        s.gloss = 0.03
-        s.polish = 8.0
+        s.specular = 0.03
+        s.shininess = 8.0
     elif material == METAL:
         s.albedo = tint * 0.55
-        s.gloss = 0.45
-        s.polish = 40.0
-        s.mirror = 0.7
+        s.specular = 0.45
+        s.shininess = 40.0
+        s.reflectivity = 0.7
     elif material == STRAW:
         if near:
-            t = texel_of(looks.noise, grain[0] * 9.0 + grain[2] * 5.0, grain[1] * 9.0 - grain[2] * 5.0)
+            t = sample_nearest(
+                materials.noise_texture, grain[0] * 9.0 + grain[2] * 5.0, grain[1] * 9.0 - grain[2] * 5.0
+            )
             s.albedo = tint * (0.70 + 0.5 * t[3])
             s.normal = wp.normalize(n + wp.vec3(t[3] - 0.5, t[2] - 0.5, 0.0) * 0.5)
-        s.through = tint * 0.25
-        s.gloss = 0.02
+        s.transmission = tint * 0.25
+        s.specular = 0.02
     elif material == REFLEX:
-        s.gloss = 0.12
-        s.polish = 20.0
-        s.mirror = 0.5
+        s.specular = 0.12
+        s.shininess = 20.0
+        s.reflectivity = 0.5
     elif material == GLASS:
-        s.gloss = 0.05
-        s.polish = 250.0
-        s.mirror = 1.0
+        s.specular = 0.05
+        s.shininess = 250.0
+        s.reflectivity = 1.0
     elif material == STEM:
-        s.through = tint * 0.3
+        s.transmission = tint * 0.3
     if material != WIRE:
         s.occlusion = s.occlusion * (0.55 + 0.45 * smoothstep(0.0, 0.35, p[2] + wp.max(n[2], 0.0) * 0.35))
     return s

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import RUN, Depths, Pixels
+from vinesim.kernels.raster.camera_raster import BATCH, FloatBatch, IntBatch
 from vinesim.kernels.raster.primitives import (
     BOX,
     CONE,
@@ -24,7 +24,7 @@ from vinesim.kernels.raster.primitives import (
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-SUN_HEIGHT = wp.constant(100.0)
+SUN_DISTANCE = wp.constant(100.0)
 """Depths of a shadow map count from this far towards the sun of its corner [m]."""
 SUN_RADIUS = wp.constant(0.0047)
 """Half of the sun's angle [rad]."""
@@ -44,7 +44,7 @@ class ShadowMap:
 
 
 @wp.kernel
-def see_sky(
+def sky_visibility(
     # model
     density: wp.array3d(dtype=wp.float32),
     corner: wp.vec3,
@@ -78,12 +78,12 @@ def see_sky(
 
 
 @wp.func
-def darken(m: ShadowMap, x: int, y: int, z: float, depth_out: wp.array(dtype=wp.float32)):
+def write_depth(m: ShadowMap, x: int, y: int, z: float, depth_out: wp.array(dtype=wp.float32)):
     wp.atomic_min(depth_out, y * m.side + x, z)
 
 
 @wp.kernel
-def cast_shadows(
+def raster_shadow_map(
     # model
     shapes: Shapes,
     clusters: Clusters,
@@ -99,8 +99,8 @@ def cast_shadows(
 ):
     """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it."""
     k, lane, part = wp.tid()
-    texels = Pixels()
-    depths = Depths()
+    texels = IntBatch()
+    depths = FloatBatch()
     cluster = which[k]
     kind = clusters.kind[cluster]
     bound = ball[cluster]
@@ -118,7 +118,7 @@ def cast_shadows(
             p = xyz(a4) - m.corner
             x = wp.dot(p, m.right) / m.texel
             y = wp.dot(p, m.up) / m.texel
-            z = SUN_HEIGHT - wp.dot(p, m.sun)
+            z = SUN_DISTANCE - wp.dot(p, m.sun)
             r = a4[3]
             if kind == SPHEROID:
                 rt = r / m.texel
@@ -128,14 +128,14 @@ def cast_shadows(
                         dy = float(py) - y
                         h = rt * rt - dx * dx - dy * dy
                         if h > 0.0:
-                            darken(m, px, py, z - wp.sqrt(h) * m.texel, depth_out)
+                            write_depth(m, px, py, z - wp.sqrt(h) * m.texel, depth_out)
             elif kind == CONE or kind == CYLINDER:
                 rb = wp.where(kind == CONE, b4[3], r)
                 if wp.max(r, rb) > smallest * m.texel:
                     q = xyz(b4) - m.corner
                     ex = wp.dot(q, m.right) / m.texel - x
                     ey = wp.dot(q, m.up) / m.texel - y
-                    ez = SUN_HEIGHT - wp.dot(q, m.sun) - z
+                    ez = SUN_DISTANCE - wp.dot(q, m.sun) - z
                     wide = wp.max(wp.max(r, rb) / m.texel, 0.55)
                     per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
                     y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
@@ -157,7 +157,7 @@ def cast_shadows(
                             rr = wp.max((r + (rb - r) * s) / m.texel, 0.55)
                             h = rr * rr - fx * fx - fy * fy
                             if h > 0.0:
-                                darken(m, px, py, z + ez * s - wp.sqrt(h) * m.texel, depth_out)
+                                write_depth(m, px, py, z + ez * s - wp.sqrt(h) * m.texel, depth_out)
             elif kind == LEAF:
                 rib = xyz(b4)
                 up = xyz(c4)
@@ -208,8 +208,8 @@ def cast_shadows(
                         row = float(py)
                         first_x = wp.max(int(wp.max(wp.max(lx, wp.max(ls - row, ld + row)), 0.0)), 0)
                         last_x = wp.min(int(wp.max(wp.min(hx, wp.min(hs - row, hd + row)) + 2.0, 0.0)), m.side)
-                        for start in range(first_x, last_x, RUN):
-                            run = wp.min(last_x - start, RUN)
+                        for start in range(first_x, last_x, BATCH):
+                            run = wp.min(last_x - start, BATCH)
                             whole = (run + 7) // 8 * 8
                             lot = wp.int32(0)
                             while lot < whole:  # without a branch: eight texels at once
@@ -228,7 +228,7 @@ def cast_shadows(
                             for lot in range(run):
                                 texel = texels[lot]
                                 inside = int(shapes.outline[number, texel >> 8, texel & 255]) > 0
-                                darken(m, start + lot, py, wp.where(inside, depths[lot], FAR), depth_out)
+                                write_depth(m, start + lot, py, wp.where(inside, depths[lot], FAR), depth_out)
             else:
                 o = xyz(a4)
                 reach_i = r
@@ -249,7 +249,7 @@ def cast_shadows(
                             m.corner
                             + m.right * (float(px) * m.texel)
                             + m.up * (float(py) * m.texel)
-                            + m.sun * SUN_HEIGHT
+                            + m.sun * SUN_DISTANCE
                         )
                         t = FAR
                         if kind == TRIANGLE:
@@ -261,11 +261,13 @@ def cast_shadows(
                             else:
                                 t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
                         if t < FAR:
-                            darken(m, px, py, t, depth_out)
+                            write_depth(m, px, py, t, depth_out)
 
 
 @wp.func
-def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.array(dtype=wp.vec2), taps: int) -> float:
+def sun_visibility(
+    m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.array(dtype=wp.vec2), taps: int
+) -> float:
     """Share of the sun's disc seen from ``p``; -1 outside the map. Soft by the distance of what stands between."""
     facing = wp.abs(wp.dot(n, m.sun))
     e = p + n * (m.texel * (1.0 + 1.6 * (1.0 - facing))) - m.corner
@@ -274,7 +276,7 @@ def lit_share(m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.ar
     lit = float(-1.0)
     if x > 8.0 and y > 8.0 and x < float(m.side) - 9.0 and y < float(m.side) - 9.0:
         z = (
-            SUN_HEIGHT
+            SUN_DISTANCE
             - wp.dot(e, m.sun)
             - m.texel * (0.4 + 0.7 * wp.sqrt(1.0 - facing * facing) / wp.max(facing, 0.12))
         )

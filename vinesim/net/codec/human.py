@@ -15,7 +15,7 @@ import numpy as np
 
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import FARTHEST, FORCE, HUMAN, TURN, MessageError, quaternion, rotation_vector
-from vinesim.scene.values import POINTS, HumanPose, HumanUpdate, RobotUpdate
+from vinesim.scene.values import POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
 STEP = 2e-4
 """Unit of a point's place from the root [m]; what is farther than 6.5 m is clipped."""
@@ -32,7 +32,7 @@ STRONGEST = 2000.0
 MAX_LINKS = 64
 """Links of one robot that one person may push at once."""
 
-_POINTS = len(POINTS)
+_POINTS = len(POINT_NAMES)
 _HUMAN = struct.Struct(f"<3f{6 * _POINTS - 3}h2H{6 * _POINTS}bB10B")
 _FLAGS = ("left_closed", "right_closed", "left_busy", "right_busy")
 _WRENCH = struct.Struct("<6f")

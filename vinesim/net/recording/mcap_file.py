@@ -31,7 +31,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose, decode_push
 from vinesim.net.codec.messages import MessageError
 from vinesim.scene.ids import Kind, unthing
-from vinesim.scene.values import POINTS, HumanUpdate
+from vinesim.scene.values import POINT_NAMES, HumanUpdate
 
 FLUSH = 0.5
 """What was recorded is in the hands of the operating system after this time [s], and on the disk: a recorder that is
@@ -85,7 +85,7 @@ def _say_pose(payload: bytes, key: str) -> dict[str, Any]:
     update = decode_pose(payload, sender_of(key))
     here = {"timestamp": _stamp(update.time), "frame_id": "map", "pose": _pose(update.base_q)}
     if isinstance(update, HumanUpdate):
-        return here | {"points": {name: _pose(at) for name, at in zip(POINTS, update.pose.points, strict=True)}}
+        return here | {"points": {name: _pose(at) for name, at in zip(POINT_NAMES, update.pose.points, strict=True)}}
     return here | {
         "velocity": update.base_qd.tolist(),
         "joint_position": update.position.tolist(),
@@ -239,7 +239,7 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             velocity={**_list(_NUMBER), "description": "of its base: m/s, rad/s, world axes"},
             joint_position={**_list(_NUMBER), "description": "rad or m"},
             joint_velocity={**_list(_NUMBER), "description": "rad/s or m/s"},
-            points=_object("points", "of a person", **dict.fromkeys(POINTS, _POSE)), **_COMMON,
+            points=_object("points", "of a person", **dict.fromkeys(POINT_NAMES, _POSE)), **_COMMON,
         ),
     ),
     "c": (

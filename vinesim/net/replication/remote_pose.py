@@ -10,7 +10,7 @@ from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.jitter_buffer import Buffer
 from vinesim.net.transport.bus import Subscription
-from vinesim.scene.values import POINTS, HumanUpdate, RobotUpdate
+from vinesim.scene.values import POINT_NAMES, HumanUpdate, RobotUpdate
 
 ELSEWHERE = 1.0
 """Who is this far [m] from where he was taken to be has been put there: it is shown at once, not blended."""
@@ -19,8 +19,8 @@ FAR_SHOWN = 0.1
 """Of who is far away nothing is heard for 200 ms: what is shown of him is computed anew only so often [s]."""
 
 _BASE = np.arange(3, 7)[None]
-_HIPS = slice(7 * POINTS.index("hips"), 7 * POINTS.index("hips") + 3)
-_TURNS = 7 * np.arange(len(POINTS))[:, None] + _BASE
+_HIPS = slice(7 * POINT_NAMES.index("hips"), 7 * POINT_NAMES.index("hips") + 3)
+_TURNS = 7 * np.arange(len(POINT_NAMES))[:, None] + _BASE
 
 
 class Actor:
@@ -86,7 +86,7 @@ class Actor:
             twist = np.concatenate([rate[:3], heard.base_qd[3:]])
             return RobotUpdate(heard.actor, now, shown[:7], twist, shown[7:], rate[7:])
         if isinstance(heard, HumanUpdate):
-            return HumanUpdate(heard.actor, now, heard.pose.at(shown.reshape(-1, 7)), heard.velocity * going)
+            return HumanUpdate(heard.actor, now, heard.pose.with_points(shown.reshape(-1, 7)), heard.velocity * going)
         return dataclasses.replace(
             heard, time=now, base_q=shown[:7], base_qd=heard.base_qd * going, position=shown[7:],
             velocity=heard.velocity * going,

@@ -245,7 +245,7 @@ def _moved(pose: np.ndarray, velocity: np.ndarray, dt: float | np.ndarray) -> np
 
 def _middles(model: Model) -> np.ndarray:
     """Where each tree is [tree, 3] m: the mean of its settled bodies."""
-    origins = model.forward(model.joint_settled)[:, :3]
+    origins = model.forward_kinematics(model.joint_settled)[:, :3]
     middles = np.zeros((len(model.tree_first), 3))
     np.add.at(middles, model.body_tree, origins)
     return middles / np.maximum(model.tree_size, 1)[:, None]

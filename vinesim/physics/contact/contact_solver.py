@@ -16,9 +16,9 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.contact import solver as kernels
-from vinesim.kernels.launch import bind
+from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE, RigidGeoms
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene.model import Model
@@ -80,7 +80,7 @@ def plant_capsules(model: Model) -> PlantCapsules:
         for i, (first, count) in enumerate(zip(model.bunch_cluster, model.bunch_clusters, strict=True))
         for k in range(count)
     }
-    stalk_of = model.bunch_of().tolist()
+    stalk_of = model.bunch_of_body().tolist()
     lengths, radii = model.body_length.tolist(), model.body_radius.mean(1).tolist()
     for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
         if b in of_body:
@@ -114,8 +114,8 @@ def plant_capsules(model: Model) -> PlantCapsules:
 class ContactSolver:
     """Contacts between the plants and the rigid world of one tick.
 
-    ``wake_near_trees()`` (before ``plants.free()``) wakes whatever a rigid body comes near; ``solve()`` (after it) leaves
-    ``bodies`` and ``wrenches`` for ``plants.commit()`` and ``rigid_force`` for ``rigid.finish()``.
+    ``wake_near_trees()`` (before ``plants.predict()``) wakes whatever a rigid body comes near; ``solve()`` (after it) leaves
+    ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.finish()``.
 
     Robots, boxes and loose bunches wake the trees that they come near. What stands (ground, poles, trunks) and other
     branches only hold back what moves already; what overlaps in the shape as drawn does so only beyond that.
@@ -129,7 +129,7 @@ class ContactSolver:
     def __init__(
         self,
         model: Model,
-        plants: Plants,
+        plants: ArticulationSolver,
         rigid: Rigid,
         *,
         capacity: int = 128,
@@ -169,7 +169,7 @@ class ContactSolver:
         self._awake = np.zeros(0, np.int32)
         self._allocate()
         self._renew()
-        drawn = model.forward(model.joint_settled)[self.capsules.body]
+        drawn = model.forward_kinematics(model.joint_settled)[self.capsules.body]
         for kept, end in ((self._start_drawn, self.capsules.start), (self._end_drawn, self.capsules.end)):
             kept[:] = drawn[:, :3] + frames.rotate(drawn[:, 3:], end.astype(float))
         self._bound(np.arange(len(model.tree_first), dtype=np.int32))
@@ -249,7 +249,7 @@ class ContactSolver:
         trees = np.flatnonzero(((self._tree_low <= high) & (low <= self._tree_high)).all(1))
         if len(trees) == 0:
             return None
-        self.plants.kinematics(trees)
+        self.plants.forward_kinematics(trees)
         s, state, model = self.capsules, self.plants.state, self.model
         at = np.concatenate([np.arange(s.tree_start[tree], s.tree_start[tree + 1]) for tree in trees])
         fine = state.tree_fine[model.body_tree[s.body[at]]]
@@ -292,7 +292,7 @@ class ContactSolver:
 
     def _deal(self, count: int, *launches: Callable[..., None]) -> None:
         """Launch over so many trees of the list, for each one launch after the other; threads take turns in it."""
-        crew = self.plants.crew
+        crew = self.plants.thread_pool
         threads = 1 if crew is None or count < MIN_TREES_PER_THREAD * crew.size else crew.size
         if self._dealt != (count, threads):
             self._dealt = (count, threads)
@@ -303,7 +303,7 @@ class ContactSolver:
             return
         share = [len(range(i, count, threads)) for i in range(threads)]
         first = [sum(share[:i]) for i in range(threads)]
-        crew.share([partial(_all, launches, share[i], first[i], i) for i in range(threads)])
+        crew.run([partial(_all, launches, share[i], first[i], i) for i in range(threads)])
 
     def _bound_tree_blocks(self, blocks: np.ndarray) -> None:
         """Bring the boxes around some blocks of trees up to their trees."""
@@ -361,8 +361,8 @@ class ContactSolver:
         if self._tally[kernels.STRUCK]:
             struck = awake[self._onset[: len(awake)]]
             if (self.plants.phi_used[struck] < 1.0).any():
-                self.plants.brace(struck)
-                self.plants.free()
+                self.plants.use_backward_euler(struck)
+                self.plants.predict()
 
     # ------------------------------------------------------------------ with what force
 
@@ -378,7 +378,7 @@ class ContactSolver:
         rigid_answer[:] = 0.0
         self._coupling(n)
 
-        self._y[:touched, :, :touched] = self.plants.response(bodies)
+        self._y[:touched, :, :touched] = self.plants.impulse_response(bodies)
         bound = self._tally[kernels.BOUND] = self.rigid.bound(self._geoms.body[self._other[:n].clip(0)])
         self._answering(rows)
         if bound:
@@ -554,16 +554,18 @@ class ContactSolver:
         moving, speed = vectors("geom_middle", "geom_velocity", "geom_spin"), doubles("geom_speed")[0]
         dt, k, c = self.dt, self.stiffness, self.damping
         softness = 1.0 / (dt * (k * dt + c))
-        dealt = {"over": "every", "shares": self.plants.threads}
+        dealt = {"index_list": "every", "partitions": self.plants.threads}
 
-        self._bound_geoms = bind(
+        self._bound_geoms = bind_launch(
             kernels.bound_geoms,
             [dt, g_id, g_body, g_root, g_center, g_half, g_dof, d_parent, xpos, xmat, cvel, cdof,
              *doubles("dof_free", "dof_held", "dof_held_before"), com],
             [*moving, speed, *g_box],
         )  # fmt: skip
-        self._bound_actors = bind(kernels.bound_actors, [MIN_WAKING_SPEED, a_first, a_lies, speed, *g_box], a_box)
-        self._bound_trees = bind(
+        self._bound_actors = bind_launch(
+            kernels.bound_actors, [MIN_WAKING_SPEED, a_first, a_lies, speed, *g_box], a_box
+        )
+        self._bound_trees = bind_launch(
             kernels.bound_trees,
             [dt, s_tree, s_body, s_bunch, s_when, shared(s.start, wp.vec3), shared(s.end, wp.vec3), s_radius,
              shared(self._reach_of_shape, float), *ints("every", "trees"), body_q, body_qd, fine],
@@ -572,10 +574,10 @@ class ContactSolver:
         )  # fmt: skip
         told = shared(self.remote_trees, wp.bool)
         a_copy, g_copy = shared(self._actor_copy, wp.bool), shared(self._geom_copy, wp.bool)
-        self._reach = bind(
+        self._reach = bind_launch(
             kernels.reach, [a_first, a_copy, told, *blocks, *t_box, *a_box, *g_box], [shared(self._near, wp.bool)]
         )
-        self._bound_blocks = bind(kernels.bound_blocks, [*ints("blocks"), *t_box], blocks)
+        self._bound_blocks = bind_launch(kernels.bound_blocks, [*ints("blocks"), *t_box], blocks)
         hit = [shared(x, wp.int32) for x in (self._hit_shape, self._hit_other)]
         hit += [
             shared(self._hit_gap, wp.float64),
@@ -584,7 +586,7 @@ class ContactSolver:
             shared(self._hit_point, wp.vec3d),
         ]
         onset, now = shared(self._onset, wp.bool), [body_q, body_qd, body_qd_free, *s_at, cut, s_speed, *s_box]
-        self._meeting = bind(
+        self._meeting = bind_launch(
             kernels.meet,
             [dt, MAX_CONTACTS_PER_TREE, self._movable, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, g_id, g_kind,
              g_size, g_radius, g_copy, *ints("every"), told, fine, attached, *ints("trees"), *t_box, *now, xmat,
@@ -592,7 +594,7 @@ class ContactSolver:
             [*ints("close", "found"), *hit, onset],
             **dealt,
         )  # fmt: skip
-        self._meeting_branches = bind(
+        self._meeting_branches = bind_launch(
             kernels.meet_branches,
             [dt, MAX_CONTACTS_PER_TREE, m_parent, s_tree, s_body, s_bunch, s_when, s_radius, *s_drawn, *ints("last_bunch", "every"),
              fine, attached, *ints("order", "tally", "trees"), *t_box, *w_box, *now],
@@ -602,14 +604,16 @@ class ContactSolver:
         flat = [x.flatten() for x in hit]
         known = [*ints("known_shape", "known_other"), *doubles("known_push"), *vectors("known_rub", "known_anchor")]
         axes, sparse = shared(self._axes, wp.mat33d), [shared(x, wp.int32) for x in mj["sparse"]]
-        self._gathering = bind(kernels.gather, [MAX_CONTACTS_PER_TREE, *ints("found"), onset], ints("hits", "tally"))
-        self._indexing = bind(
+        self._gathering = bind_launch(
+            kernels.gather, [MAX_CONTACTS_PER_TREE, *ints("found"), onset], ints("hits", "tally")
+        )
+        self._indexing = bind_launch(
             kernels.index,
             [s_body, m_tree, g_dof, sparse[0], *ints("hits"), *flat[:2], *ints("group")],
             ints("tally", "bodies", "contact_shape", "contact_body", "place", "other_body", "other_place", "island",
                  "island_first", "island_member"),
         )  # fmt: skip
-        self._coupling = bind(
+        self._coupling = bind_launch(
             kernels.couple,
             [dt, k, c, FRICTION, g_friction, g_dof, g_root, d_parent, *ints("hits"),
              *flat[1:], *ints("contact_shape", "contact_body", "other_body"), body_q,
@@ -620,23 +624,25 @@ class ContactSolver:
         pairs, rows = ints("other", "place", "other_place"), doubles("plant_rows", "rigid_rows")
         answers, y = doubles("plant_answer", "rigid_answer"), shared(self._y, float).reshape((12 * self.capacity, -1))
         blocks = ints("island", "island_first", "island_member")
-        self._answering = bind(
+        self._answering = bind_launch(
             kernels.answer,
             [*sparse[:3], g_dof, *sparse[3:], m_tree, *ints("bodies", "tally"), *pairs, *rows, y,
              *(shared(x, wp.float64) for x in mj["factors"])],
             answers,
         )  # fmt: skip
-        self._assembling = bind(kernels.assemble, [g_dof, d_parent, *blocks, *pairs, *rows, *answers], doubles("A"))
-        self._adding = bind(
+        self._assembling = bind_launch(
+            kernels.assemble, [g_dof, d_parent, *blocks, *pairs, *rows, *answers], doubles("A")
+        )
+        self._adding = bind_launch(
             kernels.add_up, [dt, *ints("tally"), *pairs, rows[0], *doubles("impulse")], doubles("wrench")
         )
-        self._relaxing = bind(
+        self._relaxing = bind_launch(
             kernels.relax,
             [softness, MAX_SWEEPS, MAX_NEWTON_STEPS, MAX_NEWTON_CONTACTS, IMPULSE_TOLERANCE, *blocks[1:],
              *doubles("friction", "A", "free", "offset")],
             [*doubles("rows", "impulse"), *ints("sweeps")],
         )  # fmt: skip
-        self._remembering = bind(
+        self._remembering = bind_launch(
             kernels.remember,
             [dt, k, c, *blocks, *ints("contact_shape", "other"), axes, *doubles("A", "free", "impulse")],
             [*vectors("force"), *known],

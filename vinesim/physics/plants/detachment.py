@@ -2,7 +2,7 @@
 
 A bunch becomes a free body of the rigid world in the same tick, with its pose, velocity and weight; on the tree stay
 its peduncle and a stub of a gram, so the tree's numbering never changes. A cane that is cut falls with all that grows
-on it, its bunches still hanging from it (:meth:`Plants.cut`).
+on it, its bunches still hanging from it (:meth:`ArticulationSolver.cut`).
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Contact, Parting
 
-STUB = 1e-3
+STUB_MASS = 1e-3
 """What stays of a bunch on the tree [kg]."""
 PATIENCE = 3
 """[tick] A peduncle parts when it has been strained too much for so long: one tick's peak is not a pull."""
@@ -42,41 +42,41 @@ class Blade:
         self.closing = True
 
 
-class Partings:
+class DetachmentMonitor:
     """Watches the peduncles of awake trees and the blades that close, and takes off what parts."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, contact_solver: ContactSolver) -> None:
+    def __init__(self, plants: ArticulationSolver, rigid: Rigid, contact_solver: ContactSolver) -> None:
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.blades: list[Blade] = []
-        self.held: tuple[Contact, ...] = ()
+        self.hand_contacts: tuple[Contact, ...] = ()
         """Hands that hold plants, as contacts; who holds a bunch may be the one who pulled it off."""
         model = plants.model
-        self._strained = np.zeros(len(model.bunch_body), np.int32)
-        self._bunch_of = model.bunch_of()
+        self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
+        self._bunch_of = model.bunch_of_body()
         trees = model.body_tree[model.bunch_body]
         order = np.argsort(trees, kind="stable")
         self._bunches = order.astype(np.int32)
         self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
         self._awake: np.ndarray | None = None
-        self._at_stake = self._bunches[:0]
-        self._told: list[Parting] = []
+        self._awake_bunches = self._bunches[:0]
+        self._detachments: list[Parting] = []
 
     # ------------------------------------------------------------------ the tick
 
-    def update(self, *, strain: bool = True) -> tuple[Parting, ...]:
+    def update(self, *, check_load: bool = True) -> tuple[Parting, ...]:
         """After a commit: all that parted since the last call, sorted by body. ``strain`` off: only what is cut."""
-        if strain:
-            self._pull()
+        if check_load:
+            self._detach_overloaded()
         if any(blade.closing for blade in self.blades):
-            self._close()
-        told, self._told = tuple(sorted(self._told, key=lambda parting: parting.body)), []
+            self._cut_with_blades()
+        told, self._detachments = tuple(sorted(self._detachments, key=lambda parting: parting.body)), []
         return told
 
-    def _pull(self) -> None:
+    def _detach_overloaded(self) -> None:
         """Part the bunches whose peduncles have been strained for long enough, where that is ours to judge."""
         model = self.plants.model
-        bunches = self._hanging()
+        bunches = self._attached_bunches()
         if self.contact_solver.remote_trees.any():
             bunches = bunches[~self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunches]]]]
         if len(bunches) == 0:
@@ -87,14 +87,16 @@ class Partings:
         bent = square[:, 3:].sum(1) / np.square(model.bunch_bend[bunches])
         strained = np.maximum(pulled, bent) > 1.0
         if not strained.any():
-            self._strained[bunches] = 0
+            self._overloaded_steps[bunches] = 0
             return
-        self._strained[bunches] = np.where(strained, self._strained[bunches] + 1, 0)
-        for i in np.flatnonzero(self._strained[bunches] >= PATIENCE):
+        self._overloaded_steps[bunches] = np.where(strained, self._overloaded_steps[bunches] + 1, 0)
+        for i in np.flatnonzero(self._overloaded_steps[bunches] >= PATIENCE):
             bunch = int(bunches[i])
-            self._pick(bunch, "pull" if pulled[i] >= bent[i] else "bend", self._toucher(bunch), carried[i])
+            self._pick(
+                bunch, "pull" if pulled[i] >= bent[i] else "bend", self._hardest_pressing_actor(bunch), carried[i]
+            )
 
-    def _hanging(self) -> np.ndarray:
+    def _attached_bunches(self) -> np.ndarray:
         """The bunches on awake trees that have not been picked [k]."""
         awake = self.plants.awake
         if awake is not self._awake:
@@ -102,24 +104,24 @@ class Partings:
             first = self._first[awake]
             count = self._first[awake + 1] - first
             inner = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-            self._at_stake = self._bunches[np.repeat(first, count) + inner]
-        attached = self.plants.state.bunch_attached[self._at_stake]
-        return self._at_stake if attached.all() else self._at_stake[attached]
+            self._awake_bunches = self._bunches[np.repeat(first, count) + inner]
+        attached = self.plants.state.bunch_attached[self._awake_bunches]
+        return self._awake_bunches if attached.all() else self._awake_bunches[attached]
 
-    def _close(self) -> None:
+    def _cut_with_blades(self) -> None:
         """Cut what lies in the mouths that are closing."""
-        self.plants.kinematics()
+        self.plants.forward_kinematics()
         for blade in self.blades:
             if blade.closing:
                 blade.closing = False
-                for body in self._in_mouth(blade).tolist():
+                for body in self._bodies_in_mouth(blade).tolist():
                     bunch = int(self._bunch_of[body])
                     if bunch < 0:
                         self.cut(body, "blade", blade.actor)
                     elif self.plants.state.bunch_attached[bunch]:
                         self.pick(bunch, "blade", blade.actor)
 
-    def _in_mouth(self, blade: Blade) -> np.ndarray:
+    def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
         """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the one next to the root."""
         model, body_q = self.plants.model, self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
@@ -138,9 +140,9 @@ class Partings:
         caught = caught[~self.plants.state.body_cut[caught]]
         inside = np.zeros(len(self._wood), bool)
         inside[caught] = True
-        return caught[~self._below(caught, inside)]
+        return caught[~self._has_marked_ancestor(caught, inside)]
 
-    def _below(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
+    def _has_marked_ancestor(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
         """Which of some bodies [k] grow on a marked one [body], with no cut between them."""
         parent, cut = self.plants.model.body_parent, self.plants.state.body_cut
         below, at = np.zeros(len(bodies), bool), bodies.copy()
@@ -153,8 +155,8 @@ class Partings:
 
     def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
         """Take one bunch off where it hangs; it keeps its pose and velocity. Call it between ticks."""
-        if not 0 <= bunch < len(self._strained):
-            raise ValueError(f"no bunch {bunch}; there are 0 to {len(self._strained) - 1}")
+        if not 0 <= bunch < len(self._overloaded_steps):
+            raise ValueError(f"no bunch {bunch}; there are 0 to {len(self._overloaded_steps) - 1}")
         if not self.plants.state.bunch_attached[bunch]:
             raise ValueError(f"bunch {bunch} was picked already")
         body = self.plants.model.bunch_body[bunch]
@@ -165,7 +167,7 @@ class Partings:
         body = int(model.bunch_body[bunch])
         tree = int(model.body_tree[body])
         plants.wake(tree)
-        plants.kinematics(np.array([tree]))
+        plants.forward_kinematics(np.array([tree]))
         shapes, state = self.contact_solver.capsules, plants.state
         # as touched so far, its clusters where they are: what holds it must not feel the difference
         here = (shapes.bunch == bunch) & (shapes.level != (1 if state.tree_fine[tree] else 2))
@@ -182,10 +184,10 @@ class Partings:
         )  # fmt: skip
         self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], plants.state.body_qd[body])
         plants.state.bunch_attached[bunch] = False
-        self._strained[bunch] = 0
-        plants.reweigh(body, STUB)
+        self._overloaded_steps[bunch] = 0
+        plants.set_mass(body, STUB_MASS)
         plants.body_drag[body] = 0.0
-        self._tell(body, bunch, cause, actor, carried)
+        self._record(body, bunch, cause, actor, carried)
 
     def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
         """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between ticks."""
@@ -200,34 +202,34 @@ class Partings:
         carried = plants.joint_wrench(np.array([body]))[0]
         tree = int(plants.model.body_tree[body])
         plants.wake(tree)
-        plants.kinematics(np.array([tree]))
+        plants.forward_kinematics(np.array([tree]))
         plants.cut(body)
-        self._tell(body, -1, cause, actor, carried)
+        self._record(body, -1, cause, actor, carried)
 
-    def told_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+    def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Take one bunch off its vine because somebody else has, and put it where they say: ``pose`` [7], ``velocity``
         [6]. It is no parting of ours: nobody is told of it.
         """
         self._pick(bunch, "told", "", np.zeros(6))
-        self._told.pop()
+        self._detachments.pop()
         self.rigid.place_bunch(bunch, pose, velocity)
 
-    def told_cut(self, body: int) -> None:
+    def apply_remote_cut(self, body: int) -> None:
         """Cut a body off its parent because somebody else has."""
         if not self.plants.state.body_cut[body]:
             tree = int(self.plants.model.body_tree[body])
             self.plants.wake(tree)
             self.plants.cut(body)
 
-    def _tell(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
+    def _record(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
         tree = int(self.plants.model.body_tree[body])
         force, moment = carried[:3].astype(float), carried[3:].astype(float)
-        self._told.append(Parting(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
+        self._detachments.append(Parting(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
 
-    def _toucher(self, bunch: int) -> str:
+    def _hardest_pressing_actor(self, bunch: int) -> str:
         """Who presses hardest on a bunch, nobody if none does."""
         pushes: dict[str, float] = {}
-        for contact in self.contact_solver.contacts + self.held:
+        for contact in self.contact_solver.contacts + self.hand_contacts:
             if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")

@@ -16,50 +16,50 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.articulation.gather_scatter import carry
-from vinesim.kernels.launch import bind
+from vinesim.kernels.articulation.gather_scatter import copy_rows
+from vinesim.kernels.launch import bind_launch
 
-LANES = 32
+WARP_SIZE = 32
 """Threads of a GPU that go in step."""
 
 
-class NoDevice(ValueError):
+class DeviceUnavailable(ValueError):
     """The text says which device cannot be had, and what to do."""
 
     exit_code = 3
 
 
-def device_of(name: str) -> wp.Device:
-    """The Warp device called ``cpu``, ``cuda`` or ``cuda:N``; :class:`NoDevice` in words if there is none."""
+def find_device(name: str) -> wp.Device:
+    """The Warp device called ``cpu``, ``cuda`` or ``cuda:N``; :class:`DeviceUnavailable` in words if there is none."""
     if name != "cpu" and name.partition(":")[0] != "cuda":
-        raise NoDevice(f"device {name!r}: give cpu, cuda or cuda:N")
+        raise DeviceUnavailable(f"device {name!r}: give cpu, cuda or cuda:N")
     if name != "cpu" and wp.get_cuda_device_count() == 0:
-        raise NoDevice(
+        raise DeviceUnavailable(
             f"device {name!r}: Warp sees no NVIDIA GPU here (none, or no driver for it); use cpu, which needs none"
         )
     try:
         return wp.get_device(name)
     except (ValueError, RuntimeError):
-        raise NoDevice(
+        raise DeviceUnavailable(
             f"device {name!r}: this machine has {wp.get_cuda_device_count()} NVIDIA GPUs, counted from cuda:0"
         ) from None
 
 
-class Memory:
+class DeviceBuffers:
     """The arrays of one model on one device, by name.
 
     Args:
-        device: see :func:`device_of`.
-        lanes: how many trees lie side by side in copies that kernels work on, 0 for no copies. Unless given, 0 on the
-            CPU and :data:`LANES` with a GPU.
+        device: see :func:`find_device`.
+        interleave: how many trees lie side by side in copies that kernels work on, 0 for no copies. Unless given, 0 on the
+            CPU and :data:`WARP_SIZE` with a GPU.
     """
 
-    def __init__(self, device: str, lanes: int | None = None) -> None:
-        self.device = device_of(device)
-        lanes = (LANES if self.device.is_cuda else 0) if lanes is None else lanes
-        self.apart = lanes > 0
+    def __init__(self, device: str, interleave: int | None = None) -> None:
+        self.device = find_device(device)
+        interleave = (WARP_SIZE if self.device.is_cuda else 0) if interleave is None else interleave
+        self.has_copies = interleave > 0
         """Whether kernels have copies of their own."""
-        self.pitch = max(lanes, 1)
+        self.pitch = max(interleave, 1)
         """From one body of a tree to the next, as kernels count."""
         self.arrays: dict[str, wp.array] = {}
         """What kernels work on."""
@@ -68,29 +68,29 @@ class Memory:
         self._dtypes: dict[str, type] = {}
         self._points: set[str] = set()
 
-    def arrange(self, first: np.ndarray, size: np.ndarray) -> None:
+    def set_layout(self, first: np.ndarray, size: np.ndarray) -> None:
         """Give each body its place: ``at`` [body], out of ``places``. ``first``, ``size`` [tree] are the model's."""
         trees = np.arange(len(first))
         there = first
-        if self.apart:
+        if self.has_copies:
             group = trees // self.pitch
             deepest = np.zeros(len(trees) // self.pitch + 1, np.int64)
             np.maximum.at(deepest, group, size)
             there = (np.cumsum(deepest) - deepest)[group] * self.pitch + trees % self.pitch
         tree = np.repeat(trees, size)
-        self.at = (there[tree] + (np.arange(len(tree)) - first[tree]) * self.pitch).astype(np.int32)
+        self.slots = (there[tree] + (np.arange(len(tree)) - first[tree]) * self.pitch).astype(np.int32)
         """Where kernels look for each body [body]."""
-        self.places = int(deepest.sum()) * self.pitch if self.apart else len(tree)
+        self.slot_count = int(deepest.sum()) * self.pitch if self.has_copies else len(tree)
         self._largest = int(size.max(initial=1))
         for name, data in (("tree_first", there), ("host_first", first), ("tree_size", size)):
-            self.constant(name, data.astype(np.int32), wp.int32)
+            self.add_constant(name, data.astype(np.int32), wp.int32)
 
     @property
-    def span(self) -> int:
+    def max_tree_extent(self) -> int:
         """Places from the first body of the largest tree to its last, both included."""
         return (self._largest - 1) * self.pitch + 1
 
-    def within_reach(self, data: np.ndarray) -> np.ndarray:
+    def pinned(self, data: np.ndarray) -> np.ndarray:
         """``data`` itself if the device can reach it, a copy that it can reach otherwise: use that from now on."""
         if self.device.is_cpu or data.size == 0:
             return data
@@ -99,12 +99,12 @@ class Memory:
         pinned[...] = data
         return pinned
 
-    def constant(self, name: str, data: np.ndarray, dtype: type) -> None:
+    def add_constant(self, name: str, data: np.ndarray, dtype: type) -> None:
         """An array that nobody will write."""
         self.arrays[name], self.host[name] = wp.array(data, dtype=dtype, device=self.device), data
 
-    def reach(self, name: str, data: np.ndarray, dtype: type) -> None:
-        """An array that kernels read and write where it is; with a GPU it must come from :meth:`within_reach`."""
+    def add_shared(self, name: str, data: np.ndarray, dtype: type) -> None:
+        """An array that kernels read and write where it is; with a GPU it must come from :meth:`pinned`."""
         if self.device.is_cpu:
             shared = wp.array(data, dtype=dtype, device="cpu", copy=False)
             if data.size and shared.ptr != data.ctypes.data:
@@ -114,37 +114,37 @@ class Memory:
             shared = wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
         self.arrays[name], self.host[name] = shared, data
 
-    def rows(self, name: str, data: np.ndarray, dtype: type, *, points: bool = False) -> None:
+    def add_body_rows(self, name: str, data: np.ndarray, dtype: type, *, points: bool = False) -> None:
         """An array with a row of four-byte numbers for each body, written by both sides.
 
-        See :meth:`carrier` and :meth:`upload`. ``points``: its numbers are bodies, or negative.
+        See :meth:`row_copier` and :meth:`upload`. ``points``: its numbers are bodies, or negative.
         """
-        if not self.apart:
-            self.reach(name, data, dtype)
+        if not self.has_copies:
+            self.add_shared(name, data, dtype)
             return
         self.host[name], self._dtypes[name] = data, dtype
         self._points |= {name} if points else set()
-        self.arrays[name] = wp.zeros(self.places, dtype=dtype, device=self.device)
+        self.arrays[name] = wp.zeros(self.slot_count, dtype=dtype, device=self.device)
         self.upload([name])
 
-    def scratch(self, name: str, dtype: type) -> None:
+    def add_scratch(self, name: str, dtype: type) -> None:
         """Rows that only kernels see."""
-        self.arrays[name] = wp.empty(self.places, dtype=dtype, device=self.device)
+        self.arrays[name] = wp.empty(self.slot_count, dtype=dtype, device=self.device)
 
     def upload(self, names: list[str]) -> None:
         """Copy whole arrays of rows to the device. Not for every tick."""
-        for name in names if self.apart else []:
+        for name in names if self.has_copies else []:
             data = self.host[name]
-            there = np.zeros((self.places, *data.shape[1:]), data.dtype)
-            there[self.at] = np.where(data >= 0, self.at[data], data) if name in self._points else data
+            there = np.zeros((self.slot_count, *data.shape[1:]), data.dtype)
+            there[self.slots] = np.where(data >= 0, self.slots[data], data) if name in self._points else data
             self.arrays[name].assign(there)
 
-    def carrier(self, names: tuple[str, ...], trees: str, *, back: bool = False) -> Callable[[int], None]:
+    def row_copier(self, names: tuple[str, ...], trees: str, *, back: bool = False) -> Callable[[int], None]:
         """A function of n that carries rows of the first n ``trees`` to the device, or ``back`` to the host.
 
         Nothing happens where both sides share their memory.
         """
-        if not self.apart:
+        if not self.has_copies:
             return lambda count: None
         widths = np.array([self.host[name][:1].size for name in names])
         starts = np.append(0, np.cumsum(widths * self._largest))
@@ -155,10 +155,10 @@ class Memory:
         addresses = [wp.array(np.array(x, np.uint64), dtype=wp.uint64, device=self.device) for x in (source, target)]
         a, threads = self.arrays, int(starts[-1])
         given = [threads, pitch, pitch_there, a[first], a[first_there], a["tree_size"], *ints, a[trees], addresses[0]]
-        launch = bind(carry, given, [addresses[1]], device=str(self.device), block=256)
+        launch = bind_launch(copy_rows, given, [addresses[1]], device=str(self.device), block=256)
         return lambda count: launch(count * threads)
 
-    def wait(self) -> None:
+    def synchronize(self) -> None:
         """Until the device has done all that was asked of it."""
         if self.device.is_cuda:
             wp.synchronize_stream(self.device.stream)

@@ -1,6 +1,6 @@
 """A tree that goes wrong is stopped, put to rest and reported; the rest of the world goes on.
 
-``Plants.commit()`` does not integrate a tree in which a rate is not finite or beyond ``Plants.bound``: its joints stay
+``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or beyond ``ArticulationSolver.fault_rate``: its joints stay
 where they were when the tick began, the last state that was sound. Here such trees are found after the commit.
 """
 
@@ -11,11 +11,11 @@ import logging
 
 import numpy as np
 
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
 log = logging.getLogger(__name__)
 
-KEPT = 1000
+MAX_PENDING_FAULTS = 1000
 """Most faults kept for the log between two reports; the count goes on."""
 
 
@@ -29,26 +29,26 @@ class Fault:
     """[rad/s] Fastest joint that the tick would have had; NaN if it was not a number."""
 
 
-class Guard:
+class FaultGuard:
     """Finds trees that a commit refused to integrate and lays them to rest in their last sound pose."""
 
-    def __init__(self, plants: Plants) -> None:
+    def __init__(self, plants: ArticulationSolver) -> None:
         self.plants = plants
         self.count = np.zeros(len(plants.model.tree_first), np.int32)
         """Faults of each tree so far [tree]."""
         self._faults: list[Fault] = []
 
-    def check(self) -> np.ndarray:
+    def stop_faulty_trees(self) -> np.ndarray:
         """After a commit: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
         plants, state = self.plants, self.plants.state
         awake = plants.awake
         rate = plants.tree_rate[awake]
-        stopped = awake[~(rate <= plants.bound)]
+        stopped = awake[~(rate <= plants.fault_rate)]
         if len(stopped) == 0:
             return stopped
         self.count[stopped] += 1
         rates = plants.tree_rate[stopped].tolist()
-        room = max(KEPT - len(self._faults), 0)
+        room = max(MAX_PENDING_FAULTS - len(self._faults), 0)
         self._faults += [Fault(plants.tick, *what) for what in zip(stopped.tolist(), rates, strict=True)][:room]
         bodies = plants.bodies_of(stopped)
         length = np.square(state.joint_q[bodies], dtype=float).sum(-1)
@@ -58,10 +58,10 @@ class Guard:
         state.joint_xd[cut] = 0.0
         lost = cut[~np.isfinite(state.joint_x[cut]).all(-1)]
         if len(lost):
-            state.joint_x[lost] = plants.model.forward(plants.model.joint_settled)[lost, :3]  # where it grew
+            state.joint_x[lost] = plants.model.forward_kinematics(plants.model.joint_settled)[lost, :3]  # where it grew
         loads = plants.body_load[bodies]
         plants.body_load[bodies] = np.where(np.isfinite(loads), loads, 0.0)
-        plants.rest(stopped)
+        plants.put_to_sleep(stopped)
         return stopped
 
     def report(self) -> list[Fault]:

@@ -1,6 +1,6 @@
 """How finely bunches move: berries in clusters where somebody is near or looks closely, one compound each elsewhere.
 
-Switching changes no pose and no momentum (:meth:`Plants.refine`, :meth:`Plants.coarsen`), so it may happen in any tick.
+Switching changes no pose and no momentum (:meth:`ArticulationSolver.refine`, :meth:`ArticulationSolver.coarsen`), so it may happen in any tick.
 Refining is never late: it happens in the tick in which somebody's box reaches into the tree's. Coarsening waits until
 everybody is gone for a while and the clusters have come to rest against their bunch.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
 LINGER = 100
 """[tick] A tree stays fine for so long after the last one has gone."""
@@ -19,10 +19,12 @@ PATIENCE = 25
 """[tick] So long must they be at rest: longer than the turning point of any swing of theirs."""
 
 
-class Detail:
+class LevelOfDetail:
     """Refines the trees that somebody is near or watches, and coarsens them when that is over."""
 
-    def __init__(self, plants: Plants, *, linger: int = LINGER, quiet: float = QUIET, patience: int = PATIENCE) -> None:
+    def __init__(
+        self, plants: ArticulationSolver, *, linger: int = LINGER, quiet: float = QUIET, patience: int = PATIENCE
+    ) -> None:
         self.plants, self.linger, self.quiet, self.patience = plants, linger, quiet, patience
         model = plants.model
         trees = len(model.tree_first)
@@ -35,17 +37,17 @@ class Detail:
         self._attached = -1
         self._worth = np.zeros(trees, bool)
 
-    def watch(self, points: np.ndarray, radius: float) -> None:
+    def set_focus(self, points: np.ndarray, radius: float) -> None:
         """Look closely at what hangs within ``radius`` [m] of ``points`` [n, 3], until told otherwise; none: stop."""
         self._points, self._radius = np.asarray(points, float).reshape(-1, 3), float(radius)
 
     @property
-    def fine(self) -> np.ndarray:
+    def fine_trees(self) -> np.ndarray:
         """The trees whose clusters move, sorted [k]."""
         return np.flatnonzero(self.plants.state.tree_fine)
 
     def update(self, near: np.ndarray) -> None:
-        """Before ``free()``: ``near`` [k] are the awake trees that somebody reaches into."""
+        """Before ``predict()``: ``near`` [k] are the awake trees that somebody reaches into."""
         plants, state = self.plants, self.plants.state
         attached = int(np.count_nonzero(state.bunch_attached))
         if attached != self._attached:  # a tree whose bunches are gone has nothing to refine
@@ -56,7 +58,7 @@ class Detail:
         if len(self._points):
             seen = self._seen()
             wanted = np.union1d(wanted, seen) if len(seen) else wanted
-        fine = self.fine
+        fine = self.fine_trees
         if len(fine):
             self._wanted[wanted] = True
             self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)

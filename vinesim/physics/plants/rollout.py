@@ -1,13 +1,13 @@
 """Gradients through time: how a loss on the motion of trees depends on their springs, dampers, masses and first state.
 
-The kernels are those that :class:`vinesim.physics.plants.articulation_solver.Plants` launches, compiled once more with their adjoints; here
+The kernels are those that :class:`vinesim.physics.plants.articulation_solver.ArticulationSolver` launches, compiled once more with their adjoints; here
 each tick has arrays of its own, so that the way back finds what the way there left. Checkpoints bound the memory: a run
 keeps only joints, every ``checkpoint`` ticks; on the way back each segment is run once more before its adjoint is. The
 loss is yours, in NumPy, PyTorch or by hand: :meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient`
 takes the loss's derivatives by them. docs/gradients.md shows it at work.
 
 The gradient is of the scheme as it steps, so it is exact where the scheme is smooth. It is not at the tick in which a
-joint passes ``brisk`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme itself
+joint passes ``fast_rate`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme itself
 damps that much, and asking for less changes nothing.
 """
 
@@ -21,15 +21,20 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.articulation import dynamics
-from vinesim.physics.plants.articulation_solver import BOUND, BRISK, LIMIT, Plants
-from vinesim.physics.plants.device_buffers import Memory, device_of
+from vinesim.physics.plants.articulation_solver import (
+    FAST_JOINT_RATE,
+    FAULT_JOINT_RATE,
+    MAX_JOINT_RATE,
+    ArticulationSolver,
+)
+from vinesim.physics.plants.device_buffers import DeviceBuffers, find_device
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
 _FREE, _INTEGRATE, _PLACE = (
     wp.kernel(kernel.func, module="vinesim.physics.plants.rollout", enable_backward=True)
-    for kernel in (dynamics.free, dynamics.integrate, dynamics.place)
+    for kernel in (dynamics.predict, dynamics.integrate, dynamics.forward_kinematics)
 )
 _STILL = ("body_load", "body_wrench")
 """Inputs that are zero unless given."""
@@ -39,7 +44,7 @@ _PARAMETERS = ("joint_stiffness", "joint_damping", "body_mass", "body_inertia", 
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Track:
+class Trajectory:
     """Where the watched bodies were: at the start, and after each tick."""
 
     body_q: np.ndarray
@@ -47,7 +52,7 @@ class Track:
     body_qd: np.ndarray
     """[tick + 1, watched, 6] velocity of the origin [m/s] and angular velocity [rad/s], world axes."""
     phi: np.ndarray
-    """[tick, tree] the phi that each tick was stepped with: 1 once a joint has turned faster than ``brisk``."""
+    """[tick, tree] the phi that each tick was stepped with: 1 once a joint has turned faster than ``fast_rate``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -62,13 +67,13 @@ class Gradient:
     """[body] by ``body_mass``, the moments of inertia scaling along."""
     load: np.ndarray
     """[body, 6] by ``load``."""
-    turn: np.ndarray
+    rotation: np.ndarray
     """[body, 3] by a small rotation vector [rad] put in front of the first ``joint_q``, in joint-frame axes."""
     joint_qd: np.ndarray
     """[body, 3] by the first ``joint_qd``."""
 
 
-class WentWrong(ValueError):
+class RolloutDiverged(ValueError):
     """The text says which tree left what can be simulated, and when."""
 
 
@@ -81,7 +86,7 @@ class Rollout:
         watch: bodies [k] whose motion the loss looks at; all that move unless given.
         fine: let the berry clusters of bunches move.
         dt: tick [s].
-        phi: see :class:`vinesim.physics.plants.articulation_solver.Plants`; likewise ``brisk``, ``limit``, ``bound`` and ``tension``.
+        phi: see :class:`vinesim.physics.plants.articulation_solver.ArticulationSolver`; likewise ``fast_rate``, ``max_rate``, ``fault_rate`` and ``geometric_stiffness``.
         checkpoint: ticks between two states that the first run keeps. Memory is about 1.2 kB for each body and tick of
             one segment, and 56 B for each body and checkpoint.
         device: ``cpu``, ``cuda`` or ``cuda:N``.
@@ -92,38 +97,46 @@ class Rollout:
         model: Model,
         ticks: int,
         *,
-        watch: np.ndarray | None = None,
+        watched: np.ndarray | None = None,
         fine: bool = False,
         dt: float = 0.01,
         phi: float = 0.55,
         checkpoint: int = 50,
         device: str = "cpu",
-        brisk: float = BRISK,
-        limit: float = LIMIT,
-        bound: float = BOUND,
-        tension: bool = True,
+        fast_rate: float = FAST_JOINT_RATE,
+        max_rate: float = MAX_JOINT_RATE,
+        fault_rate: float = FAULT_JOINT_RATE,
+        geometric_stiffness: bool = True,
     ) -> None:
         if ticks < 1 or checkpoint < 1 or not dt > 0.0 or not 0.5 <= phi <= 1.0:
             raise ValueError(
                 f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, dt above 0, "
                 "phi from 0.5 to 1"
             )
-        self.model, self.ticks, self.dt, self.bound, self.device = model, ticks, dt, bound, device_of(device)
+        self.model, self.ticks, self.dt, self.fault_rate, self.device = (
+            model,
+            ticks,
+            dt,
+            fault_rate,
+            find_device(device),
+        )
         self.state = State.at_rest(model)
-        plants = Plants(model, self.state, memory=Memory("cpu"))  # what the kernels are given there they are given here
+        plants = ArticulationSolver(
+            model, self.state, buffers=DeviceBuffers("cpu")
+        )  # what the kernels are given there they are given here
         if fine:
             plants.refine(np.arange(len(model.tree_first)))
-        self._host = plants.memory.host
+        self._host = plants.buffers.host
         moving = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
         moving = moving < self._host["tree_moving"][model.body_tree]
-        self.watch = np.flatnonzero(moving) if watch is None else np.asarray(watch)
-        if not moving[self.watch].all():
-            body = int(self.watch[~moving[self.watch]][0])
+        self.watched = np.flatnonzero(moving) if watched is None else np.asarray(watched)
+        if not moving[self.watched].all():
+            body = int(self.watched[~moving[self.watched]][0])
             raise ValueError(f"body {body} is a berry cluster that rides on its bunch: watch that, or give fine=True")
         self._slots = min(checkpoint, ticks)
         trees = len(model.tree_first)
         self._given = {
-            "dt": dt, "brisk": brisk, "limit": limit, "bound": bound, "tension": float(tension),
+            "dt": dt, "brisk": fast_rate, "limit": max_rate, "bound": fault_rate, "tension": float(geometric_stiffness),
             "gravity": wp.vec3(GRAVITY), "pitch": 1,
         }  # fmt: skip
         self._arrays = {
@@ -149,7 +162,7 @@ class Rollout:
         load: np.ndarray | None = None,
         joint_q: np.ndarray | None = None,
         joint_qd: np.ndarray | None = None,
-    ) -> Track:
+    ) -> Trajectory:
         """Roll out and return what was watched.
 
         Args:
@@ -177,21 +190,21 @@ class Rollout:
             start["joint_q"] = frames.normalize(self._sound("joint_q", joint_q, start["joint_q"].shape))
         if joint_qd is not None:
             start["joint_qd"] = self._sound("joint_qd", joint_qd, start["joint_qd"].shape)
-        poses = np.empty((self.ticks + 1, len(self.watch), 7), np.float32)
-        motions = np.empty((self.ticks + 1, len(self.watch), 6), np.float32)
+        poses = np.empty((self.ticks + 1, len(self.watched), 7), np.float32)
+        motions = np.empty((self.ticks + 1, len(self.watched), 6), np.float32)
         phi = np.empty((self.ticks, len(model.tree_first)), np.float32)
         self._checkpoints = [start]
         for segment, first, count in self._segments():
             self._replay(segment, count)
             rows = slice(first, first + count)
-            poses[rows] = self._stacks["body_q"].numpy()[:count, self.watch]
-            motions[rows] = self._stacks["body_qd"].numpy()[:count, self.watch]
+            poses[rows] = self._stacks["body_q"].numpy()[:count, self.watched]
+            motions[rows] = self._stacks["body_qd"].numpy()[:count, self.watched]
             phi[rows] = self._stacks["tree_phi"].numpy()[:count]
             self._checkpoints.append({name: self._stacks[name].numpy()[count].copy() for name in start})
             self._refuse(first, self._stacks["tree_rate"].numpy()[:count])
-        poses[-1] = self._last[0].numpy()[self.watch]
-        motions[-1] = self._last[1].numpy()[self.watch]
-        return Track(poses, motions, phi)
+        poses[-1] = self._last[0].numpy()[self.watched]
+        motions[-1] = self._last[1].numpy()[self.watched]
+        return Trajectory(poses, motions, phi)
 
     # and back
 
@@ -204,7 +217,7 @@ class Rollout:
         """
         if not self._checkpoints:
             raise ValueError("there is no run to differentiate; call run() first")
-        shape = (self.ticks + 1, len(self.watch))
+        shape = (self.ticks + 1, len(self.watched))
         by_q = np.zeros((*shape, 7)) if by_q is None else self._sound("by_q", by_q, (*shape, 7))
         by_qd = np.zeros((*shape, 6)) if by_qd is None else self._sound("by_qd", by_qd, (*shape, 6))
         for name in _PARAMETERS:
@@ -236,7 +249,7 @@ class Rollout:
             damping=by["joint_damping"],
             mass=by["body_mass"] + along / self._host["body_mass"],
             load=by["body_load"],
-            turn=(turned * carried["joint_q"][:, None]).sum(-1),
+            rotation=(turned * carried["joint_q"][:, None]).sum(-1),
             joint_qd=carried["joint_qd"].astype(float),
         )
 
@@ -315,7 +328,7 @@ class Rollout:
     def _seed(self, grad: wp.array, rows: np.ndarray) -> None:
         """Write the loss's derivatives of some ticks by the watched bodies, zero by all others."""
         seed = np.zeros((*grad.shape, rows.shape[-1]), np.float32)
-        np.add.at(seed.reshape(-1, *seed.shape[-2:]), (slice(0, len(rows)), self.watch), rows)
+        np.add.at(seed.reshape(-1, *seed.shape[-2:]), (slice(0, len(rows)), self.watched), rows)
         _fill(grad, seed)
 
     def _set(self, name: str, value: np.ndarray) -> None:
@@ -333,10 +346,10 @@ class Rollout:
         return value
 
     def _refuse(self, first: int, rate: np.ndarray) -> None:
-        bad = np.argwhere(~(rate <= self.bound))
+        bad = np.argwhere(~(rate <= self.fault_rate))
         if len(bad):
             tick, tree = bad[0].tolist()
-            raise WentWrong(
+            raise RolloutDiverged(
                 f"tree {tree} turned at {rate[tick, tree]} rad/s in tick {first + tick}; start it slower, or give it "
                 "more stiffness, damping or shorter ticks"
             )

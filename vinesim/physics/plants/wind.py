@@ -12,13 +12,13 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import AIR, Plants
+from vinesim.physics.plants.articulation_solver import AIR_DENSITY, ArticulationSolver
 from vinesim.scene.builder import GRAVITY
 
-WAVES = 48
+GUST_WAVES = 48
 """Plane waves of which gusts are made."""
 
-STIR = 0.05
+WAKE_DRAG_RATIO = 0.05
 """A sleeping tree wakes when the drag on it has changed by this share of its weight since it fell asleep."""
 
 ROUND = 32
@@ -46,24 +46,26 @@ class Wind:
         # wave numbers at equal shares of the energy; shuffled, since directions are drawn by number
         grid = np.geomspace(1e-2, 1e2, 4000) / scale
         energy = np.cumsum((grid * scale) ** 4 / (1.0 + (grid * scale) ** 2) ** (17.0 / 6.0) * np.gradient(grid))
-        share = (np.arange(WAVES) + 0.5) / WAVES
+        share = (np.arange(GUST_WAVES) + 0.5) / GUST_WAVES
         number = np.interp(rng.permutation(share), energy / energy[-1], grid)
-        along = frames.normalize(rng.normal(size=(WAVES, 3)))
+        along = frames.normalize(rng.normal(size=(GUST_WAVES, 3)))
         self._wave = number[:, None] * along
-        self._phase = rng.uniform(0.0, 2.0 * np.pi, WAVES)
-        across = np.cross(along, frames.normalize(rng.normal(size=(WAVES, 3))))
-        self._sway = frames.normalize(across) * gusts * np.sqrt(6.0 / WAVES)
-        self._plants: Plants | None = None
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, GUST_WAVES)
+        across = np.cross(along, frames.normalize(rng.normal(size=(GUST_WAVES, 3))))
+        self._sway = frames.normalize(across) * gusts * np.sqrt(6.0 / GUST_WAVES)
+        self._plants: ArticulationSolver | None = None
         self._round = 0
 
-    def at(self, points: np.ndarray, time: float) -> np.ndarray:
+    def velocity_at(self, points: np.ndarray, time: float) -> np.ndarray:
         """Velocity of the air [..., 3] m/s at points [..., 3] m of the world at a time [s]."""
         points = np.asarray(points, float)
         if self.gusts == 0.0:
             return np.broadcast_to(self.mean, points.shape)
         return self.mean + np.cos((points - self.mean * time) @ self._wave.T + self._phase) @ self._sway
 
-    def update(self, plants: Plants, time: float, reach: tuple[np.ndarray, float] | None = None) -> None:
+    def update(
+        self, plants: ArticulationSolver, time: float, observers: tuple[np.ndarray, float] | None = None
+    ) -> None:
         """Set ``plants.tree_air`` of awake trees for the next tick; wake sleepers that the wind would move.
 
         Wind blows everywhere and gusts let nothing rest, but ten thousand awake trees fit in no tick. ``reach`` =
@@ -77,24 +79,24 @@ class Wind:
             number = np.arange(len(model.body_mass)) - first[model.body_tree]
             core = number < model.tree_core[model.body_tree]  # a bunch's mass has its clusters in it
             self._weight = np.add.reduceat(model.body_mass * core, first) * -GRAVITY[2]
-        awake = self._within(plants.awake, reach)
-        plants.tree_air[awake] = self.at(self._foot[awake], time)
+        awake = self._near_observers(plants.awake, observers)
+        plants.tree_air[awake] = self.velocity_at(self._foot[awake], time)
 
         self._round = (self._round + 1) % ROUND
         some = np.arange(self._round, len(self._foot), ROUND)
-        some = self._within(some[~plants.state.tree_awake[some] & (self._area[some] > 0.0)], reach)
-        air, felt = self.at(self._foot[some], time), plants.tree_air[some].astype(float)
+        some = self._near_observers(some[~plants.state.tree_awake[some] & (self._area[some] > 0.0)], observers)
+        air, felt = self.velocity_at(self._foot[some], time), plants.tree_air[some].astype(float)
         change = air * np.linalg.norm(air, axis=-1, keepdims=True) - felt * np.linalg.norm(felt, axis=-1, keepdims=True)
-        force = 0.5 * AIR * self._area[some] * np.linalg.norm(change, axis=-1)
-        stirred = force > STIR * self._weight[some]
+        force = 0.5 * AIR_DENSITY * self._area[some] * np.linalg.norm(change, axis=-1)
+        stirred = force > WAKE_DRAG_RATIO * self._weight[some]
         plants.tree_air[some[stirred]] = air[stirred]
         plants.wake(some[stirred])
 
-    def _within(self, trees: np.ndarray, reach: tuple[np.ndarray, float] | None) -> np.ndarray:
+    def _near_observers(self, trees: np.ndarray, observers: tuple[np.ndarray, float] | None) -> np.ndarray:
         """Those of some trees whose foot is near one of the points."""
-        if reach is None:
+        if observers is None:
             return trees
-        points, distance = np.atleast_2d(np.asarray(reach[0], float)), reach[1]
+        points, distance = np.atleast_2d(np.asarray(observers[0], float)), observers[1]
         near = np.zeros(len(trees), bool)
         for point in points:  # a handful of robots and people
             near |= ((self._foot[trees] - point) ** 2).sum(-1) < distance * distance

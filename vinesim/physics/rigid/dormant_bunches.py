@@ -10,8 +10,8 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
-from vinesim.physics.plants.articulation_solver import Plants
-from vinesim.physics.plants.detachment import STUB
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.detachment import STUB_MASS
 from vinesim.physics.rigid.free_bunch import Loose
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.physics.rigid.support_tracking import Riding
@@ -25,7 +25,7 @@ NEAR = 2.5
 class Lying:
     """Picked bunches without bodies, each at a pose in the frame of its parent."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, contact_solver: ContactSolver, riding: Riding) -> None:
+    def __init__(self, plants: ArticulationSolver, rigid: Rigid, contact_solver: ContactSolver, riding: Riding) -> None:
         self.plants, self.rigid, self.contact_solver, self.riding = plants, rigid, contact_solver, riding
         self._loose: dict[int, Loose] = {}
         self._parent: dict[int, str] = {}
@@ -62,7 +62,7 @@ class Lying:
             plants.state.bunch_attached[new] = False
             plants.body_drag[bodies] = 0.0
             for body in bodies.tolist():
-                plants.reweigh(body, STUB)
+                plants.set_mass(body, STUB_MASS)
         for bunch, parent, pose in zip(bunches, parents, poses, strict=True):
             self._parent[bunch], self._relative[bunch] = parent, np.asarray(pose, float)
         self._links = None

@@ -62,7 +62,7 @@ class Loose:
         """Spheres and capsules, in the bunch's frame."""
         axis, middle = self.end - self.start, 0.5 * (self.start + self.end)
         half, rgba = 0.5 * np.linalg.norm(axis, axis=-1), (0.25, 0.05, 0.3, 1.0)
-        turn = frames.multiply(frames.aligned(axis), _Z_TO_X)
+        turn = frames.multiply(frames.from_x_axis(axis), _Z_TO_X)
         return tuple(
             Shape("capsule", (float(r), float(h)), frames.pose(p, q), rgba) if h > 0.0
             else Shape("sphere", (float(r),), frames.pose(p), rgba)

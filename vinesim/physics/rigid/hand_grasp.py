@@ -13,7 +13,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
-from vinesim.physics.plants.articulation_solver import Plants
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.human_body import FINGERS, THICK, Hand, Person
 from vinesim.physics.rigid.rigid_world import Rigid
 from vinesim.scene.values import Contact, Haptic, Parting
@@ -47,7 +47,7 @@ class _Grip:
 class Holding:
     """What the hands of all people hold, and what their controllers feel of it."""
 
-    def __init__(self, plants: Plants, rigid: Rigid, contact_solver: ContactSolver) -> None:
+    def __init__(self, plants: ArticulationSolver, rigid: Rigid, contact_solver: ContactSolver) -> None:
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the last tick, by person and hand."""
@@ -89,7 +89,7 @@ class Holding:
         gone = {parting.body: parting.bunch for parting in partings if parting.bunch >= 0}
         contacts, haptics = [], []
         if self._grips:
-            self.plants.kinematics(self.trees)
+            self.plants.forward_kinematics(self.trees)
         for person, hand in self._hands():
             key = person.spec.name, hand.side
             if (grip := self._grips.get(key)) is not None:
@@ -132,7 +132,7 @@ class Holding:
             pose = self.plants.state.body_q[body].astype(float)
             hand.grip = frames.compose(frames.inverse(pose), palm)
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
-            tie = self.plants.hold(body, hand.grip[:3], person.spec.stiffness, person.damping)
+            tie = self.plants.add_tie(body, hand.grip[:3], person.spec.stiffness, person.damping)
             self._grips[key] = _Grip(body, tie, hand.grip[:3].copy(), next(iter(bunch.tolist()), -1))
             self.rigid.ride(*key, body)
         elif rigid is not None:
@@ -167,7 +167,7 @@ class Holding:
     def _drop(self, key: tuple[str, str]) -> None:
         grip = self._grips.pop(key, None)
         if grip is not None:
-            self.plants.let_go(grip.body, grip.tie)
+            self.plants.remove_tie(grip.body, grip.tie)
 
     def _vibrate(self, person: Person, hand: Hand) -> list[Haptic]:
         """A pulse when a touch begins, then as strong as the force."""

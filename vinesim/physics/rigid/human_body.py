@@ -21,11 +21,11 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels import human_posture as kernels
-from vinesim.kernels.launch import bind
+from vinesim.kernels.launch import bind_launch
 from vinesim.physics.rigid.static_world import ALL, GROUND, GUEST, ROUGH
 from vinesim.scene import appearance
 from vinesim.scene.appearance import PHALANGES
-from vinesim.scene.values import POINTS, HandSample, HumanPose, HumanSpec, Shape
+from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
 SIDES = ("left", "right")
 MASS = 0.4
@@ -150,7 +150,7 @@ class _Motion:
     """Kernels about one person, bound to their arrays."""
 
     def __init__(self, height: float) -> None:
-        points, poses = len(POINTS) - 3, len(PARTS) + 2 * len(SIDES)
+        points, poses = len(POINT_NAMES) - 3, len(PARTS) + 2 * len(SIDES)
         self._tracked, self._parts = np.zeros((points, 7)), np.zeros((len(PARTS), 7))
         self._start, self._goal = np.zeros((poses, 7)), np.zeros((poses, 7))
         self._apart = np.zeros((3, poses, 3))
@@ -158,20 +158,20 @@ class _Motion:
         def shared(data: np.ndarray) -> wp.array:
             return wp.array(data, dtype=wp.float64, device="cpu", copy=False)
 
-        self._stand = bind(
-            kernels.stand,
+        self._stand = bind_launch(
+            kernels.pose_torso_and_legs,
             [THIGH * height, SHANK * height, HIP * height, wp.vec3d(-_BACK, 0.0, _NECK), shared(self._tracked)],
             [shared(self._parts)],
         )
-        self._differ = bind(
-            kernels.differ, [shared(self._start), shared(self._goal)], [shared(rows) for rows in self._apart]
+        self._differ = bind_launch(
+            kernels.pose_difference, [shared(self._start), shared(self._goal)], [shared(rows) for rows in self._apart]
         )
-        looks = appearance.person(height)
+        looks = appearance.load_human_model(height)
         self._held, self._closed = np.zeros((4, 7)), np.zeros(2 * len(appearance.FINGERS))
         self._limbs, limbs = np.zeros((len(LIMBS), 7)), looks.limbs
         bones = [np.ascontiguousarray(table) for table in (looks.root, looks.length, looks.bent)]
-        self._hang = bind(
-            kernels.hang,
+        self._hang = bind_launch(
+            kernels.pose_arms_and_fingers,
             [
                 limbs.upper_arm, limbs.forearm, *map(wp.vec3d, (limbs.shoulder, limbs.wrist, limbs.elbow)), limbs.neck,
                 wp.vec3d(limbs.nape), *map(shared, bones), shared(self._held), shared(self._closed),
@@ -269,12 +269,12 @@ class Person:
 
     def move(self, pose: HumanPose) -> None:
         """Take over where the tracked points are: the body is there at once, the hands try to be."""
-        points = [getattr(pose, name) for name in POINTS]
+        points = [getattr(pose, name) for name in POINT_NAMES]
         square = np.array([np.nan if np.shape(at) != (7,) else 0.0 * at[:3].sum() + at[3:] @ at[3:] for at in points])
         if not (abs(square - 1.0) < 1e-3).all():
             worst = int(np.argmin(abs(square - 1.0) < 1e-3))
             raise HumanError(
-                f"human {self.spec.name!r}: {POINTS[worst]} is {points[worst]}; give seven finite numbers, position "
+                f"human {self.spec.name!r}: {POINT_NAMES[worst]} is {points[worst]}; give seven finite numbers, position "
                 "and unit quaternion (x, y, z, w)"
             )
         self._fingers = (*pose.left_fingers, *pose.right_fingers)

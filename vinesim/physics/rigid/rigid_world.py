@@ -677,7 +677,7 @@ class Rigid:
     def _list_links(self) -> tuple[tuple[Link, ...], np.ndarray]:
         links, bodies = [], []
         for box, size in enumerate(self.model.box_size):
-            links.append(Link(f"box/{box}", Organ.BOX, box, appearance.crate(tuple(map(float, size)), box)))
+            links.append(Link(f"box/{box}", Organ.BOX, box, appearance.crate_shapes(tuple(map(float, size)), box)))
             bodies.append(self.world.body(f"box/{box}").id)
         for name, robot in self._robots.items():
             for link, shapes in robot.shapes.items():
@@ -685,7 +685,7 @@ class Rigid:
                     links.append(Link(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                     bodies.append(robot.bodies[link])
         for name, person in self._people.items():
-            drawn = appearance.person(person.spec.height).parts
+            drawn = appearance.load_human_model(person.spec.height).parts
             mine = [(part, person.bodies[part]) for part in (*PARTS, *(hand.link for hand in person.hands))]
             for part, body in (*mine, *((limb, 0) for limb in LIMBS)):  # limbs have no body: link_q() places them
                 links.append(Link(f"{name}/{part}", Organ.HUMAN, person.spec.index, drawn[part]))

@@ -79,7 +79,7 @@ class RobotBody:
         """[joint] effort beside that of the springs [N m or N]."""
         self.control = np.zeros(joints)
         """[joint] what MuJoCo was asked for in the last tick; less K q and D v it is what the servo gave."""
-        self.base_target = np.array([pose[0], pose[1], frames.heading(pose[3:])])
+        self.base_target = np.array([pose[0], pose[1], frames.to_yaw(pose[3:])])
         """[3] x, y, yaw where the tracks hold; moves with ``base_velocity``."""
         self.base_velocity = np.zeros(3)
         """[3] vx, vy, wz in the base's own axes."""
@@ -139,7 +139,7 @@ class RobotBody:
     def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
         """Be somewhere, at rest and asking for nothing else: base ``pose`` [7], ``position`` [joint]."""
         self.target[:] = d.qpos[self.q] = position
-        self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.heading(pose[3:])
+        self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.to_yaw(pose[3:])
         d.qvel[self.v] = d.qvel[self.base_v] = 0.0
         self.target_velocity[:] = self.base_velocity[:] = 0.0
         self.control[:] = self.stiffness * self.target + self.forward
@@ -178,7 +178,7 @@ class RobotBody:
 
     def follow(self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray) -> None:
         """Pull the base to where the original's is: ``base_q`` [7], ``base_qd`` [6] world axes."""
-        yaw = frames.heading(base_q[3:])
+        yaw = frames.to_yaw(base_q[3:])
         turns = np.round((d.qpos[self.base_q[2]] - yaw) / (2.0 * np.pi))
         self.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
         c, s = np.cos(yaw), np.sin(yaw)
@@ -259,7 +259,7 @@ def _parsed(given: RobotSpec, bit: int) -> mujoco.MjSpec:
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         if joint.name in driven:
             joint.actgravcomp = True
-            joint.armature = driven[joint.name].rotor
+            joint.armature = driven[joint.name].armature
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
     return child

@@ -15,15 +15,22 @@ from vinesim import frames
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.scene.values import RobotSample
 
-SINGULAR = 0.05
+JACOBIAN_DAMPING = 0.05
 """Damping of the inverse Jacobian: stretched out, an arm moves slower than asked instead of fast."""
 
 
-class Admittance:
+class AdmittanceController:
     """The hand is a mass in honey: mass dv/dt + damping v = force; it keeps its attitude."""
 
     def __init__(
-        self, robot: Robot, group: str, sensor: str, *, mass: float = 6.0, damping: float = 60.0, ignored: float = 0.5
+        self,
+        robot: Robot,
+        group: str,
+        sensor: str,
+        *,
+        mass: float = 6.0,
+        damping: float = 60.0,
+        force_deadband: float = 0.5,
     ) -> None:
         """``mass`` [kg] and ``damping`` [N s/m] that a hand feels; forces below ``ignored`` [N] count as none.
 
@@ -36,10 +43,10 @@ class Admittance:
         if not (mass > 0.0 and damping > 0.0):
             raise CommandError(f"mass {mass} and damping {damping} of an admittance must both be above 0")
         self.robot, self.sensor = robot, sensor
-        self.mass, self.damping, self.ignored = mass, damping, ignored
+        self.mass, self.damping, self.force_deadband = mass, damping, force_deadband
         self.velocity = np.zeros(3)
         """[3] m/s of the hand, world axes, as it is asked for"""
-        self._joints = robot.description.indices(group)
+        self._joints = robot.description.joint_indices(group)
         self._weight: np.ndarray | None = None
 
     def tare(self) -> None:
@@ -54,11 +61,11 @@ class Admittance:
         if self._weight is None:
             self._weight = force
         force = force - self._weight
-        if np.linalg.norm(force) < self.ignored:
+        if np.linalg.norm(force) < self.force_deadband:
             force = np.zeros(3)
         dt = self.robot.rigid.dt
         self.velocity = (self.velocity + dt / self.mass * force) / (1.0 + dt * self.damping / self.mass)
         J = self.robot.rigid.jacobian(self.robot.name, wrench.frame, pose[:3])[:, self._joints]
         wanted = np.concatenate([self.velocity, np.zeros(3)])
-        rates = J.T @ np.linalg.solve(J @ J.T + SINGULAR**2 * np.eye(6), wanted)
+        rates = J.T @ np.linalg.solve(J @ J.T + JACOBIAN_DAMPING**2 * np.eye(6), wanted)
         self.robot.command_velocity(rates, self._joints)

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vinesim.robot.drives import CommandError, Interface, Robot
+from vinesim.robot.drives import CommandError, CommandInterface, Robot
 
 
 class Outcome(enum.IntEnum):
@@ -52,11 +52,11 @@ class Tolerance:
     """[joint] rad/s or m/s"""
 
     @classmethod
-    def of(cls, count: int, position: float = np.inf, velocity: float = np.inf) -> Tolerance:
+    def uniform(cls, count: int, position: float = np.inf, velocity: float = np.inf) -> Tolerance:
         """The same for ``count`` joints."""
         return cls(np.full(count, float(position)), np.full(count, float(velocity)))
 
-    def broken(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    def violated(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """[k] indices of the joints whose errors are too large."""
         return np.flatnonzero((np.abs(position) > self.position) | (np.abs(velocity) > self.velocity))
 
@@ -72,39 +72,39 @@ class Trajectory:
     """[point, joint] rad or m"""
     velocities: np.ndarray | None = None
     """[point, joint] rad/s or m/s; without them the way is straight from point to point"""
-    start: float = 0.0
+    start_time: float = 0.0
     """When it starts [s]; 0 means as soon as it is taken."""
-    path: Tolerance | None = None
+    path_tolerance: Tolerance | None = None
     """How far off the joints may be on the way; None: as the controller is set."""
-    goal: Tolerance | None = None
+    goal_tolerance: Tolerance | None = None
     """How far off they may be at the end."""
-    goal_time: float | None = None
+    goal_time_tolerance: float | None = None
     """How much later than planned they may arrive [s]; 0: for ever, as in ROS."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Following:
+class ControllerState:
     """Where the joints should be and are (control_msgs/JointTrajectoryControllerState), each [joint]."""
 
     time: float
     joints: tuple[str, ...]
-    wanted: np.ndarray
-    wanted_velocity: np.ndarray
+    desired: np.ndarray
+    desired_velocity: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
 
     @property
     def error(self) -> np.ndarray:
         """[joint] rad or m: wanted less actual."""
-        return self.wanted - self.position
+        return self.desired - self.position
 
 
 @dataclasses.dataclass(slots=True, eq=False)
-class Run:
+class GoalHandle:
     """One trajectory on its way, or what came of it."""
 
     trajectory: Trajectory
-    began: float
+    start_time: float
     """[s] simulation time of its first moment"""
     outcome: Outcome | None = None
     """None as long as it runs."""
@@ -112,7 +112,7 @@ class Run:
     """What went wrong, in words."""
 
     @property
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         """Whether it has ended, well or not."""
         return self.outcome is not None
 
@@ -125,59 +125,63 @@ class TrajectoryController:
         robot: Robot,
         joints: Sequence[str],
         *,
-        path: Tolerance | None = None,
-        goal: Tolerance | None = None,
-        goal_time: float = 0.0,
+        path_tolerance: Tolerance | None = None,
+        goal_tolerance: Tolerance | None = None,
+        goal_time_tolerance: float = 0.0,
     ) -> None:
         """``path``, ``goal``, ``goal_time``: tolerances of trajectories that bring none; none means anything goes."""
         self.robot = robot
         self.joints = tuple(joints)
         self.indices = robot.joint_indices(self.joints)
-        self.path = path or Tolerance.of(len(self.joints))
-        self.goal = goal or Tolerance.of(len(self.joints))
-        self.goal_time = goal_time
-        self.run: Run | None = None
+        self.path_tolerance = path_tolerance or Tolerance.uniform(len(self.joints))
+        self.goal_tolerance = goal_tolerance or Tolerance.uniform(len(self.joints))
+        self.goal_time_tolerance = goal_time_tolerance
+        self.active_goal: GoalHandle | None = None
         """What is being followed, None if nothing is."""
-        self._knots = np.zeros(0)
-        self._points = np.zeros((0, 0))
-        self._slopes: np.ndarray | None = None
+        self._knot_times = np.zeros(0)
+        self._knot_positions = np.zeros((0, 0))
+        self._knot_velocities: np.ndarray | None = None
         self._active = self.indices
         self._order = np.arange(len(self.joints))
-        self._wanted = robot.setpoint[self.indices].copy()
-        self._wanted_velocity = np.zeros(len(self.joints))
+        self._desired = robot.setpoint[self.indices].copy()
+        self._desired_velocity = np.zeros(len(self.joints))
 
     # ------------------------------------------------------------------ commands
 
-    def start(self, trajectory: Trajectory, time: float) -> Run:
+    def start(self, trajectory: Trajectory, time: float) -> GoalHandle:
         """Follow a trajectory from now, or from its own start, on; what ran before is preempted.
 
         Joints that it does not name stay where they are. Raises :class:`TrajectoryError` and changes nothing if the
         trajectory makes no sense.
         """
-        order = self._check(trajectory, time)
-        began = max(trajectory.start, time) if trajectory.start > 0.0 else time
+        order = self._validate(trajectory, time)
+        began = max(trajectory.start_time, time) if trajectory.start_time > 0.0 else time
         self._end(Outcome.PREEMPTED, "a newer trajectory took over")
         active = self.indices[order]
-        self._knots, self._points, self._slopes = trajectory.times, trajectory.positions, trajectory.velocities
+        self._knot_times, self._knot_positions, self._knot_velocities = (
+            trajectory.times,
+            trajectory.positions,
+            trajectory.velocities,
+        )
         if trajectory.times[0] > 0.0:  # from where they are, or should be
-            by_servo = np.isin(self.robot.interface[active], (Interface.POSITION, Interface.VELOCITY))
+            by_servo = np.isin(self.robot.interface[active], (CommandInterface.POSITION, CommandInterface.VELOCITY))
             here = np.where(by_servo, self.robot.setpoint[active], self.robot.rigid.read(self.robot.name)[0][active])
-            self._knots = np.concatenate([[0.0], self._knots])
-            self._points = np.concatenate([here[None], self._points])
-            if self._slopes is not None:
-                moving = self._wanted_velocity[order] if self.run is not None else np.zeros(len(order))
-                self._slopes = np.concatenate([moving[None], self._slopes])
+            self._knot_times = np.concatenate([[0.0], self._knot_times])
+            self._knot_positions = np.concatenate([here[None], self._knot_positions])
+            if self._knot_velocities is not None:
+                moving = self._desired_velocity[order] if self.active_goal is not None else np.zeros(len(order))
+                self._knot_velocities = np.concatenate([moving[None], self._knot_velocities])
         self._active, self._order = active, order
-        self.run = Run(trajectory, began)
-        return self.run
+        self.active_goal = GoalHandle(trajectory, began)
+        return self.active_goal
 
     def cancel(self) -> None:
         """Stop where the joints are."""
-        if self.run is not None:
+        if self.active_goal is not None:
             self._end(Outcome.CANCELED, "it was cancelled")
             self._hold()
 
-    def _check(self, trajectory: Trajectory, time: float) -> np.ndarray:
+    def _validate(self, trajectory: Trajectory, time: float) -> np.ndarray:
         """Where the trajectory's joints stand among this controller's [joint]."""
         name, t = self.robot.name, trajectory
         strangers = [joint for joint in t.joints if joint not in self.joints]
@@ -195,7 +199,7 @@ class TrajectoryController:
                 )
             if values is not None and not np.isfinite(values).all():
                 raise TrajectoryError(Outcome.INVALID_GOAL, f"{name}: {what} are not finite; give numbers")
-        for what, tolerance in (("path", t.path), ("goal", t.goal)):
+        for what, tolerance in (("path", t.path_tolerance), ("goal", t.goal_tolerance)):
             if tolerance is not None and not len(tolerance.position) == len(tolerance.velocity) == len(t.joints):
                 raise TrajectoryError(
                     Outcome.INVALID_GOAL,
@@ -205,10 +209,10 @@ class TrajectoryController:
             raise TrajectoryError(
                 Outcome.INVALID_GOAL, f"{name}: way points at {list(t.times)} s; give times that rise from 0 on"
             )
-        if t.start > 0.0 and t.start + t.times[-1] < time:
+        if t.start_time > 0.0 and t.start_time + t.times[-1] < time:
             raise TrajectoryError(
                 Outcome.OLD_HEADER_TIMESTAMP,
-                f"{name}: trajectory ended at {t.start + t.times[-1]:.2f} s, now is {time:.2f} s; send it in time",
+                f"{name}: trajectory ended at {t.start_time + t.times[-1]:.2f} s, now is {time:.2f} s; send it in time",
             )
         return np.array([self.joints.index(joint) for joint in t.joints])
 
@@ -216,70 +220,74 @@ class TrajectoryController:
 
     def __call__(self, time: float) -> None:
         """Command the set-points of the tick that starts at ``time`` [s], and judge how the last one went."""
-        if self.run is None:
+        if self.active_goal is None:
             return
-        run, elapsed = self.run, time - self.run.began
+        run, elapsed = self.active_goal, time - self.active_goal.start_time
         if elapsed < 0.0:
             return
         position, velocity, _, _ = self.robot.rigid.read(self.robot.name)
-        wanted, rate = self._at(elapsed)
-        self._wanted[self._order], self._wanted_velocity[self._order] = wanted, rate
+        wanted, rate = self._sample(elapsed)
+        self._desired[self._order], self._desired_velocity[self._order] = wanted, rate
         error, slip = wanted - position[self._active], rate - velocity[self._active]
-        if elapsed < self._knots[-1]:
-            tolerance = run.trajectory.path or _pick(self.path, self._order)
-            if len(off := tolerance.broken(error, slip)):
+        if elapsed < self._knot_times[-1]:
+            tolerance = run.trajectory.path_tolerance or _reordered(self.path_tolerance, self._order)
+            if len(off := tolerance.violated(error, slip)):
                 self._fail(Outcome.PATH_TOLERANCE_VIOLATED, off[0], error, slip, f"{elapsed:.2f} s on the way")
                 return
         else:
-            tolerance = run.trajectory.goal or _pick(self.goal, self._order)
-            off = tolerance.broken(error, slip)
-            late = self.goal_time if run.trajectory.goal_time is None else run.trajectory.goal_time
+            tolerance = run.trajectory.goal_tolerance or _reordered(self.goal_tolerance, self._order)
+            off = tolerance.violated(error, slip)
+            late = (
+                self.goal_time_tolerance
+                if run.trajectory.goal_time_tolerance is None
+                else run.trajectory.goal_time_tolerance
+            )
             if not len(off):
                 self._end(Outcome.SUCCESSFUL, "")
-                self.run = None
-            elif late > 0.0 and elapsed > self._knots[-1] + late:
+                self.active_goal = None
+            elif late > 0.0 and elapsed > self._knot_times[-1] + late:
                 self._fail(Outcome.GOAL_TOLERANCE_VIOLATED, off[0], error, slip, f"{late:.2f} s after the end")
                 return
-        self.robot.command_position(self._at(elapsed + self.robot.rigid.dt)[0], self._active)
+        self.robot.command_position(self._sample(elapsed + self.robot.rigid.dt)[0], self._active)
 
-    def following(self, time: float) -> Following:
+    def state(self, time: float) -> ControllerState:
         """Where the joints should be and are."""
         position, velocity, _, _ = self.robot.rigid.read(self.robot.name)
-        return Following(
-            time, self.joints, self._wanted.copy(), self._wanted_velocity.copy(), position[self.indices],
+        return ControllerState(
+            time, self.joints, self._desired.copy(), self._desired_velocity.copy(), position[self.indices],
             velocity[self.indices],
         )  # fmt: skip
 
-    def _at(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+    def _sample(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities [joint] of the spline; beyond its end, standing there."""
-        knots, points = self._knots, self._points
+        knots, points = self._knot_times, self._knot_positions
         if elapsed >= knots[-1]:
             return points[-1], np.zeros(points.shape[1])
         i = max(int(np.searchsorted(knots, elapsed, side="right")) - 1, 0)
         span = knots[i + 1] - knots[i]
         s, way = (elapsed - knots[i]) / span, points[i + 1] - points[i]
-        if self._slopes is None:
+        if self._knot_velocities is None:
             return points[i] + s * way, way / span
-        first, last = span * self._slopes[i], span * self._slopes[i + 1]
+        first, last = span * self._knot_velocities[i], span * self._knot_velocities[i + 1]
         square, cube = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
         place = points[i] + s * (first + s * (square + s * cube))
         return place, (first + s * (2.0 * square + 3.0 * s * cube)) / span
 
     def _fail(self, outcome: Outcome, joint: int, error: np.ndarray, slip: np.ndarray, when: str) -> None:
-        name = self.run.trajectory.joints[joint]
+        name = self.active_goal.trajectory.joints[joint]
         self._end(outcome, f"{name} is off by {error[joint]:.4f} and {slip[joint]:.4f} a second, {when}")
         self._hold()
 
     def _hold(self) -> None:
         position = self.robot.rigid.read(self.robot.name)[0][self._active]
         self.robot.command_position(position, self._active)
-        self._wanted[self._order], self._wanted_velocity[self._order] = position, 0.0
-        self.run = None
+        self._desired[self._order], self._desired_velocity[self._order] = position, 0.0
+        self.active_goal = None
 
     def _end(self, outcome: Outcome, text: str) -> None:
-        if self.run is not None:
-            self.run.outcome, self.run.text = outcome, text
+        if self.active_goal is not None:
+            self.active_goal.outcome, self.active_goal.text = outcome, text
 
 
-def _pick(tolerance: Tolerance, order: np.ndarray) -> Tolerance:
+def _reordered(tolerance: Tolerance, order: np.ndarray) -> Tolerance:
     return Tolerance(tolerance.position[order], tolerance.velocity[order])

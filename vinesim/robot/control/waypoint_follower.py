@@ -8,99 +8,99 @@ import numpy as np
 
 from vinesim.robot.drives import Robot
 
-ARRIVED = 0.01
+POSITION_TOLERANCE = 0.01
 """This near is there [m]."""
-FACING = 0.01
+HEADING_TOLERANCE = 0.01
 """This exactly turned is turned [rad]."""
 DECELERATION = 0.5
 """Of the base before a point [m/s2] and before a heading [rad/s2]; half of what vinebot's tracks can do."""
-LOOKAHEAD = 0.4
+LOOKAHEAD_DISTANCE = 0.4
 """A base beside its line steers for the point so far ahead on it [m]."""
-PATIENCE = 4.0
+STUCK_TIMEOUT = 4.0
 """A base that has not moved for so long while it should is stuck [s]."""
 
 
-class Way:
+class WaypointFollower:
     """Drive along points, one straight leg after the other, forwards unless told otherwise."""
 
     def __init__(
-        self, robot: Robot, points: np.ndarray, heading: float | None = None, *, speed: float = 0.5, turn: float = 0.4,
-        backwards: bool = False,
+        self, robot: Robot, points: np.ndarray, heading: float | None = None, *, speed: float = 0.5, turn_rate: float = 0.4,
+        reverse: bool = False,
     ) -> None:  # fmt: skip
         """``points`` [n, 2] m in the world, ``heading`` [rad] at the end (as the last leg left it, unless given);
         ``speed`` [m/s], ``turn`` [rad/s]; ``backwards``: the base looks back along every leg.
         """
         self.robot = robot
         self.points = np.asarray(points, float).reshape(-1, 2)
-        self.heading, self.speed, self.turn = heading, speed, turn
-        self.done = False
-        self.stuck = False
+        self.heading, self.speed, self.turn_rate = heading, speed, turn_rate
+        self.is_done = False
+        self.is_stuck = False
         """Whether something keeps the base from going on."""
-        self._side = -1.0 if backwards else 1.0
+        self._direction = -1.0 if reverse else 1.0
         self._leg = 0
         self._turning = True
-        self._from: np.ndarray | None = None
-        self._rested = (0.0, np.full(3, np.inf))
+        self._leg_start: np.ndarray | None = None
+        self._last_motion = (0.0, np.full(3, np.inf))
 
     def control(self, time: float) -> None:
         """Command the base for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
-        if self.done:
+        if self.is_done:
             return
         pose, _ = self.robot.rigid.base(self.robot.name)
         here, yaw = pose[:2], 2.0 * math.atan2(pose[5], pose[6])
-        self._watch(time, here, yaw)
+        self._detect_stall(time, here, yaw)
         linear = angular = 0.0
-        if self._from is None:
-            self._from = here.copy()
+        if self._leg_start is None:
+            self._leg_start = here.copy()
         if self._leg < len(self.points):
-            linear, angular = self._drive(here, yaw)
+            linear, angular = self._follow_leg(here, yaw)
         elif self.heading is not None:
-            angular = self._face(self.heading, yaw)
+            angular = self._turn_towards(self.heading, yaw)
         else:
-            self.done = True
+            self.is_done = True
         self.robot.command_base(linear, angular, time)
 
-    def _drive(self, here: np.ndarray, yaw: float) -> tuple[float, float]:
+    def _follow_leg(self, here: np.ndarray, yaw: float) -> tuple[float, float]:
         """Speeds ahead and to the left on the present leg."""
         goal = self.points[self._leg]
-        leg = goal - self._from
+        leg = goal - self._leg_start
         length = float(np.hypot(*leg))
         if length > 1e-6:
             ahead = leg / length
-            course = math.atan2(ahead[1], ahead[0]) + (math.pi if self._side < 0.0 else 0.0)
+            course = math.atan2(ahead[1], ahead[0]) + (math.pi if self._direction < 0.0 else 0.0)
             if self._turning:
-                angular = self._face(course, yaw)
+                angular = self._turn_towards(course, yaw)
                 return 0.0, angular
             left = float((goal - here) @ ahead)
-            if left > ARRIVED:
+            if left > POSITION_TOLERANCE:
                 beside = float(ahead[0] * (here - goal)[1] - ahead[1] * (here - goal)[0])
-                course -= self._side * math.atan2(beside, LOOKAHEAD)
-                angular = float(np.clip(2.0 * _wrapped(course - yaw), -self.turn, self.turn))
-                return self._side * min(self.speed, math.sqrt(2.0 * DECELERATION * left)), angular
+                course -= self._direction * math.atan2(beside, LOOKAHEAD_DISTANCE)
+                angular = float(np.clip(2.0 * _wrap_angle(course - yaw), -self.turn_rate, self.turn_rate))
+                return self._direction * min(self.speed, math.sqrt(2.0 * DECELERATION * left)), angular
         self._leg += 1
-        self._turning, self._from = True, here.copy()
+        self._turning, self._leg_start = True, here.copy()
         return 0.0, 0.0
 
-    def _face(self, course: float, yaw: float) -> float:
+    def _turn_towards(self, course: float, yaw: float) -> float:
         """Rate of turn [rad/s] towards a heading; takes note when it is reached."""
-        error = _wrapped(course - yaw)
+        error = _wrap_angle(course - yaw)
         rate = float(self.robot.rigid.base(self.robot.name)[1][5])
-        if abs(error) < FACING and abs(rate) < 0.02:
+        if abs(error) < HEADING_TOLERANCE and abs(rate) < 0.02:
             if self._leg < len(self.points):
                 self._turning = False
             else:
-                self.done = True
+                self.is_done = True
             return 0.0
-        return math.copysign(min(self.turn, math.sqrt(2.0 * DECELERATION * abs(error)), 3.0 * abs(error)), error)
+        return math.copysign(min(self.turn_rate, math.sqrt(2.0 * DECELERATION * abs(error)), 3.0 * abs(error)), error)
 
-    def _watch(self, time: float, here: np.ndarray, yaw: float) -> None:
+    def _detect_stall(self, time: float, here: np.ndarray, yaw: float) -> None:
         """Notice when the base stands where it should move."""
         now = np.append(here, yaw)
-        if np.abs(now - self._rested[1]).max() > 0.01:
-            self._rested = (time, now)
-        self.stuck = time - self._rested[0] > PATIENCE
+        if np.abs(now - self._last_motion[1]).max() > 0.01:
+            self._last_motion = (time, now)
+        self.is_stuck = time - self._last_motion[0] > STUCK_TIMEOUT
 
 
-def _wrapped(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     """The angle between -pi and pi [rad]."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

@@ -1,11 +1,11 @@
 """Robot descriptions: a URDF, and beside it a TOML with what a URDF cannot say.
 
-    robot = load("vinebot")
-    rigid.add_robot(robot.spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
+    robot = load_description("vinebot")
+    rigid.add_robot(robot.to_spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
 
 The URDF is read by yourdfpy. The text that physics and ROS receive differs from the file in three ways: meshes are
 named by absolute path, wheels and casters are fixed (the base is driven as a whole), and shapes whose mesh format
-physics cannot read are replaced; :attr:`Description.notes` lists each change.
+physics cannot read are replaced; :attr:`RobotDescription.notes` lists each change.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Share of the tracks' travel that is lost on the ground, ahead and in turns; odometry counts the travel."""
 
 
-class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Joints that one controller moves."""
 
     joints: tuple[str, ...]
@@ -80,7 +80,7 @@ class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Frame whose x axis points out of the hand, if the group is an arm."""
 
 
-class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A sensor: its name in topics, the frame it sits in, and the file in ``data/cameras`` or ``data/lidars``."""
 
     name: str
@@ -105,11 +105,11 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The TOML beside a URDF."""
 
     base: BaseLimits = BaseLimits()
-    groups: dict[str, Group] = {}
-    cameras: tuple[Mount, ...] | None = None
-    lidars: tuple[Mount, ...] | None = None
-    imus: tuple[Mount, ...] = ()
-    wrenches: tuple[Mount, ...] = ()
+    groups: dict[str, JointGroup] = {}
+    cameras: tuple[SensorMount, ...] | None = None
+    lidars: tuple[SensorMount, ...] | None = None
+    imus: tuple[SensorMount, ...] = ()
+    wrenches: tuple[SensorMount, ...] = ()
     cutters: tuple[Cutter, ...] = ()
 
 
@@ -120,7 +120,7 @@ class MovingJoints:
     names: tuple[str, ...]
     frames: tuple[tuple[str, str], ...]
     """(parent frame, child frame) of each."""
-    source: np.ndarray
+    drive_index: np.ndarray
     """[joint] index of the drive that moves it."""
     multiplier: np.ndarray
     """[joint] 1"""
@@ -128,23 +128,23 @@ class MovingJoints:
     """[joint] rad or m"""
     origin: np.ndarray
     """[joint, 7] child in parent at position 0."""
-    slide: np.ndarray
+    translation: np.ndarray
     """[joint, 3] way of the child per metre, zero for a turning joint, in the parent."""
-    swing: np.ndarray
+    rotation: np.ndarray
     """[joint, 4] origin's quaternion times (axis, 0), zero for a sliding joint."""
 
     def poses(self, position: np.ndarray) -> np.ndarray:
         """Child in parent [joint, 7] for drive positions [drive] rad or m."""
-        q = self.multiplier * position[self.source] + self.offset
-        half = 0.5 * q[:, None] * self.swing.any(axis=1, keepdims=True)
+        q = self.multiplier * position[self.drive_index] + self.offset
+        half = 0.5 * q[:, None] * self.rotation.any(axis=1, keepdims=True)
         poses = np.empty((len(q), 7))
-        poses[:, :3] = self.origin[:, :3] + self.slide * q[:, None]
-        poses[:, 3:] = self.origin[:, 3:] * np.cos(half) + self.swing * np.sin(half)
+        poses[:, :3] = self.origin[:, :3] + self.translation * q[:, None]
+        poses[:, 3:] = self.origin[:, 3:] * np.cos(half) + self.rotation * np.sin(half)
         return poses
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Description:
+class RobotDescription:
     """A robot as every room needs it; constant."""
 
     name: str
@@ -158,18 +158,18 @@ class Description:
     """In the URDF's order; mimicking joints have none."""
     home: np.ndarray
     """[joint] rad or m"""
-    groups: dict[str, Group]
-    moving: MovingJoints
-    fixed: tuple[tuple[str, str], ...]
+    groups: dict[str, JointGroup]
+    moving_joints: MovingJoints
+    fixed_frames: tuple[tuple[str, str], ...]
     """(parent frame, child frame) of every fixed joint: ``/tf_static``."""
-    fixed_q: np.ndarray
+    fixed_poses: np.ndarray
     """[fixed, 7] child in parent."""
-    anchors: dict[str, tuple[str, np.ndarray]]
+    link_anchors: dict[str, tuple[str, np.ndarray]]
     """Of every link: the moving link (or the root) it is fixed to, and its pose [7] there."""
-    cameras: tuple[Mount, ...]
-    lidars: tuple[Mount, ...]
-    imus: tuple[Mount, ...]
-    wrenches: tuple[Mount, ...]
+    cameras: tuple[SensorMount, ...]
+    lidars: tuple[SensorMount, ...]
+    imus: tuple[SensorMount, ...]
+    wrenches: tuple[SensorMount, ...]
     cutters: tuple[Cutter, ...]
     base_limits: BaseLimits
     mass: float
@@ -182,32 +182,34 @@ class Description:
         """Names of the driven joints, in the order of joint arrays everywhere."""
         return tuple(drive.joint for drive in self.drives)
 
-    def indices(self, group: str) -> np.ndarray:
+    def joint_indices(self, group: str) -> np.ndarray:
         """Positions of a group's joints in joint arrays."""
         order = {name: i for i, name in enumerate(self.joints)}
         return np.array([order[name] for name in self.groups[group].joints], int)
 
-    def frame_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
+    def link_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
         """Pose [7] of every link in the root for drive positions; walks the tree, so not for the tick."""
-        parents = dict(zip([child for _, child in self.moving.frames], range(len(self.moving.frames)), strict=True))
-        local = self.moving.poses(np.asarray(position, float))
+        parents = dict(
+            zip([child for _, child in self.moving_joints.frames], range(len(self.moving_joints.frames)), strict=True)
+        )
+        local = self.moving_joints.poses(np.asarray(position, float))
         found = {self.base: frames.pose([0.0, 0.0, 0.0])}
 
         def place(link: str) -> np.ndarray:
             if link not in found:
-                anchor, offset = self.anchors[link]
+                anchor, offset = self.link_anchors[link]
                 if anchor != link:
                     found[link] = frames.compose(place(anchor), offset)
                 else:
                     joint = parents[link]
-                    found[link] = frames.compose(place(self.moving.frames[joint][0]), local[joint])
+                    found[link] = frames.compose(place(self.moving_joints.frames[joint][0]), local[joint])
             return found[link]
 
-        for link in self.anchors:
+        for link in self.link_anchors:
             place(link)
         return found
 
-    def spec(self, name: str, index: int = 0, pose: np.ndarray | None = None) -> RobotSpec:
+    def to_spec(self, name: str, index: int = 0, pose: np.ndarray | None = None) -> RobotSpec:
         """The robot as physics needs it: called ``name``, standing at ``pose`` [7]."""
         pose = frames.pose([0.0, 0.0, 0.0]) if pose is None else np.asarray(pose, float)
         return RobotSpec(
@@ -215,7 +217,7 @@ class Description:
         )
 
 
-def load(name: str | pathlib.Path) -> Description:
+def load_description(name: str | pathlib.Path) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
     Raises :class:`DescriptionError` in one line if it cannot be simulated as it is.
@@ -259,8 +261,8 @@ def _locate(name: str) -> pathlib.Path:
             raise DescriptionError("tiago_pro: its files are not installed; pip install vinesim[tiago]")
         return found
     try:
-        return data_files.find("robots", name, ".urdf").resolve()
-    except data_files.NotFoundInData as error:
+        return data_files.find_data_file("robots", name, ".urdf").resolve()
+    except data_files.DataFileNotFound as error:
         raise DescriptionError(f"{name}: {error}") from error
 
 
@@ -552,14 +554,14 @@ def _assemble(
     urdf: str,
     sidecar: Sidecar,
     notes: list[str],
-) -> Description:
+) -> RobotDescription:
     base = order[0].parent
     driven = [joint for joint in robot.joints if joint.type in MOVING and joint.mimic is None]
     moving = _moving(robot, [joint.name for joint in driven])
     anchors = _anchors(base, order)
     fixed = [joint for joint in robot.joints if joint.type == "fixed"]
     home = np.array([_resting(joint) for joint in driven])
-    description = Description(
+    description = RobotDescription(
         name=robot.name,
         file=file,
         urdf=urdf,
@@ -567,10 +569,10 @@ def _assemble(
         drives=(),
         home=home,
         groups=sidecar.groups or _guess_groups([joint.name for joint in driven], anchors),
-        moving=moving,
-        fixed=tuple((joint.parent, joint.child) for joint in fixed),
-        fixed_q=np.array([_origin(joint) for joint in fixed]).reshape(-1, 7),
-        anchors=anchors,
+        moving_joints=moving,
+        fixed_frames=tuple((joint.parent, joint.child) for joint in fixed),
+        fixed_poses=np.array([_origin(joint) for joint in fixed]).reshape(-1, 7),
+        link_anchors=anchors,
         cameras=sidecar.cameras or (),
         lidars=sidecar.lidars or (),
         imus=sidecar.imus,
@@ -612,12 +614,12 @@ def _moving(robot: yourdfpy.Robot, driven: list[str]) -> MovingJoints:
     return MovingJoints(
         names=tuple(joint.name for joint in joints),
         frames=tuple((joint.parent, joint.child) for joint in joints),
-        source=np.array([driven.index(joint.mimic.joint if joint.mimic else joint.name) for joint in joints]),
+        drive_index=np.array([driven.index(joint.mimic.joint if joint.mimic else joint.name) for joint in joints]),
         multiplier=np.array([joint.mimic.multiplier if joint.mimic else 1.0 for joint in joints]),
         offset=np.array([joint.mimic.offset if joint.mimic else 0.0 for joint in joints]),
         origin=origin,
-        slide=np.where(sliding, frames.rotate(origin[:, 3:], axis), 0.0),
-        swing=np.where(sliding, 0.0, frames.multiply(origin[:, 3:], turn)),
+        translation=np.where(sliding, frames.rotate(origin[:, 3:], axis), 0.0),
+        rotation=np.where(sliding, 0.0, frames.multiply(origin[:, 3:], turn)),
     )
 
 
@@ -630,7 +632,7 @@ def _resting(joint: yourdfpy.Joint) -> float:
     return middle if abs(middle) > 0.1 * (upper - lower) else 0.0
 
 
-def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, Group]:
+def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGroup]:
     """Groups from names in PAL style: ``arm_left_3_joint`` is of ``arm_left``, ``gripper_left_...`` of its gripper."""
 
     def tool(group: str) -> str:
@@ -642,10 +644,10 @@ def _guess_groups(joints: list[str], links: Container[str]) -> dict[str, Group]:
         hand = re.match(r"(gripper|hand)_(left|right)", joint)
         stem = hand.group() if hand else re.sub(r"(_lift)?(_?\d+)?(_joint)?$", "", joint)
         groups.setdefault(stem or joint, []).append(joint)
-    return {name: Group(joints=tuple(members), tool=tool(name)) for name, members in groups.items()}
+    return {name: JointGroup(joints=tuple(members), tool=tool(name)) for name, members in groups.items()}
 
 
-def _guess_cameras(root: etree._Element, notes: list[str]) -> tuple[Mount, ...]:
+def _guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
     """A D435 in the first optical frame (colour before others), else in front of the first link called a camera."""
     links = [link.get("name", "") for link in root.iterfind("link")]
     optical = [link for link in links if link.endswith("optical_frame")]
@@ -665,20 +667,20 @@ def _guess_cameras(root: etree._Element, notes: list[str]) -> tuple[Mount, ...]:
         etree.SubElement(joint, "parent", link=link)
         etree.SubElement(joint, "child", link=found)
         etree.SubElement(joint, "origin", xyz="0 0 0", rpy=f"{-math.pi / 2} 0 {-math.pi / 2}")
-    return (Mount(name, found, "d435"),)
+    return (SensorMount(name, found, "d435"),)
 
 
-def _guess_lidars(root: etree._Element, notes: list[str]) -> tuple[Mount, ...]:
+def _guess_lidars(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
     """A VLP-16 in the first link called a lidar or laser, one in front before others."""
     links = [link.get("name", "") for link in root.iterfind("link")]
     found = sorted((link for link in links if re.search(r"lidar|laser|velodyne", link)), key=lambda n: "front" not in n)
     if not found:
         return ()
     notes.append(f"a vlp16 is taken to sit in {found[0]!r}")
-    return (Mount("lidar", found[0], "vlp16"),)
+    return (SensorMount("lidar", found[0], "vlp16"),)
 
 
-def _check_sidecar(description: Description, driven: set[str], file: pathlib.Path) -> None:
+def _check_sidecar(description: RobotDescription, driven: set[str], file: pathlib.Path) -> None:
     for name, group in description.groups.items():
         for joint in group.joints:
             if joint not in driven:
@@ -693,12 +695,12 @@ def _check_sidecar(description: Description, driven: set[str], file: pathlib.Pat
             raise _error(file, f"group {name!r} gives only half of its springs", "give elastic and elastic_damping")
         if min((*(group.elastic or ()), *(group.elastic_damping or ()), 0.0)) < 0.0:
             raise _error(file, f"group {name!r} has a spring below zero", "give 0 or more")
-        if group.tool and group.tool not in description.anchors:
+        if group.tool and group.tool not in description.link_anchors:
             raise _error(file, f"group {name!r} has the tool {group.tool!r}", "name a link of the URDF")
     for cutter in description.cutters:
         if cutter.group not in description.groups:
             raise _error(file, f"a cutter belongs to {cutter.group!r}", "name a group")
-        if cutter.frame not in description.anchors:
+        if cutter.frame not in description.link_anchors:
             raise _error(file, f"the cutter of {cutter.group!r} sits in {cutter.frame!r}", "name a link of the URDF")
         if min(cutter.half) <= 0.0:
             raise _error(
@@ -707,17 +709,17 @@ def _check_sidecar(description: Description, driven: set[str], file: pathlib.Pat
     if not all(0.0 <= slip < 1.0 for slip in description.base_limits.slip):
         raise _error(file, f"slip of {description.base_limits.slip}", "give shares from 0 to below 1")
     for mount in (*description.cameras, *description.lidars, *description.imus, *description.wrenches):
-        if mount.frame not in description.anchors:
+        if mount.frame not in description.link_anchors:
             raise _error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
 
 
-def _carried_inertia(robot: yourdfpy.Robot, description: Description) -> dict[str, float]:
+def _carried_inertia(robot: yourdfpy.Robot, description: RobotDescription) -> dict[str, float]:
     """What each moving joint carries with the robot at home: mass [kg], or inertia about its origin [kg m2].
 
     The inertia is the one about the worst axis through the joint, since arms bend: gains must suit any posture.
     """
-    poses = description.frame_poses(description.home)
-    above = {child: description.anchors[parent][0] for parent, child in description.moving.frames}
+    poses = description.link_poses(description.home)
+    above = {child: description.link_anchors[parent][0] for parent, child in description.moving_joints.frames}
     heavy = [link for link in robot.links if link.inertial is not None and link.inertial.mass]
     mass = np.array([link.inertial.mass for link in heavy])
     centre = np.empty((len(heavy), 3))
@@ -728,8 +730,8 @@ def _carried_inertia(robot: yourdfpy.Robot, description: Description) -> dict[st
         own[i] = np.linalg.norm(link.inertial.inertia, 2) if link.inertial.inertia is not None else 0.0
     kinds = {joint.name: joint.type for joint in robot.joints}
     carried = {}
-    for name, (_, child) in zip(description.moving.names, description.moving.frames, strict=True):
-        beyond = np.array([_is_beyond(description.anchors[link.name][0], child, above) for link in heavy])
+    for name, (_, child) in zip(description.moving_joints.names, description.moving_joints.frames, strict=True):
+        beyond = np.array([_is_beyond(description.link_anchors[link.name][0], child, above) for link in heavy])
         if kinds[name] == "prismatic":
             carried[name] = float(mass[beyond].sum())
         else:
@@ -768,7 +770,7 @@ def _drive(
         velocity=limit.velocity,
         lower=-math.inf if endless else limit.lower,
         upper=math.inf if endless else limit.upper,
-        rotor=rotor,
-        elastic=spring[0] if spring else 0.0,
-        elastic_damping=spring[1] if spring else 0.0,
+        armature=rotor,
+        series_stiffness=spring[0] if spring else 0.0,
+        series_damping=spring[1] if spring else 0.0,
     )

@@ -1,6 +1,6 @@
 """Reach for a bunch and push it: a scripted motion for demonstrations, benchmarks and tests.
 
-    reach = ReachAndPush(robot, "left", lambda: bunch_position)
+    reach = PushBunch(robot, "left", lambda: bunch_position)
     while running:
         reach.control(time)
         robot.control(time)
@@ -18,19 +18,19 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.robot.control.cartesian_controller import Hand
+from vinesim.robot.control.cartesian_controller import CartesianController
 from vinesim.robot.drives import Robot
 
 log = logging.getLogger(__name__)
 
-TIP = 0.027
+FINGER_LENGTH = 0.027
 """How far vinebot's fingers reach beyond its grasping frame [m]."""
-RISE = 0.35
+PUSH_ELEVATION = 0.35
 """Fingers point up by this angle [rad]: forearm and wrist stay below the leaves."""
-NEAR = 0.003
+POSITION_TOLERANCE = 0.003
 """Fingertips this close to the end of a phase [m] are there."""
 
-FAR = 0.01
+MISS_DISTANCE = 0.01
 """Fingertips that end an approach farther off than this [m] have missed."""
 
 
@@ -45,7 +45,7 @@ class Phase(enum.Enum):
     DONE = "done"
 
 
-class ReachAndPush:
+class PushBunch:
     """One arm touches a target, pushes it, lets go, and begins again.
 
     ``target`` gives the bunch's centre in the world [3] m; it is asked once for every approach. The fingers come from
@@ -61,12 +61,12 @@ class ReachAndPush:
         radius: float = 0.05,
         depth: float = 0.04,
         clearance: float = 0.10,
-        hold: float = 1.0,
+        hold_time: float = 1.0,
         speed: float = 0.35,
         touch_speed: float = 0.10,
         acceleration: float = 0.8,
         repeat: bool = True,
-        lift: bool = True,
+        use_lift: bool = True,
     ) -> None:
         """``radius`` of the bunch, ``depth`` of the push and ``clearance`` before the touch [m], ``hold`` [s];
         ``speed`` through free space, ``touch_speed`` [m/s] and ``acceleration`` [m/s2] of the fingertips;
@@ -74,29 +74,31 @@ class ReachAndPush:
         """
         self.robot = robot
         self.target = target
-        self.hand = Hand(robot, side, tip=TIP, acceleration=acceleration, lift=lift)
-        self.tool = self.hand.tool
-        self.radius, self.depth, self.clearance, self.hold = radius, depth, clearance, hold
+        self.arm = CartesianController(
+            robot, side, tip_offset=FINGER_LENGTH, acceleration=acceleration, use_lift=use_lift
+        )
+        self.tool = self.arm.tool
+        self.radius, self.depth, self.clearance, self.hold_time = radius, depth, clearance, hold_time
         self.speed, self.touch_speed = speed, touch_speed
         self.repeat = repeat
         self.phase = Phase.APPROACH
-        self.cycles = 0
+        self.push_count = 0
         """Pushes done so far."""
-        self.missed = 0
+        self.missed_count = 0
         """Approaches given up because the target is out of reach."""
 
-        self._way: dict[Phase, np.ndarray] = {}
+        self._waypoints: dict[Phase, np.ndarray] = {}
         self._started = -np.inf
 
     @property
     def tip(self) -> np.ndarray:
         """Fingertips in the world [3] m."""
-        return self.hand.point
+        return self.arm.tip_position
 
     @property
     def goal(self) -> np.ndarray:
         """Where the fingertips are to be at the end of the present phase [3] m; where they are, if there is none."""
-        return self._way.get(self.phase, self.hand.place)
+        return self._waypoints.get(self.phase, self.arm.reference)
 
     @property
     def error(self) -> float:
@@ -107,26 +109,26 @@ class ReachAndPush:
         """Command the arm for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
         if self.phase is Phase.DONE:
             return
-        if not self._way:
+        if not self._waypoints:
             self._plan()
             self._begin(self.phase, time)
-        if self._ended(time):
+        if self._is_phase_over(time):
             self._advance(time)
         if self.phase is not Phase.DONE:
-            self.hand.lead(self.goal, self._axis, speed=self._fastest, height=self._height)
+            self.arm.move_towards(self.goal, self._push_axis, speed=self._phase_speed, shoulder_height=self._height)
 
     # ------------------------------------------------------------------ phases
 
     def _plan(self) -> None:
         """Lay the way to where the target is now."""
         center = np.asarray(self.target(), float)
-        ahead = center - self.hand.shoulder
-        ahead[2] = np.hypot(ahead[0], ahead[1]) * np.tan(RISE)
-        self._axis = frames.normalize(ahead)
-        touch = center - self.radius * self._axis
-        ready = touch - self.clearance * self._axis
-        pushed = touch + self.depth * self._axis
-        self._way = {
+        ahead = center - self.arm.shoulder_position
+        ahead[2] = np.hypot(ahead[0], ahead[1]) * np.tan(PUSH_ELEVATION)
+        self._push_axis = frames.normalize(ahead)
+        touch = center - self.radius * self._push_axis
+        ready = touch - self.clearance * self._push_axis
+        pushed = touch + self.depth * self._push_axis
+        self._waypoints = {
             Phase.APPROACH: ready,
             Phase.TOUCH: touch,
             Phase.PUSH: pushed,
@@ -134,34 +136,34 @@ class ReachAndPush:
             Phase.RETREAT: ready,
         }
         self._height = center[2]
-        self.hand.start()
-        if self.hand.gripper:
-            self.robot.command_gripper(self.hand.gripper, 0.0)
+        self.arm.reset()
+        if self.arm.gripper:
+            self.robot.command_gripper(self.arm.gripper, 0.0)
 
     def _begin(self, phase: Phase, time: float) -> None:
         self.phase, self._started = phase, time
         fast = phase in (Phase.APPROACH, Phase.RETREAT)
-        self._fastest = self.speed if fast else self.touch_speed
-        way = np.linalg.norm(self.goal - self.hand.place)
+        self._phase_speed = self.speed if fast else self.touch_speed
+        way = np.linalg.norm(self.goal - self.arm.reference)
         # a bunch that pushes back may keep the tip from arriving; then time ends the phase
-        self._patience = 2.0 * way / self._fastest + 2.0 * self._fastest / self.hand.acceleration + 3.0
+        self._phase_timeout = 2.0 * way / self._phase_speed + 2.0 * self._phase_speed / self.arm.acceleration + 3.0
 
-    def _ended(self, time: float) -> bool:
+    def _is_phase_over(self, time: float) -> bool:
         elapsed = time - self._started
         if self.phase is Phase.HOLD:
-            return elapsed >= self.hold
-        return bool(self.error < NEAR or elapsed > self._patience)
+            return elapsed >= self.hold_time
+        return bool(self.error < POSITION_TOLERANCE or elapsed > self._phase_timeout)
 
     def _advance(self, time: float) -> None:
         order = list(Phase)
         phase = order[order.index(self.phase) + 1]
-        if self.phase is Phase.APPROACH and self.error > FAR:
+        if self.phase is Phase.APPROACH and self.error > MISS_DISTANCE:
             log.warning("%s: target out of reach by %.2f m; bring the base closer", self.robot.name, self.error)
-            self.missed += 1
+            self.missed_count += 1
             phase = Phase.RETREAT
-            self._way[phase] = self.tip
+            self._waypoints[phase] = self.tip
         if phase is Phase.DONE:
-            self.cycles += 1
+            self.push_count += 1
             if self.repeat:
                 self._plan()
                 phase = Phase.APPROACH

@@ -1,6 +1,6 @@
 """The logistic job: a carrier with a clamp at either end takes a full box away and leaves an empty one in its place.
 
-    exchange = Exchange(physics, robot, swap)
+    exchange = SwapBoxes(physics, robot, swap)
     while not exchange.done:
         exchange.control(time)
         robot.control(time)
@@ -22,57 +22,57 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.robot.control.waypoint_follower import Way
+from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives import CommandError, Robot
-from vinesim.robot.tasks.task import Failed, Script
+from vinesim.robot.tasks.task import Task, TaskFailed
 
-LIFTED = 0.15
+LIFT_HEIGHT = 0.15
 """A box is carried so high above the ground [m]."""
-GROUNDED = 0.004
+RELEASE_HEIGHT = 0.004
 """A box is let go so high above where it was taken [m]: on the ground, whatever the clamp has given way."""
-HELD = 100.0
+MIN_CLAMP_FORCE = 100.0
 """Paddles that feel as much hold something [N]."""
-CREEP = 0.2
+APPROACH_SPEED = 0.2
 """Speed of the base beside a box [m/s]."""
-PLACED = 0.05
+PLACEMENT_TOLERANCE = 0.05
 """The empty box stands where the full one stood if it is no farther off [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Swap:
+class SwapPlan:
     """Which boxes to exchange, and the ways between them."""
 
     start: np.ndarray
     """[7] pose of the base at the beginning."""
-    full: int
-    empty: int
-    to_empty: np.ndarray
+    full_box: int
+    empty_box: int
+    path_to_empty: np.ndarray
     """[n, 2] m, from the start to a place with room to turn, straight before a long side of the empty box."""
-    to_full: np.ndarray
+    path_to_full: np.ndarray
     """[n, 2] m, from there to such a place before the full box."""
 
 
-class Exchange(Script):
+class SwapBoxes(Task):
     """An empty box for a full one; ``done``, ``succeeded`` and ``reason`` say how it went."""
 
-    def __init__(self, physics: Physics, robot: Robot, swap: Swap, *, seconds: float = 180.0) -> None:
-        super().__init__(robot, seconds=seconds)
-        self.physics, self.swap = physics, swap
+    def __init__(self, physics: Physics, robot: Robot, plan: SwapPlan, *, timeout: float = 180.0) -> None:
+        super().__init__(robot, timeout=timeout)
+        self.physics, self.plan = physics, plan
         for group in ("lift_front", "clamp_front", "lift_rear", "clamp_rear"):
             if group not in robot.description.groups:
                 raise CommandError(f"{robot.name} has no group {group!r}; give a robot with a clamp at either end")
-        self._place = self.box_pose(swap.full)
+        self._target_pose = self.box_pose(plan.full_box)
         """Where the full box stood [7]."""
-        self._contents = self._inside(swap.full)
+        self._contents = self._bunches_in(plan.full_box)
 
     def report(self) -> dict[str, Any]:
-        """See :class:`Script`."""
-        boxes = {"full": self.swap.full, "empty": self.swap.empty, "bunches": len(self._contents)}
+        """See :class:`Task`."""
+        boxes = {"full": self.plan.full_box, "empty": self.plan.empty_box, "bunches": len(self._contents)}
         return {"exchanged": self.succeeded, **boxes, **super().report()}
 
     def focus(self) -> np.ndarray:
-        """See :class:`Script`."""
-        return self.box_pose(self.swap.full)[:3]
+        """See :class:`Task`."""
+        return self.box_pose(self.plan.full_box)[:3]
 
     def box_pose(self, box: int) -> np.ndarray:
         """Where a box is [7]: the middle of its underside."""
@@ -81,98 +81,108 @@ class Exchange(Script):
 
     # ------------------------------------------------------------------ the job
 
-    def steps(self) -> Iterator[str]:
-        """See :class:`Script`."""
-        swap = self.swap
-        yield from self._go("to the empty box", swap.to_empty, self._away_from(swap.empty, swap.to_empty[-1]))
-        yield from self._take("rear", swap.empty)
-        yield from self._go("to the full box", swap.to_full, self._away_from(swap.full, swap.to_full[-1]) + math.pi)
-        yield from self._take("front", swap.full)
-        yield from self._go("turn", np.zeros((0, 2)), self._away_from(swap.full, swap.to_full[-1], self._place))
-        yield from self._leave("rear", swap.empty)
-        self._judge()
+    def run(self) -> Iterator[str]:
+        """See :class:`Task`."""
+        swap = self.plan
+        yield from self._follow_path(
+            "to the empty box", swap.path_to_empty, self._away_from(swap.empty_box, swap.path_to_empty[-1])
+        )
+        yield from self._take("rear", swap.empty_box)
+        yield from self._follow_path(
+            "to the full box", swap.path_to_full, self._away_from(swap.full_box, swap.path_to_full[-1]) + math.pi
+        )
+        yield from self._take("front", swap.full_box)
+        yield from self._follow_path(
+            "turn", np.zeros((0, 2)), self._away_from(swap.full_box, swap.path_to_full[-1], self._target_pose)
+        )
+        yield from self._put_down("rear", swap.empty_box)
+        self._check_result()
 
     def _take(self, end: str, box: int) -> Iterator[str]:
         """Come to a box, hold it, lift it, and go back to where there is room."""
-        phase, group = f"take the {'full' if box == self.swap.full else 'empty'} box", f"clamp_{end}"
-        here = self._base()[:2].copy()
-        fingers = self.robot.description.indices(group)
-        self.robot.command_position(self.robot.upper[fingers], fingers)
-        yield from self._lift(phase, end, 0.0)
-        yield from self._reach(phase, end, self.box_pose(box))
+        phase, group = f"take the {'full' if box == self.plan.full_box else 'empty'} box", f"clamp_{end}"
+        here = self._base_pose()[:2].copy()
+        fingers = self.robot.description.joint_indices(group)
+        self.robot.command_position(self.robot.upper_limit[fingers], fingers)
+        yield from self._move_lift(phase, end, 0.0)
+        yield from self._align_clamp(phase, end, self.box_pose(box))
         self.robot.command_position(np.zeros(len(fingers)), fingers)
         yield from self.wait(1.5, phase)
         felt = np.abs(self.robot.rigid.read(self.robot.name)[3][fingers])
-        if (felt < HELD).any():
-            raise Failed(f"the {end} paddles feel {felt.min():.0f} N: nothing between them")
+        if (felt < MIN_CLAMP_FORCE).any():
+            raise TaskFailed(f"the {end} paddles feel {felt.min():.0f} N: nothing between them")
         low = float(self.box_pose(box)[2])
-        yield from self._lift(phase, end, LIFTED)
+        yield from self._move_lift(phase, end, LIFT_HEIGHT)
         risen = float(self.box_pose(box)[2]) - low
-        if risen < 0.8 * LIFTED:
-            raise Failed(f"the box has slipped: lifted by {LIFTED} m it has risen by {risen:.2f} m")
-        yield from self._straight(phase, here, backwards=end == "front")
+        if risen < 0.8 * LIFT_HEIGHT:
+            raise TaskFailed(f"the box has slipped: lifted by {LIFT_HEIGHT} m it has risen by {risen:.2f} m")
+        yield from self._drive_straight(phase, here, backwards=end == "front")
 
-    def _leave(self, end: str, box: int) -> Iterator[str]:
+    def _put_down(self, end: str, box: int) -> Iterator[str]:
         """Put the box of a clamp down where the other one stood, and go back to where there is room."""
-        phase, here = "leave the empty box", self._base()[:2].copy()
-        yield from self._reach(phase, end, self._place)
+        phase, here = "leave the empty box", self._base_pose()[:2].copy()
+        yield from self._align_clamp(phase, end, self._target_pose)
         down = float(self.robot.rigid.read(self.robot.name)[0][self._lift_index(end)])
-        yield from self._lift(phase, end, down - float(self.box_pose(box)[2] - self._place[2]) + GROUNDED)
-        fingers = self.robot.description.indices(f"clamp_{end}")
-        self.robot.command_position(self.robot.upper[fingers], fingers)
+        yield from self._move_lift(
+            phase, end, down - float(self.box_pose(box)[2] - self._target_pose[2]) + RELEASE_HEIGHT
+        )
+        fingers = self.robot.description.joint_indices(f"clamp_{end}")
+        self.robot.command_position(self.robot.upper_limit[fingers], fingers)
         yield from self.wait(1.5, phase)
-        yield from self._straight(phase, here, backwards=end == "front")
+        yield from self._drive_straight(phase, here, backwards=end == "front")
 
-    def _judge(self) -> None:
-        """:class:`Failed` if a box is not where it should be, or what lay in it is not in it."""
-        swap = self.swap
-        off = float(np.linalg.norm(self.box_pose(swap.empty)[:2] - self._place[:2]))
-        if off > PLACED:
-            raise Failed(f"the empty box stands {off:.2f} m from where the full one stood")
-        if self.box_pose(swap.full)[2] < self._place[2] + 0.5 * LIFTED:
-            raise Failed("the full box has been lost on the way")
-        if lost := sorted(set(self._contents) - set(self._inside(swap.full))):
-            raise Failed(f"{len(lost)} of {len(self._contents)} bunches fell out of the full box: {lost}")
+    def _check_result(self) -> None:
+        """:class:`TaskFailed` if a box is not where it should be, or what lay in it is not in it."""
+        swap = self.plan
+        off = float(np.linalg.norm(self.box_pose(swap.empty_box)[:2] - self._target_pose[:2]))
+        if off > PLACEMENT_TOLERANCE:
+            raise TaskFailed(f"the empty box stands {off:.2f} m from where the full one stood")
+        if self.box_pose(swap.full_box)[2] < self._target_pose[2] + 0.5 * LIFT_HEIGHT:
+            raise TaskFailed("the full box has been lost on the way")
+        if lost := sorted(set(self._contents) - set(self._bunches_in(swap.full_box))):
+            raise TaskFailed(f"{len(lost)} of {len(self._contents)} bunches fell out of the full box: {lost}")
 
     # ------------------------------------------------------------------ what the steps are made of
 
-    def _go(self, phase: str, points: np.ndarray, heading: float) -> Iterator[str]:
-        yield from self._follow(phase, Way(self.robot, points, heading, speed=0.5, turn=0.3))
+    def _follow_path(self, phase: str, points: np.ndarray, heading: float) -> Iterator[str]:
+        yield from self._follow(phase, WaypointFollower(self.robot, points, heading, speed=0.5, turn_rate=0.3))
 
-    def _straight(self, phase: str, place: np.ndarray, *, backwards: bool) -> Iterator[str]:
-        yield from self._follow(phase, Way(self.robot, place, None, speed=CREEP, backwards=backwards))
+    def _drive_straight(self, phase: str, place: np.ndarray, *, backwards: bool) -> Iterator[str]:
+        yield from self._follow(
+            phase, WaypointFollower(self.robot, place, None, speed=APPROACH_SPEED, reverse=backwards)
+        )
 
-    def _reach(self, phase: str, end: str, box: np.ndarray) -> Iterator[str]:
+    def _align_clamp(self, phase: str, end: str, box: np.ndarray) -> Iterator[str]:
         """Bring the clamp at one ``end`` to a box at pose [7], straight."""
         clamp = self.robot.frame_pose(f"clamp_{end}_link")[:2]
-        base = self._base()[:2]
+        base = self._base_pose()[:2]
         reach = float(np.linalg.norm(clamp - base))
         ahead = (clamp - base) / reach
         # straight ahead: a sideways step is what the turn before was for
         place = base + ahead * (float((box[:2] - base) @ ahead) - reach)
-        yield from self._straight(phase, place, backwards=end == "rear")
+        yield from self._drive_straight(phase, place, backwards=end == "rear")
 
-    def _follow(self, phase: str, way: Way) -> Iterator[str]:
-        while not way.done:
+    def _follow(self, phase: str, way: WaypointFollower) -> Iterator[str]:
+        while not way.is_done:
             way.control(self.time)
-            if way.stuck:
-                raise Failed("something keeps the base from going on")
+            if way.is_stuck:
+                raise TaskFailed("something keeps the base from going on")
             yield phase
 
-    def _lift(self, phase: str, end: str, height: float) -> Iterator[str]:
+    def _move_lift(self, phase: str, end: str, height: float) -> Iterator[str]:
         """Bring a lift to ``height`` [m]."""
-        index = self.robot.description.indices(f"lift_{end}")
+        index = self.robot.description.joint_indices(f"lift_{end}")
         self.robot.command_position([height], index)
         until = self.time + 6.0
         while abs(self.robot.rigid.read(self.robot.name)[0][index[0]] - height) > 0.003:
             if self.time > until:
-                raise Failed(f"the {end} lift does not come to {height:.2f} m")
+                raise TaskFailed(f"the {end} lift does not come to {height:.2f} m")
             yield phase
 
     def _lift_index(self, end: str) -> int:
-        return int(self.robot.description.indices(f"lift_{end}")[0])
+        return int(self.robot.description.joint_indices(f"lift_{end}")[0])
 
-    def _base(self) -> np.ndarray:
+    def _base_pose(self) -> np.ndarray:
         return self.robot.rigid.base(self.robot.name)[0]
 
     def _away_from(self, box: int, place: np.ndarray, pose: np.ndarray | None = None) -> float:
@@ -180,7 +190,7 @@ class Exchange(Script):
         pose = self.box_pose(box) if pose is None else pose
         return math.atan2(place[1] - pose[1], place[0] - pose[0])
 
-    def _inside(self, box: int) -> tuple[int, ...]:
+    def _bunches_in(self, box: int) -> tuple[int, ...]:
         """The loose bunches that lie in a box."""
         rigid, size = self.physics.rigid, self.physics.model.box_size[box].astype(float)
         back, found = frames.inverse(self.box_pose(box)), []

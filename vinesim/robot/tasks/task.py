@@ -1,7 +1,7 @@
 """A job told in the order in which it happens: a generator that commands, then yields once a tick.
 
-    class Wave(Script):
-        def steps(self):
+    class Wave(Task):
+        def run(self):
             for angle in (0.5, -0.5, 0.0):
                 self.robot.command_position([angle], ["arm_left_3_joint"])
                 yield from self.wait(1.0, "wave")
@@ -26,39 +26,39 @@ from vinesim.robot.drives import Robot
 log = logging.getLogger(__name__)
 
 
-class Failed(Exception):
+class TaskFailed(Exception):
     """The job cannot go on; the text says why."""
 
 
-class Script(abc.ABC):
-    """Runs :meth:`steps` one tick at a time. ``reason`` is empty as long as all goes well."""
+class Task(abc.ABC):
+    """Runs :meth:`run` one tick at a time. ``reason`` is empty as long as all goes well."""
 
-    shown: frozenset[str] = frozenset()
+    key_phases: frozenset[str] = frozenset()
     """Phases of which a picture tells most."""
 
-    def __init__(self, robot: Robot, *, seconds: float) -> None:
-        """Given up after ``seconds`` [s]."""
-        self.robot, self.seconds = robot, seconds
+    def __init__(self, robot: Robot, *, timeout: float) -> None:
+        """Given up after ``timeout`` [s]."""
+        self.robot, self.timeout = robot, timeout
         self.time = 0.0
         """Of the present tick [s]."""
         self.phase = ""
         """What it is at."""
         self.durations: dict[str, float] = {}
         """How long each phase took, in their order [s]."""
-        self.done = False
+        self.is_done = False
         self.reason = ""
         """Why it failed, if it did."""
         self._started: float | None = None
-        self._steps = self.steps()
+        self._coroutine = self.run()
 
     @property
     def succeeded(self) -> bool:
         """Whether it came to its end."""
-        return self.done and not self.reason
+        return self.is_done and not self.reason
 
-    def worth(self) -> float:
+    def frame_score(self) -> float:
         """How much there is to see now, from 0 to 1."""
-        return float(self.phase in self.shown)
+        return float(self.phase in self.key_phases)
 
     def report(self) -> dict[str, Any]:
         """How it went, as plain values for JSON."""
@@ -70,25 +70,25 @@ class Script(abc.ABC):
         """What to look at [3] m in the world."""
 
     @abc.abstractmethod
-    def steps(self) -> Iterator[str]:
-        """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`Failed`."""
+    def run(self) -> Iterator[str]:
+        """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`TaskFailed`."""
 
     def control(self, time: float) -> None:
         """Command the robot for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
-        if self.done:
+        if self.is_done:
             return
         if self._started is None:
             self._started = time
         self.time = time
         try:
-            if time - self._started > self.seconds:
-                raise Failed(f"not done after {self.seconds:g} s")
-            self.phase = next(self._steps)
+            if time - self._started > self.timeout:
+                raise TaskFailed(f"not done after {self.timeout:g} s")
+            self.phase = next(self._coroutine)
             self.durations[self.phase] = self.durations.get(self.phase, 0.0) + self.robot.rigid.dt
         except StopIteration:
-            self.done = True
-        except Failed as failure:
-            self.done = True
+            self.is_done = True
+        except TaskFailed as failure:
+            self.is_done = True
             self.reason = f"{self.phase}: {failure}"
             log.warning("%s: %s", self.robot.name, self.reason)
 

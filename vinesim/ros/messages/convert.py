@@ -28,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 
 from vinesim import frames
 from vinesim.ros.commands.types import BaseVelocity, JointPositions, JointTrajectory
-from vinesim.ros.messages.transforms import split
+from vinesim.ros.messages.transforms import split_time
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
@@ -64,7 +64,7 @@ class CommandError(ValueError):
 
 def stamp(time: float) -> Time:
     """Simulation time [s] as a message."""
-    seconds, nanoseconds = split(time)
+    seconds, nanoseconds = split_time(time)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 

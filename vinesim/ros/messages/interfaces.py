@@ -54,7 +54,7 @@ class InterfacesError(RuntimeError):
     """A message package can neither be imported nor built; the text names the remedy."""
 
 
-def ensure(packages: Iterable[str]) -> None:
+def ensure_importable(packages: Iterable[str]) -> None:
     """Make message packages importable: the official one if there is one, else ours, built at the first call.
 
     A first build takes 10 to 20 s per package; :class:`InterfacesError` says in one line why one cannot be had.
@@ -67,14 +67,14 @@ def ensure(packages: Iterable[str]) -> None:
                 importlib.invalidate_caches()
 
 
-def known() -> list[str]:
+def available_packages() -> list[str]:
     """The packages whose definitions ship with vinesim."""
     return sorted(folder.name for folder in DEFINITIONS.iterdir() if folder.is_dir())
 
 
 def build(package: str) -> pathlib.Path:
     """Build ``package`` unless the cache has it; returns the folder to put on ``sys.path``."""
-    if package not in known():
+    if package not in available_packages():
         raise InterfacesError(
             f"message package {package!r} is not installed and vinesim ships no definitions of it; "
             f"source a ROS 2 that has it, or add its .msg files to {DEFINITIONS / package}"
@@ -143,7 +143,7 @@ def _check_toolchain(package: str) -> None:
         raise InterfacesError(f"{missing} {header} is missing; apt install python3-dev")
 
 
-class _Build:
+class _PackageBuild:
     """One package on its way from definitions to a Python package; runs in a process of its own."""
 
     def __init__(self, package: str, scratch: pathlib.Path) -> None:
@@ -291,7 +291,7 @@ def main() -> None:
     parser.add_argument("--into", type=pathlib.Path, required=True)
     parser.add_argument("--scratch", type=pathlib.Path, required=True)
     arguments = parser.parse_args()
-    _Build(arguments.package, arguments.scratch).run(arguments.into)
+    _PackageBuild(arguments.package, arguments.scratch).run(arguments.into)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ HEADER = b"\x00\x01\x00\x00"
 """CDR, little endian."""
 
 
-class Transforms:
+class SerializedTransforms:
     """The poses of ``frames``, pairs of (parent, child), ready to be published again and again."""
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
@@ -46,14 +46,14 @@ class Transforms:
         poses = np.asarray(poses, float)
         if poses.shape != (len(self._poses), 7):
             raise ValueError(f"poses have shape {poses.shape}, expected {(len(self._poses), 7)}: one per frame")
-        seconds, nanoseconds = split(time)
+        seconds, nanoseconds = split_time(time)
         self._words[self._stamps] = seconds
         self._words[self._stamps + 1] = nanoseconds
         self._doubles[self._poses] = poses
         return HEADER + self._bytes[8 : 8 + self._length].tobytes()
 
 
-def split(time: float) -> tuple[int, int]:
+def split_time(time: float) -> tuple[int, int]:
     """Seconds and nanoseconds of a time [s], rounded to the nearest nanosecond."""
     return divmod(round(time * 1e9), 1_000_000_000)
 

@@ -8,24 +8,24 @@ from functools import partial
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from vinesim.ros.messages import convert
-from vinesim.ros.topic import SENSOR, Advertise, Offer
+from vinesim.ros.topic import SENSOR_DATA, Advertise, PendingMessage
 from vinesim.scene.values import CameraFrame
 
 
-class Camera:
+class CameraPublisher:
     """``<name>/{rgb,depth}/{image_raw,camera_info}``, ``rgb/image_raw/compressed``, ``depth/points``, ``labels``."""
 
     def __init__(self, advertise: Advertise, name: str) -> None:
-        self._infos = [advertise(CameraInfo, f"{name}/{kind}/camera_info", SENSOR) for kind in ("rgb", "depth")]
+        self._infos = [advertise(CameraInfo, f"{name}/{kind}/camera_info", SENSOR_DATA) for kind in ("rgb", "depth")]
         self._built = (
-            (advertise(Image, f"{name}/rgb/image_raw", SENSOR), convert.rgb_image),
-            (advertise(Image, f"{name}/depth/image_raw", SENSOR), convert.depth_image),
-            (advertise(Image, f"{name}/labels", SENSOR), convert.label_image),
-            (advertise(CompressedImage, f"{name}/rgb/image_raw/compressed", SENSOR), convert.compressed_image),
-            (advertise(PointCloud2, f"{name}/depth/points", SENSOR), convert.depth_cloud),
+            (advertise(Image, f"{name}/rgb/image_raw", SENSOR_DATA), convert.rgb_image),
+            (advertise(Image, f"{name}/depth/image_raw", SENSOR_DATA), convert.depth_image),
+            (advertise(Image, f"{name}/labels", SENSOR_DATA), convert.label_image),
+            (advertise(CompressedImage, f"{name}/rgb/image_raw/compressed", SENSOR_DATA), convert.compressed_image),
+            (advertise(PointCloud2, f"{name}/depth/points", SENSOR_DATA), convert.depth_cloud),
         )
 
-    def offers(self, frame: CameraFrame) -> Iterator[Offer]:
+    def pending(self, frame: CameraFrame) -> Iterator[PendingMessage]:
         """Everything that one picture tells, cheap things first."""
         for topic in self._infos:
             yield topic, partial(convert.camera_info, frame.info, frame.time)

@@ -8,15 +8,15 @@ from functools import partial
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from vinesim.ros.messages import convert
-from vinesim.ros.topic import RELIABLE, Advertise, Offer
+from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
 
 
-class Clock:
+class ClockPublisher:
     """There is one clock per ROS domain, so its name is absolute under every namespace."""
 
     def __init__(self, advertise: Advertise) -> None:
-        self._topic = advertise(ClockMessage, "/clock", RELIABLE, urgent=True)
+        self._topic = advertise(ClockMessage, "/clock", RELIABLE, high_priority=True)
 
-    def offers(self, time: float) -> Iterator[Offer]:
+    def pending(self, time: float) -> Iterator[PendingMessage]:
         """The time [s]."""
         yield self._topic, partial(convert.clock, time)

@@ -9,32 +9,32 @@ import numpy as np
 from std_msgs.msg import String
 
 from vinesim.ros.messages import convert
-from vinesim.ros.messages.transforms import Transforms
-from vinesim.ros.publishers.robot import MAP
-from vinesim.ros.topic import LATCHED, RELIABLE, Advertise, Offer
+from vinesim.ros.messages.transforms import SerializedTransforms
+from vinesim.ros.publishers.robot import MAP_FRAME
+from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
 
 
-class Surroundings:
+class GroundTruthPublisher:
     """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map; ``label_map``, latched."""
 
     def __init__(self, advertise: Advertise, tf_message: type) -> None:
         self._moving = advertise(tf_message, "tf_environment", RELIABLE)
-        self._static = advertise(tf_message, "tf_environment_static", LATCHED)
-        advertise(String, "label_map", LATCHED).send(convert.label_map())
+        self._static = advertise(tf_message, "tf_environment_static", TRANSIENT_LOCAL)
+        advertise(String, "label_map", TRANSIENT_LOCAL).send(convert.label_map())
         self._names: Sequence[str] | None = None
-        self._transforms = Transforms([])
+        self._transforms = SerializedTransforms([])
 
-    def offers(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[Offer]:
+    def pending(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
         """What moves; what is no longer named is gone. Pass the same tuple as long as the names stay."""
         yield self._moving, partial(self._message, time, names, poses)
 
-    def static_offers(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[Offer]:
+    def pending_static(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
         """What stands, once for all."""
-        transforms = Transforms([(MAP, name) for name in names])
+        transforms = SerializedTransforms([(MAP_FRAME, name) for name in names])
         yield self._static, partial(transforms.message, 0.0, poses)
 
     def _message(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> bytes:
         if names is not self._names:
-            self._transforms = Transforms([(MAP, name) for name in names])
+            self._transforms = SerializedTransforms([(MAP_FRAME, name) for name in names])
             self._names = names
         return self._transforms.message(time, poses)

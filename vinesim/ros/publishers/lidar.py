@@ -8,16 +8,16 @@ from functools import partial
 from sensor_msgs.msg import PointCloud2
 
 from vinesim.ros.messages import convert
-from vinesim.ros.topic import SENSOR, Advertise, Offer
+from vinesim.ros.topic import SENSOR_DATA, Advertise, PendingMessage
 from vinesim.scene.values import LidarScan
 
 
-class Lidar:
+class LidarPublisher:
     """``<name>/points``: x y z intensity ring time; return_type too if the lidar reports two returns of a shot."""
 
     def __init__(self, advertise: Advertise, name: str) -> None:
-        self._points = advertise(PointCloud2, f"{name}/points", SENSOR)
+        self._points = advertise(PointCloud2, f"{name}/points", SENSOR_DATA)
 
-    def offers(self, scan: LidarScan) -> Iterator[Offer]:
+    def pending(self, scan: LidarScan) -> Iterator[PendingMessage]:
         """One revolution."""
         yield self._points, partial(convert.lidar_cloud, scan)

@@ -13,17 +13,17 @@ from std_msgs.msg import String
 
 from vinesim import frames
 from vinesim.ros.messages import convert
-from vinesim.ros.messages.transforms import Transforms
-from vinesim.ros.topic import LATCHED, RELIABLE, TRANSFORMS, Advertise, Offer
+from vinesim.ros.messages.transforms import SerializedTransforms
+from vinesim.ros.topic import RELIABLE, TRANSFORMS, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import Contact, RobotSample
 
-MAP, ODOM = "map", "odom"
+MAP_FRAME, ODOM_FRAME = "map", "odom"
 
-Joints = dict[str, tuple[str, np.ndarray]]
+FrameTree = dict[str, tuple[str, np.ndarray]]
 """Parent and pose [7] in the parent, by child frame."""
 
 
-class Robot:
+class RobotPublisher:
     """robot_description and tf_static once; joint_states, tf, odometry and contacts every tick."""
 
     def __init__(
@@ -35,21 +35,21 @@ class Robot:
         base: str,
     ) -> None:
         self._base = base
-        self._fixed: Joints = {child: (parent, np.asarray(pose, float)) for parent, child, pose in static_transforms}
+        self._fixed: FrameTree = {child: (parent, np.asarray(pose, float)) for parent, child, pose in static_transforms}
         self._pairs: tuple[tuple[str, str], ...] | None = None
-        self._transforms = Transforms([])
+        self._transforms = SerializedTransforms([])
 
-        self._joints = advertise(JointState, "joint_states", RELIABLE, urgent=True)
-        self._tf = advertise(tf_message, "tf", TRANSFORMS, urgent=True)
-        self._odometry = advertise(Odometry, "mobile_base_controller/odom", RELIABLE, urgent=True)
-        self._contacts = advertise(WrenchStamped, "vine/contacts", RELIABLE, urgent=True)
+        self._joints = advertise(JointState, "joint_states", RELIABLE, high_priority=True)
+        self._tf = advertise(tf_message, "tf", TRANSFORMS, high_priority=True)
+        self._odometry = advertise(Odometry, "mobile_base_controller/odom", RELIABLE, high_priority=True)
+        self._contacts = advertise(WrenchStamped, "vine/contacts", RELIABLE, high_priority=True)
 
-        advertise(String, "robot_description", LATCHED).send(String(data=urdf))
-        static = Transforms([(parent, child) for child, (parent, _) in self._fixed.items()])
+        advertise(String, "robot_description", TRANSIENT_LOCAL).send(String(data=urdf))
+        static = SerializedTransforms([(parent, child) for child, (parent, _) in self._fixed.items()])
         poses = np.array([pose for _, pose in self._fixed.values()]).reshape(-1, 7)
-        advertise(tf_message, "tf_static", LATCHED).send(static.message(0.0, poses))
+        advertise(tf_message, "tf_static", TRANSIENT_LOCAL).send(static.message(0.0, poses))
 
-    def offers(self, sample: RobotSample) -> Iterator[Offer]:
+    def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """Everything that one tick tells."""
         yield self._joints, partial(convert.joint_state, sample.joints)
         yield self._tf, partial(self._frames, sample)
@@ -59,7 +59,9 @@ class Robot:
 
     def _frames(self, sample: RobotSample) -> bytes:
         if sample.transforms is not self._pairs:
-            self._transforms = Transforms([(MAP, ODOM), (ODOM, self._base), *sample.transforms])
+            self._transforms = SerializedTransforms(
+                [(MAP_FRAME, ODOM_FRAME), (ODOM_FRAME, self._base), *sample.transforms]
+            )
             self._pairs = sample.transforms
         base, odom = np.asarray(sample.base_q, float), np.asarray(sample.odom_q, float)
         drift = frames.compose(base, frames.inverse(odom))
@@ -71,18 +73,18 @@ class Robot:
         joints = self._fixed | {child: (parent, pose) for (parent, child), pose in moving}
         return [self._wrench(sample, contact, joints) for contact in sample.contacts]
 
-    def _wrench(self, sample: RobotSample, contact: Contact, joints: Joints) -> WrenchStamped:
+    def _wrench(self, sample: RobotSample, contact: Contact, joints: FrameTree) -> WrenchStamped:
         """In the frame of the touching link, or in the map if no frame bears the link's name."""
         link = contact.link.removeprefix(f"{sample.actor}/")
         in_base = pose_in_base(link, joints, self._base)
         if in_base is None:
-            return convert.wrench(contact, sample.joints.time, MAP, frames.pose(np.zeros(3)))
+            return convert.wrench(contact, sample.joints.time, MAP_FRAME, frames.pose(np.zeros(3)))
         return convert.wrench(
             contact, sample.joints.time, link, frames.compose(np.asarray(sample.base_q, float), in_base)
         )
 
 
-def pose_in_base(link: str, joints: Joints, base: str) -> np.ndarray | None:
+def pose_in_base(link: str, joints: FrameTree, base: str) -> np.ndarray | None:
     """Pose [7] of a link in the base, up the tree of joints; None if they do not lead there."""
     pose = frames.pose(np.zeros(3))
     for _ in range(len(joints) + 1):

@@ -29,13 +29,13 @@ from typing import Any
 from vinesim.ros import ros_setup
 from vinesim.ros.messages import interfaces
 
-LOOK_PERIOD = 0.2
+DISCOVERY_PERIOD = 0.2
 """How often the graph is searched for new topics [s]."""
-NOISE = ("/rosout", "/parameter_events")
+EXCLUDED_TOPICS = ("/rosout", "/parameter_events")
 """Topics of every node, not listened to unless named."""
 
 
-class Ear:
+class TopicStats:
     """What one topic brought."""
 
     def __init__(self, type_name: str, type_hash: str, message: type, publishers: int) -> None:
@@ -50,7 +50,7 @@ class Ear:
         self._sequence: int | None = None
         self._latencies: deque[int] = deque(maxlen=10_000)
 
-    def hear(self, message: bytes, info: dict[str, Any]) -> None:
+    def add(self, message: bytes, info: dict[str, Any]) -> None:
         """One serialised message, and what the middleware says of it."""
         now = time.time_ns()
         if not self.count:
@@ -88,7 +88,7 @@ class Ear:
         }
 
 
-class Witness:
+class TopicMonitor:
     """Subscribes to topics as they appear."""
 
     def __init__(self, topics: Sequence[str] = ()) -> None:
@@ -96,29 +96,29 @@ class Witness:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
 
-        self.ears: dict[str, Ear] = {}
-        self._asked = tuple(topics)
+        self.stats: dict[str, TopicStats] = {}
+        self._topics = tuple(topics)
         self._context = Context()
         self._context.init([])
         self._node = Node("witness", context=self._context, enable_rosout=False, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
 
-    def listen(self, until: threading.Event, seconds: float | None) -> None:
+    def run(self, until: threading.Event, seconds: float | None) -> None:
         """Listen until the event, or for so many seconds from the first message on."""
         next_look = 0.0
         deadline = None
         while not until.is_set() and (deadline is None or time.monotonic() < deadline):
             if time.monotonic() >= next_look:
-                self._look()
-                next_look = time.monotonic() + LOOK_PERIOD
-            self._executor.spin_once(timeout_sec=LOOK_PERIOD)
-            if seconds is not None and deadline is None and any(ear.count for ear in self.ears.values()):
+                self._discover()
+                next_look = time.monotonic() + DISCOVERY_PERIOD
+            self._executor.spin_once(timeout_sec=DISCOVERY_PERIOD)
+            if seconds is not None and deadline is None and any(ear.count for ear in self.stats.values()):
                 deadline = time.monotonic() + seconds
 
     def report(self) -> dict[str, dict[str, Any]]:
         """By topic."""
-        return {name: ear.report() for name, ear in sorted(self.ears.items())}
+        return {name: ear.report() for name, ear in sorted(self.stats.items())}
 
     def close(self) -> None:
         """Leave the graph."""
@@ -126,10 +126,10 @@ class Witness:
         self._node.destroy_node()
         self._context.shutdown()
 
-    def _look(self) -> None:
+    def _discover(self) -> None:
         for name, types in self._node.get_topic_names_and_types():
-            heard = name in self._asked if self._asked else name not in NOISE
-            if heard and name not in self.ears:
+            heard = name in self._topics if self._topics else name not in EXCLUDED_TOPICS
+            if heard and name not in self.stats:
                 self._subscribe(name, types[0])
 
     def _subscribe(self, name: str, type_name: str) -> None:
@@ -147,9 +147,9 @@ class Witness:
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        ear = Ear(type_name, str(offered[0].topic_type_hash), message, len(offered))
-        self.ears[name] = ear
-        hear: Any = ear.hear  # rclpy hands over what the signature has room for, its annotations know less
+        ear = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered))
+        self.stats[name] = ear
+        hear: Any = ear.add  # rclpy hands over what the signature has room for, its annotations know less
         self._node.create_subscription(message, name, hear, qos, raw=True)
 
 
@@ -193,18 +193,18 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Listen and report; returns the exit status."""
     given = parse(arguments)
-    reason = ros_setup.available()
+    reason = ros_setup.unavailable_reason()
     if reason is not None:
         sys.stderr.write(reason + "\n")
         return 2
-    ros_setup.without_profile()
-    interfaces.ensure(["tf2_msgs"])
+    ros_setup.clear_profile()
+    interfaces.ensure_importable(["tf2_msgs"])
     stop = threading.Event()
     if given.seconds is None:
         threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
-    witness = Witness(given.topics)
+    witness = TopicMonitor(given.topics)
     with contextlib.suppress(KeyboardInterrupt):
-        witness.listen(stop, given.seconds)
+        witness.run(stop, given.seconds)
     text = json.dumps(witness.report(), indent=1)
     witness.close()
     if given.out is None:

@@ -38,7 +38,7 @@ Draw = Callable[..., np.ndarray]
 
 _SIDE = slice(PIECES, PIECES + SIDE_PIECES)
 _CORE = PIECES + SIDE_PIECES + BUNCHES * (STALK_PIECES + 1)
-_SLOTS = _CORE + BUNCHES * builder.CLUSTERS
+_SLOTS = _CORE + BUNCHES * builder.MAX_CLUSTERS
 _BOUND = 10
 """The piece of a shoot at whose beginning a string binds it to the net."""
 _CLEAR = 0.02
@@ -55,19 +55,19 @@ def _stalk(which: int) -> slice:
 
 def _clusters(which: int) -> slice:
     """Slots of one bunch's berry clusters."""
-    first = _CORE + which * builder.CLUSTERS
-    return slice(first, first + builder.CLUSTERS)
+    first = _CORE + which * builder.MAX_CLUSTERS
+    return slice(first, first + builder.MAX_CLUSTERS)
 
 
 def generate(scene: Scene) -> Model:
     """The model of a scene; the same scene gives the same bits."""
-    parts = plant_parameters.load(scene.plants)
+    parts = plant_parameters.load_plant(scene.plants)
     wood = _old_wood(scene, parts)
     shoots = _draw_shoots(scene, parts, wood)
     bodies = _bodies(scene, parts, shoots)
     leaf = _leaves(scene, parts, shoots, bodies)
     model = _model(scene, parts, wood, shoots, bodies, leaf, _ties(scene, parts, shoots, bodies))
-    return builder.settle(model).check()
+    return builder.solve_rest_pose(model).check()
 
 
 # ---- old wood and trellis ------------------------------------------------------------------------------------------
@@ -89,7 +89,7 @@ class _Wood:
     fixed: dict[str, np.ndarray]
 
 
-def _old_wood(scene: Scene, parts: plant_parameters.Vine) -> _Wood:
+def _old_wood(scene: Scene, parts: plant_parameters.VineParameters) -> _Wood:
     layout, tendone = scene.layout, scene.training == "tendone"
     row, place = (a.ravel() for a in np.mgrid[0 : layout.rows, 0 : layout.vines])
     foot = np.stack([place * layout.vine_spacing, row * layout.row_spacing, 0.0 * row], -1)
@@ -148,7 +148,7 @@ def _chains(points: np.ndarray, radius: np.ndarray, organ: Organ, index: np.ndar
     }
 
 
-def _wires(scene: Scene, parts: plant_parameters.Vine) -> list[dict[str, np.ndarray]]:
+def _wires(scene: Scene, parts: plant_parameters.VineParameters) -> list[dict[str, np.ndarray]]:
     """A net at the roof (tendone), or a fruiting wire and pairs of catch wires in each row (vsp)."""
     layout, trellis = scene.layout, parts.trellis
     wide, deep = (layout.vines - 1) * layout.vine_spacing, (layout.rows - 1) * layout.row_spacing
@@ -219,7 +219,7 @@ class _Shoots:
     """[4, shoot, NODES + SIDE_NODES] uniform numbers"""
 
 
-def _draw_shoots(scene: Scene, parts: plant_parameters.Vine, wood: _Wood) -> _Shoots:
+def _draw_shoots(scene: Scene, parts: plant_parameters.VineParameters, wood: _Wood) -> _Shoots:
     tendone, cane = scene.training == "tendone", parts.cane
     each = int((parts.arm.tendone_shoots if tendone else parts.arm.vsp_shoots).value)
     arm_count = wood.arms.shape[1]
@@ -323,7 +323,7 @@ def _side_axis(
 
 def _draw_fruit(
     scene: Scene,
-    parts: plant_parameters.Vine,
+    parts: plant_parameters.VineParameters,
     points: np.ndarray,
     nodes: np.ndarray,
     row: np.ndarray,
@@ -340,10 +340,10 @@ def _draw_fruit(
     variety = np.broadcast_to(in_turn[row % len(in_turn)][:, None], mass.shape)
     juice = mass * (1.0 - fruit.stem_share.value)
     berry_mass = np.array([v.mass for v in berries.VARIETIES])[variety]
-    count = np.clip(np.round(juice / berry_mass), berries.FEWEST, berries.MOST).astype(int)
+    count = np.clip(np.round(juice / berry_mass), berries.MIN_BERRIES, berries.MAX_BERRIES).astype(int)
     seed = (uniform(BUNCHES) * 2.0**32).astype(np.uint32)
     size = np.array([v.volume_radius for v in berries.VARIETIES])[variety] * np.cbrt(juice / (count * berry_mass))
-    hull = berries.hull(count, seed) * size[..., None]
+    hull = berries.hull_size(count, seed) * size[..., None]
     drawn = {
         "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,
         "pull": stalk.pull.at(uniform(BUNCHES)), "thick": 0.5 * stalk.diameter.at(_share(mass, fruit.mass_range)),
@@ -450,7 +450,7 @@ class _Bodies:
     """[shoot, BUNCHES] mass, com, inertia of what of a bunch is no cluster."""
 
 
-def _bodies(scene: Scene, parts: plant_parameters.Vine, s: _Shoots) -> _Bodies:
+def _bodies(scene: Scene, parts: plant_parameters.VineParameters, s: _Shoots) -> _Bodies:
     count = len(s.vine)
     shape = (count, _SLOTS)
     b = _Bodies(
@@ -499,7 +499,7 @@ def _bodies(scene: Scene, parts: plant_parameters.Vine, s: _Shoots) -> _Bodies:
     return b
 
 
-def _bunch(parts: plant_parameters.Vine, s: _Shoots, b: _Bodies, k: int) -> None:
+def _bunch(parts: plant_parameters.VineParameters, s: _Shoots, b: _Bodies, k: int) -> None:
     """Fill the slots of the bunch at the end of stalk ``k`` and of its clusters."""
     bunch, clusters = _stalk(k).stop - 1, _clusters(k)
     b.present[:, clusters] = False
@@ -507,14 +507,14 @@ def _bunch(parts: plant_parameters.Vine, s: _Shoots, b: _Bodies, k: int) -> None
     if len(has) == 0:
         return
     mass, long, wide, count, seed = (s.fruit[name][has, k] for name in ("mass", "length", "radius", "count", "seed"))
-    pieces = builder.bunch_pieces(mass, long, wide, count, seed, parts.rachis, parts.bunch.stem_share.value)
+    pieces = builder.segment_bunches(mass, long, wide, count, seed, parts.rachis, parts.bunch.stem_share.value)
     b.mass[has, bunch], b.com[has, bunch], b.inertia[has, bunch] = pieces.compound()
     for name, head in b.head.items():
         head[has, k] = getattr(pieces, name)[:, 0]
     b.organ[:, bunch] = b.organ[:, clusters] = int(Organ.BUNCH)
     b.parent[:, bunch] = bunch - 1
     b.origin[:, bunch] = s.stalk[:, k, -1]
-    b.turn[:, bunch] = frames.aligned(s.hang[:, k], s.roll[:, k])
+    b.turn[:, bunch] = frames.from_x_axis(s.hang[:, k], s.roll[:, k])
     b.length[has, bunch], b.radius[has, bunch] = long, wide[:, None]
     b.stiffness[:, bunch], b.damping[:, bunch] = b.stiffness[:, bunch - 1], b.damping[:, bunch - 1]
     # the wind takes hold of the bunch as a whole
@@ -546,15 +546,15 @@ def _rod(
     along = np.diff(points, axis=1)
     length = np.linalg.norm(along, axis=-1)
     start, end = radius[:, :-1], radius[:, 1:]
-    mass, inertia, near, b.half[:, slots] = builder.section(length, start, end, modulus, density)
+    mass, inertia, near, b.half[:, slots] = builder.segment_properties(length, start, end, modulus, density)
     b.parent[:, slots] = parent
     b.origin[:, slots] = points[:, :-1]
-    b.turn[:, slots] = turn = frames.aligned(along, up[:, None])
+    b.turn[:, slots] = turn = frames.from_x_axis(along, up[:, None])
     slack = 1.0 / near
     slack[:, 1:] += 1.0 / b.half[:, slots][:, :-1]
     if (parent[:, 0] >= 0).all():
         grown_on = np.arange(len(parent)), parent[:, 0]
-        axes = frames.matrix(frames.multiply(frames.conjugate(b.turn[grown_on]), turn[:, 0]))
+        axes = frames.to_matrix(frames.multiply(frames.conjugate(b.turn[grown_on]), turn[:, 0]))
         slack[:, 0] += np.einsum("si,sij->sj", 1.0 / b.half[grown_on], axes**2)
     stiffness = 1.0 / slack
     b.length[:, slots] = length
@@ -569,7 +569,7 @@ def _rod(
 # ---- leaves --------------------------------------------------------------------------------------------------------
 
 
-def _leaves(scene: Scene, parts: plant_parameters.Vine, s: _Shoots, b: _Bodies) -> dict[str, np.ndarray]:
+def _leaves(scene: Scene, parts: plant_parameters.VineParameters, s: _Shoots, b: _Bodies) -> dict[str, np.ndarray]:
     """Leaves at the nodes, left and right in turn, and their weight on the bodies that carry them."""
     count, leaf = len(s.vine), parts.leaf
     node = np.arange(NODES + SIDE_NODES)
@@ -608,7 +608,7 @@ def _leaves(scene: Scene, parts: plant_parameters.Vine, s: _Shoots, b: _Bodies) 
     flat = frames.normalize(out * [1.0, 1.0, 0.0])
     midrib = frames.normalize(flat + 0.3 * swing * axis + ((-0.45 if tendone else -1.0) + 0.3 * droop) * up)
     upper = up + (0.0 if tendone else 0.9) * flat + 0.3 * np.concatenate(lean, -1)
-    pose = np.concatenate([blade, frames.multiply(frames.conjugate(turn), frames.aligned(midrib, upper))], -1)
+    pose = np.concatenate([blade, frames.multiply(frames.conjugate(turn), frames.from_x_axis(midrib, upper))], -1)
     age = np.where(turned < scene.season.yellow, 0.75, 0.05 + 0.45 * (1.0 - share)) + 0.08 * ageing[..., 0]
 
     weight = np.where(present, leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink), 0.0)
@@ -639,7 +639,7 @@ def _lever(p: np.ndarray) -> np.ndarray:
 # ---- ties ----------------------------------------------------------------------------------------------------------
 
 
-def _ties(scene: Scene, parts: plant_parameters.Vine, s: _Shoots, b: _Bodies) -> dict[str, np.ndarray]:
+def _ties(scene: Scene, parts: plant_parameters.VineParameters, s: _Shoots, b: _Bodies) -> dict[str, np.ndarray]:
     """Where shoots pass wires closely: over the net they are tied to it or lie on it, in a hedge wires hold them.
 
     A taut wire pushed aside half way between two posts gives way with 4 tension / span.
@@ -694,7 +694,7 @@ def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> 
 
 
 def _model(
-    scene: Scene, parts: plant_parameters.Vine, wood: _Wood, s: _Shoots, b: _Bodies, leaf: dict[str, np.ndarray],
+    scene: Scene, parts: plant_parameters.VineParameters, wood: _Wood, s: _Shoots, b: _Bodies, leaf: dict[str, np.ndarray],
     ties: dict[str, np.ndarray],
 ) -> Model:  # fmt: skip
     """Leave out what is masked, number the rest, and make drawn world poses relative."""
@@ -750,12 +750,12 @@ def _model(
         leaf["pose"][shown],
         leaf["age"][shown],
     )
-    blade = np.mean([leaves.area(shape) for shape in range(leaves.SHAPES)])
+    blade = np.mean([leaves.blade_area(shape) for shape in range(leaves.SHAPE_COUNT)])
     model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade)
 
     for name, value in wood.fixed.items():
         getattr(model, name)[:] = value
     for i, box in enumerate(scene.boxes):
-        model.box_pose[i] = frames.pose(np.array([box.x, box.y, 0.0]), frames.yaw(box.yaw))
+        model.box_pose[i] = frames.pose(np.array([box.x, box.y, 0.0]), frames.from_yaw(box.yaw))
         model.box_size[i], model.box_mass[i] = box.size, box.mass
     return model

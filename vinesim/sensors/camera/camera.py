@@ -27,16 +27,18 @@ from vinesim.sensors.camera.sunlight import DEFAULT_SUN, Sunlight, SunPath
 from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
 from vinesim.sensors.scene.primitives import Primitives
 
-REACH = 500.0
+MAX_DEPTH = 500.0
 """Nothing is drawn beyond this depth [m]."""
-_RASTER = (
+_KERNELS = (
     (camera_raster.raster_cones, (CONE,)),
     (camera_raster.raster_spheroids, (SPHEROID,)),
     (camera_raster.raster_triangles, (TRIANGLE,)),
     (camera_raster.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
     (camera_raster.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
 )
-_STAGE = np.array([next(i for i, (_, kinds) in enumerate(_RASTER) if kind in kinds) for kind in range(TRIANGLE + 1)])
+_KERNEL_OF_KIND = np.array(
+    [next(i for i, (_, kinds) in enumerate(_KERNELS) if kind in kinds) for kind in range(TRIANGLE + 1)]
+)
 """Which of these draws a kind."""
 
 
@@ -98,16 +100,16 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> camera_raster.Pinhole:
         raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
     lens = camera_raster.Pinhole()
     lens.eye = wp.vec3(*map(float, pose[:3]))
-    lens.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
+    lens.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
     lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
-    lens.width, lens.height, lens.reach = int(info.width), int(info.height), REACH
+    lens.width, lens.height, lens.max_depth = int(info.width), int(info.height), MAX_DEPTH
     wide = max(info.cx, info.width - info.cx) / info.fx
     high = max(info.cy, info.height - info.cy) / info.fy
-    lens.close = float(camera_raster.CLOSE) * float(np.sqrt(1.0 + wide * wide + high * high))
+    lens.near_radius = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
     return lens
 
 
-def finer(info: CameraInfo, samples: int) -> CameraInfo:
+def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
     """Intrinsics of the same view with ``samples`` squared pixels for each one."""
     return dataclasses.replace(
         info,
@@ -120,7 +122,7 @@ def finer(info: CameraInfo, samples: int) -> CameraInfo:
     )
 
 
-class Visibility:
+class CameraRasterizer:
     """Nearest primitive of every pixel; the buffers of one camera."""
 
     def __init__(self, width: int, height: int, device: str = "cpu") -> None:
@@ -134,18 +136,18 @@ class Visibility:
         self._distance = wp.empty(0, dtype=float, device=device)
 
     def draw(
-        self, primitives: Primitives, lens: camera_raster.Pinhole, nearest: float = 0.0, farthest: float = REACH
+        self, primitives: Primitives, lens: camera_raster.Pinhole, nearest: float = 0.0, farthest: float = MAX_DEPTH
     ) -> None:
         """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
-        if primitives.raster is None:
-            distance = self.distances(primitives, lens)
+        if primitives.rasterizer is None:
+            distance = self.cluster_distances(primitives, lens)
             seen = np.flatnonzero(distance < float(shapes.FAR))
-            self._raster(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+            self._rasterize(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
         else:
-            primitives.raster.fill(primitives, lens, None, self.keys)
+            primitives.rasterizer.rasterize(primitives, lens, None, self.keys)
         run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
-            camera_raster.resolve,
+            camera_raster.resolve_keys,
             self.width * self.height // run,
             inputs=[
                 primitives.labels,
@@ -162,31 +164,35 @@ class Visibility:
             device=self.device,
         )
 
-    def distances(self, primitives: Primitives, lens: camera_raster.Pinhole) -> np.ndarray:
+    def cluster_distances(self, primitives: Primitives, lens: camera_raster.Pinhole) -> np.ndarray:
         """How near each cluster may come to the eye [cluster] m; :data:`shapes.FAR` if no pixel can see it."""
         clusters = len(primitives.cluster_first)
         if len(self._distance) != clusters:
             self._distance = wp.empty(clusters, dtype=float, device=self.device)
         wp.launch(
-            camera_raster.cull, clusters, inputs=[primitives.ball, lens], outputs=[self._distance], device=self.device
+            camera_raster.cull_clusters,
+            clusters,
+            inputs=[primitives.ball, lens],
+            outputs=[self._distance],
+            device=self.device,
         )
         return self._distance.numpy()
 
-    def alone(self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray) -> np.ndarray:
+    def coverage(self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray) -> np.ndarray:
         """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
-        if primitives.raster is None:
-            self._raster(primitives, lens, clusters)
+        if primitives.rasterizer is None:
+            self._rasterize(primitives, lens, clusters)
         else:
-            primitives.raster.fill(primitives, lens, clusters, self.keys)
-        return self.keys.numpy().reshape(self.height, self.width) < int(camera_raster.EMPTY)
+            primitives.rasterizer.rasterize(primitives, lens, clusters, self.keys)
+        return self.keys.numpy().reshape(self.height, self.width) < int(camera_raster.EMPTY_KEY)
 
-    def _raster(self, primitives: Primitives, lens: camera_raster.Pinhole, seen: np.ndarray) -> None:
+    def _rasterize(self, primitives: Primitives, lens: camera_raster.Pinhole, seen: np.ndarray) -> None:
         """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
-        self._keys.fill(int(camera_raster.EMPTY))  # numpy's fill of the same memory: five times as fast
+        self._keys.fill(int(camera_raster.EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
-        stage = _STAGE[kind]
-        for number, (kernel, _) in enumerate(_RASTER):
+        stage = _KERNEL_OF_KIND[kind]
+        for number, (kernel, _) in enumerate(_KERNELS):
             mine = seen[stage == number]
             if len(mine):
                 wp.launch(
@@ -208,14 +214,14 @@ class Quality:
     """Pixels, squared, in which one primitive is lit once."""
     samples: int
     """Samples, squared, of one pixel's colour."""
-    fine: int
+    shadow_texel_divisor: int
     """Divides the texels of the shadow map nearby."""
 
 
 QUALITIES = {
-    "fast": Quality(taps=-1, block=2, samples=1, fine=1),
-    "full": Quality(taps=0, block=1, samples=1, fine=1),
-    "still": Quality(taps=12, block=2, samples=2, fine=2),
+    "fast": Quality(taps=-1, block=2, samples=1, shadow_texel_divisor=1),
+    "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1),
+    "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2),
 }
 """``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
 
@@ -237,7 +243,7 @@ class Camera:
     """Fixed; automatic unless given. 0.75 suits a sunny noon."""
     device: str = "cpu"
     seed: int = 0
-    image: int = 0
+    image_index: int = 0
     """Number of the next image. What the sensor measures follows from (seed, name, this)."""
 
     def __post_init__(self) -> None:
@@ -248,15 +254,17 @@ class Camera:
         period = self.shadow_period
         if period is None:
             period = 0.0 if self.quality == "still" else 0.2
-        self.visibility = Visibility(width, height, self.device)
-        self._samples = self.visibility
+        self.rasterizer = CameraRasterizer(width, height, self.device)
+        self._supersampled = self.rasterizer
         if samples > 1:
-            self._samples = Visibility(width * samples, height * samples, self.device)
-        self._sunlight = Sunlight(self.sun, taps=quality.taps, period=period, fine=quality.fine, device=self.device)
+            self._supersampled = CameraRasterizer(width * samples, height * samples, self.device)
+        self._sunlight = Sunlight(
+            self.sun, taps=quality.taps, period=period, fine=quality.shadow_texel_divisor, device=self.device
+        )
         self._exposure = Exposure(width, height, samples, self.exposure, self.device)
-        self._landing: list[wp.array] = []
+        self._host_buffers: list[wp.array] = []
         reach = self.spec.nearest.value, self.spec.farthest.value
-        self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, Visibility, self.device)
+        self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, CameraRasterizer, self.device)
 
     @property
     def rate(self) -> float:
@@ -264,24 +272,24 @@ class Camera:
         return self.spec.rate.value
 
     def render(
-        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, measure: bool = True
+        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, measure_depth: bool = True
     ) -> CameraFrame:
         """The frame seen from ``pose`` [7], the optical frame in the world.
 
         Who looks at colours only saves the second view by ``measure=False``: depth is then exact, where in range.
         """
         pose = np.array(pose, float)
-        picture = self.expose(primitives, pose, time)
+        picture = self.render_on_device(primitives, pose, time)
         shape = (self.info.height, self.info.width)
-        rgb, exact, labels = self._fetch(picture, self.visibility.depth, self.visibility.labels)
+        rgb, exact, labels = self._download(picture, self.rasterizer.depth, self.rasterizer.labels)
         rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
-        if self._stereo and measure:
-            lens, dice = pinhole(self.info, pose), spec_file.dice(self.seed, self.name, self.image)
+        if self._stereo and measure_depth:
+            lens, dice = pinhole(self.info, pose), spec_file.noise_rng(self.seed, self.name, self.image_index)
             depth = self._stereo.measure(primitives, lens, exact, rgb, dice)
         else:
             too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
-        self.image += 1
+        self.image_index += 1
         return CameraFrame(
             time=float(time),
             name=self.name,
@@ -293,37 +301,37 @@ class Camera:
             exact_depth=exact,
         )
 
-    def _fetch(self, *arrays: wp.array) -> list[np.ndarray]:
+    def _download(self, *arrays: wp.array) -> list[np.ndarray]:
         """Copies for the host: from a GPU through memory that it can write to, all at once."""
         if self.device != "cpu":
-            if not self._landing:
-                self._landing = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
-            for array, place in zip(arrays, self._landing, strict=True):
+            if not self._host_buffers:
+                self._host_buffers = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
+            for array, place in zip(arrays, self._host_buffers, strict=True):
                 wp.copy(place, array)
             wp.synchronize_stream(self.device)
-            arrays = tuple(self._landing)
+            arrays = tuple(self._host_buffers)
         return [a.numpy().copy() for a in arrays]
 
-    def expose(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> wp.array:
+    def render_on_device(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> wp.array:
         """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for."""
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
-        seen = self.visibility
+        seen = self.rasterizer
         seen.draw(primitives, lens)
-        seen, quality = self._samples, self._quality
+        seen, quality = self._supersampled, self._quality
         if quality.samples > 1:
-            lens = pinhole(finer(self.info, quality.samples), pose)
+            lens = pinhole(supersampled(self.info, quality.samples), pose)
             seen.draw(primitives, lens)
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
-        near, far = self._sunlight.follow(primitives, pose[:3], forward, time)
+        near, far = self._sunlight.update(primitives, pose[:3], forward, time)
         across, down = (-(-n // quality.block) for n in (seen.width, seen.height))
         run = across if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
-            deferred.shade,
+            deferred.shade_pixels,
             across * down // run,
             inputs=[
                 primitives.shapes,
-                primitives.looks,
+                primitives.materials,
                 self._sunlight.light,
                 near,
                 far,
@@ -336,5 +344,5 @@ class Camera:
             outputs=[self._exposure.radiance],
             device=self.device,
         )
-        self._exposure.halo(primitives, seen.primitive)
-        return self._exposure.develop(self._sunlight.balance, time, self._sunlight.brightness)
+        self._exposure.add_glare(primitives, seen.primitive)
+        return self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)

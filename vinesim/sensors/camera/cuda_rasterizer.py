@@ -12,10 +12,10 @@ from vinesim.kernels.raster import camera_raster, cuda_raster
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
 
-_LISTS = int(cuda_raster.LISTS)
+_LISTS = int(cuda_raster.TILE_LISTS)
 
 
-class Tiles:
+class CudaRasterizer:
     """Fills the keys of pictures of any size; no host waits for a GPU.
 
     Args:
@@ -42,24 +42,24 @@ class Tiles:
         self._pieces = wp.empty((_LISTS, room), dtype=wp.vec4i, device=device)
         self._all = wp.empty(0, dtype=wp.int32, device=device)
 
-    def fill(
+    def rasterize(
         self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         if len(self._all) != len(primitives.cluster_first):
             self._all = wp.array(np.arange(len(primitives.cluster_first), dtype=np.int32), device=self.device)
         which = self._all if clusters is None else wp.array(np.asarray(clusters, np.int32), device=self.device)
-        keys.fill_(int(camera_raster.EMPTY))
+        keys.fill_(int(camera_raster.EMPTY_KEY))
         self._count.zero_()
         wp.launch(
-            cuda_raster.list_pieces,
+            cuda_raster.list_tiles,
             (len(which), self._listers),
             inputs=[primitives.shapes, primitives.clusters, primitives.ball, which, lens, self._listers],
             outputs=[self._count, self._pieces, keys],
             device=self.device,
         )
         wp.launch(
-            cuda_raster.draw_pieces,
+            cuda_raster.draw_tiles,
             _LISTS * self._groups * self._lanes,
             inputs=[primitives.shapes, self._count, self._pieces, lens, self._groups, self._lanes],
             outputs=[keys],

@@ -16,44 +16,48 @@ RENDERERS = ("warp", "taichi", "taichi-gpu")
 """By name, the default first (docs/decisions/renderers.md)."""
 
 
-class NoRenderer(ValueError):
+class RendererUnavailable(ValueError):
     """The text says which renderer cannot be had, and what to do."""
 
     exit_code = 3
 
 
-class Raster(Protocol):
+class PrimitiveRasterizer(Protocol):
     """Something that draws keys: depth [um] above, number of the primitive below (see kernels/raster/camera_raster.py)."""
 
-    def fill(self, primitives: Primitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array) -> None:
+    def rasterize(self, primitives: Primitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         ...
 
 
-def check(renderer: str) -> str:
-    """Its name, if it is known and installed; :class:`NoRenderer` in words if not."""
+def check_renderer(renderer: str) -> str:
+    """Its name, if it is known and installed; :class:`RendererUnavailable` in words if not."""
     if renderer not in RENDERERS:
-        raise NoRenderer(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
+        raise RendererUnavailable(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
     if renderer != "warp" and importlib.util.find_spec("taichi") is None:
-        raise NoRenderer(f"renderer {renderer!r}: Taichi is not installed; type: pip install 'vinesim[taichi]'")
+        raise RendererUnavailable(
+            f"renderer {renderer!r}: Taichi is not installed; type: pip install 'vinesim[taichi]'"
+        )
     return renderer
 
 
-def raster_of(renderer: str, device: str) -> Raster | None:
+def create_rasterizer(renderer: str, device: str) -> PrimitiveRasterizer | None:
     """The rasteriser of that name for primitives on ``device``; None for Warp's own on a CPU."""
-    if check(renderer) != "warp":
+    if check_renderer(renderer) != "warp":
         if device != "cpu":
-            raise NoRenderer(f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out")
-        from vinesim.sensors.camera.taichi_rasterizer import Twin
+            raise RendererUnavailable(
+                f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out"
+            )
+        from vinesim.sensors.camera.taichi_rasterizer import TaichiRasterizer
 
         try:
-            return Twin(gpu=renderer == "taichi-gpu")
+            return TaichiRasterizer(gpu=renderer == "taichi-gpu")
         except RuntimeError:
-            raise NoRenderer(
+            raise RendererUnavailable(
                 f"renderer {renderer!r}: Taichi finds no Vulkan or Metal GPU; use taichi or warp"
             ) from None
     if device == "cpu":
         return None
-    from vinesim.sensors.camera.cuda_rasterizer import Tiles
+    from vinesim.sensors.camera.cuda_rasterizer import CudaRasterizer
 
-    return Tiles(device)
+    return CudaRasterizer(device)

@@ -54,8 +54,8 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Grey level from which on a window is overexposed."""
 
 
-class View(Protocol):
-    """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.Visibility`)."""
+class DepthRenderer(Protocol):
+    """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.CameraRasterizer`)."""
 
     depth: wp.array
 
@@ -71,13 +71,13 @@ class Stereo:
         spec: StereoSpec,
         info: CameraInfo,
         reach: tuple[float, float],
-        viewer: Callable[[int, int, str], View],
+        depth_renderer: Callable[[int, int, str], DepthRenderer],
         device: str = "cpu",
     ) -> None:
-        """``reach``: nearest and farthest depth [m]; ``viewer`` makes what draws a view of some width and height."""
+        """``reach``: nearest and farthest depth [m]; ``depth_renderer`` makes what draws a view of some width and height."""
         self.info, self.device = info, device
-        s = self._struct = stereo_depth.Stereo()
-        s.baseline, s.reach = spec.baseline.value, spec.focal.value * spec.baseline.value
+        s = self._parameters = stereo_depth.Stereo()
+        s.baseline, s.focal_baseline = spec.baseline.value, spec.focal.value * spec.baseline.value
         s.scale = min(spec.focal.value / info.fx, 1.0)
         s.stride = max(1, round(spec.window.value / 5.0 / s.scale))
         s.sigma, s.step = spec.noise.value, spec.step.value
@@ -95,10 +95,10 @@ class Stereo:
         self._rows = int(np.ceil(info.height * focal / info.fy)) + 1
         self._centre = -edge * focal, info.cy / info.fy * focal
         self._focal = focal
-        self._second = viewer(self._columns, self._rows, device)
+        self._second = depth_renderer(self._columns, self._rows, device)
         self._window = max(1, round(spec.window.value))
         cells = int(np.ceil(info.height * s.scale)), int(np.ceil(info.width * s.scale))
-        self._luck = wp.empty((2, *cells), dtype=float, device=device)
+        self._noise = wp.empty((2, *cells), dtype=float, device=device)
         self._depth = wp.empty(info.width * info.height, dtype=float, device=device)
 
     def measure(
@@ -107,25 +107,27 @@ class Stereo:
         lens: camera_raster.Pinhole,
         depth: np.ndarray,
         rgb: np.ndarray,
-        dice: np.random.Generator,
+        rng: np.random.Generator,
     ) -> np.ndarray:
         """Measured depth [height, width] m where ``depth`` [height, width] m is true and ``rgb`` what it looks like."""
-        second = self._view(lens)
+        second = self._second_pinhole(lens)
         self._second.draw(primitives, second)
-        self._luck.assign(self._throw(dice))
-        _, rows, columns = self._luck.shape
+        self._noise.assign(self._correlated_noise(rng))
+        _, rows, columns = self._noise.shape
         run = columns if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
-            stereo_depth.measure,
+            stereo_depth.measure_depth,
             rows * columns // run,
             inputs=[
-                self._struct,
+                self._parameters,
                 lens,
                 second,
-                wp.array((np.float32(self._struct.reach) / depth).ravel(), dtype=float, device=self.device),
+                wp.array(
+                    (np.float32(self._parameters.focal_baseline) / depth).ravel(), dtype=float, device=self.device
+                ),
                 wp.array(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel(), dtype=wp.uint8, device=self.device),
                 self._second.depth,
-                self._luck,
+                self._noise,
                 run,
             ],
             outputs=[self._depth],
@@ -133,25 +135,25 @@ class Stereo:
         )
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
 
-    def _view(self, lens: camera_raster.Pinhole) -> camera_raster.Pinhole:
+    def _second_pinhole(self, lens: camera_raster.Pinhole) -> camera_raster.Pinhole:
         """The second imager: parallel to the first, a baseline to its right."""
         other = camera_raster.Pinhole()
-        turn = np.array(lens.turn).reshape(3, 3)
-        other.eye = wp.vec3(*map(float, np.array(lens.eye) + self._struct.baseline * turn[0]))
-        other.turn = lens.turn
+        turn = np.array(lens.rotation).reshape(3, 3)
+        other.eye = wp.vec3(*map(float, np.array(lens.eye) + self._parameters.baseline * turn[0]))
+        other.rotation = lens.rotation
         other.fx = other.fy = float(self._focal)
         other.cx, other.cy = map(float, self._centre)
-        other.width, other.height, other.reach = self._columns, self._rows, lens.reach
+        other.width, other.height, other.max_depth = self._columns, self._rows, lens.max_depth
         wide = max(other.cx, other.width - other.cx) / other.fx
         high = max(other.cy, other.height - other.cy) / other.fy
-        other.close = float(camera_raster.CLOSE) * float(np.sqrt(1.0 + wide * wide + high * high))
+        other.near_radius = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
         return other
 
-    def _throw(self, dice: np.random.Generator) -> np.ndarray:
+    def _correlated_noise(self, rng: np.random.Generator) -> np.ndarray:
         """Two fields [2, row, column] of normal numbers with variance 1, alike within a window."""
-        _, rows, columns = self._luck.shape
+        _, rows, columns = self._noise.shape
         wide = self._window - 1
-        raw = dice.standard_normal((2, rows + wide, columns + wide), np.float32)
+        raw = rng.standard_normal((2, rows + wide, columns + wide), np.float32)
         if not wide:
             return raw
         sums = [cv2.boxFilter(field, -1, (self._window, self._window), normalize=False) for field in raw]

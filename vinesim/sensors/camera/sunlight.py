@@ -19,7 +19,7 @@ DEFAULT_SUN = (-0.41, -0.52, 0.75)
 """Towards the sun: south-west, half-way up."""
 
 
-_SPREAD = (8, 16)
+_GPU_THREADS = (8, 16)
 """Threads that share the primitives of a cluster, and the rows of each of them, on a GPU."""
 
 
@@ -31,7 +31,7 @@ def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
     return wp.array(np.stack([x, y], 1).astype(np.float32), dtype=wp.vec2, device=device)
 
 
-class _Map:
+class _ShadowMap:
     """One square of depths seen from the sun, around a focus that moves in steps."""
 
     def __init__(self, texel: float, side: int, ahead: float, slack: float, rigid: bool, device: str) -> None:
@@ -42,7 +42,7 @@ class _Map:
         self.struct.texel, self.struct.side = float(texel), side
         self.half = 0.5 * texel * side
 
-    def aim(self, sun: np.ndarray) -> None:
+    def set_sun(self, sun: np.ndarray) -> None:
         """Turn to the sun, a unit vector towards it; nothing that was drawn holds any more."""
         self.right = np.cross(sun, [0.0, 0.0, 1.0]) if abs(sun[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
         self.right /= np.linalg.norm(self.right)
@@ -55,17 +55,17 @@ class _Map:
         """Draw the map anew if it no longer holds for this camera at ``time``."""
         wanted = eye + self.ahead * forward
         strayed = not np.linalg.norm(wanted - self.focus) <= self.slack
-        other = self.built != primitives.built
+        other = self.built != primitives.layout_version
         if not (strayed or other):
             due = self.rigid and not 0.0 <= time - self.time < period
-            if not due or not (primitives.cluster_version[self._inside(primitives)] > self.version).any():
+            if not due or not (primitives.cluster_version[self._casters_inside(primitives)] > self.version).any():
                 return
         if strayed:
             self.focus = wanted
-        self.time, self.version, self.built = time, primitives.version, primitives.built
+        self.time, self.version, self.built = time, primitives.pose_version, primitives.layout_version
         self._draw(primitives)
 
-    def _inside(self, primitives: Primitives) -> np.ndarray:
+    def _casters_inside(self, primitives: Primitives) -> np.ndarray:
         """Clusters whose shadows may fall into the square."""
         ball = primitives.ball.numpy()
         apart = ball[:, :3] - self.focus
@@ -75,24 +75,24 @@ class _Map:
             inside[primitives.rigid_clusters] = False
         return np.flatnonzero(inside)
 
-    def _casting(self, primitives: Primitives) -> wp.array:
+    def _casters(self, primitives: Primitives) -> wp.array:
         """Clusters that this map shows, wherever they are."""
-        if self._known != primitives.built:
+        if self._known != primitives.layout_version:
             every = np.arange(len(primitives.cluster_first), dtype=np.int32)
             mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
-            self._every, self._known = wp.array(mine, device=self.device), primitives.built
+            self._every, self._known = wp.array(mine, device=self.device), primitives.layout_version
         return self._every
 
     def _draw(self, primitives: Primitives) -> None:
         self.struct.corner = _vector(self.focus - self.half * (self.right + self.up))
         self.struct.depth.fill_(1.0e9)
         if self.device == "cpu":
-            which, lanes, slices = wp.array(self._inside(primitives).astype(np.int32), device="cpu"), 1, 1
+            which, lanes, slices = wp.array(self._casters_inside(primitives).astype(np.int32), device="cpu"), 1, 1
         else:  # a GPU culls faster than it can be told what to draw, and wants a thread for every row
-            which, (lanes, slices) = self._casting(primitives), _SPREAD
+            which, (lanes, slices) = self._casters(primitives), _GPU_THREADS
         if len(which):
             wp.launch(
-                shadow_maps.cast_shadows,
+                shadow_maps.raster_shadow_map,
                 (len(which), lanes, slices),
                 inputs=[
                     primitives.shapes,
@@ -111,16 +111,16 @@ class _Map:
 
 SunPath = Callable[[float], tuple[float, float, float]]
 """Unit vector towards the sun at a simulated time [s]."""
-_STEP = np.cos(np.radians(0.25))
+_MIN_COS_CHANGE = np.cos(np.radians(0.25))
 """The light is made anew when the sun has moved by a quarter of a degree: once a minute."""
-_NOON = np.array([3.3, 2.95, 2.35])
-"""Light of a sun with :data:`_HIGH` for the sine of its elevation; white is 1 for a sheet in full light."""
-_HIGH = 0.75
-_DEPTH = np.array([0.10, 0.15, 0.27])
+_NOON_SUN = np.array([3.3, 2.95, 2.35])
+"""Light of a sun with :data:`_NOON_SINE` for the sine of its elevation; white is 1 for a sheet in full light."""
+_NOON_SINE = 0.75
+_OPTICAL_DEPTH = np.array([0.10, 0.15, 0.27])
 """Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh's and some haze."""
-_SKY, _HAZE = np.array([0.52, 0.70, 1.0]), np.array([0.50, 0.60, 0.72])
-_BOUNCE, _LEAVES = np.array([0.26, 0.21, 0.13]), np.array([0.14, 0.19, 0.075])
-_ADAPTED = 0.6
+_SKY_COLOUR, _HAZE_COLOUR = np.array([0.52, 0.70, 1.0]), np.array([0.50, 0.60, 0.72])
+_GROUND_COLOUR, _CANOPY_COLOUR = np.array([0.26, 0.21, 0.13]), np.array([0.14, 0.19, 0.075])
+_WHITE_BALANCE_SHARE = 0.6
 """Share of the colour of the light that a camera's white balance takes out."""
 
 
@@ -132,8 +132,12 @@ def air_mass(height: float) -> float:
 
 def daylight(height: float) -> tuple[np.ndarray, float]:
     """Colour [3] of direct sunlight, and how bright the sky is beside its usual self, by the sine of the elevation."""
-    sun = _NOON * np.exp(-_DEPTH * (air_mass(height) - air_mass(_HIGH))) * np.clip(height / 0.02 + 0.5, 0.0, 1.0)
-    return sun, 0.04 + 0.96 * float(np.clip((height + 0.1) / (_HIGH + 0.1), 0.0, 1.0) ** 0.8)
+    sun = (
+        _NOON_SUN
+        * np.exp(-_OPTICAL_DEPTH * (air_mass(height) - air_mass(_NOON_SINE)))
+        * np.clip(height / 0.02 + 0.5, 0.0, 1.0)
+    )
+    return sun, 0.04 + 0.96 * float(np.clip((height + 0.1) / (_NOON_SINE + 0.1), 0.0, 1.0) ** 0.8)
 
 
 class Sunlight:
@@ -155,50 +159,53 @@ class Sunlight:
         """
         self._path: SunPath = sun if callable(sun) else lambda time: sun
         self.period, self._device = period, device
-        self._stands = np.zeros(3)
+        self._direction = np.zeros(3)
         self.balance = np.ones(3)
         """White balance: factors [3] on linear light."""
         self.brightness = 1.0
         """Light that falls on the ground, beside that of a high sun."""
         light = deferred.Light()
-        light.taps = taps
+        light.shadow_taps = taps
         k = np.arange(max(taps, 1))
         angle, radius = 2.399963 * k, np.sqrt((k + 0.5) / len(k))
-        light.spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
+        light.sample_spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
         turn = np.arange(64) * (2.0 * np.pi / 64)
-        light.turns = _pairs(np.cos(turn), np.sin(turn), device)
+        light.sample_rotations = _pairs(np.cos(turn), np.sin(turn), device)
         self.light = light
-        self._near = _Map(0.007 / fine, 1024 * fine, 2.5, 0.8, True, device)
-        self._far = _Map(0.035, 1024, 12.0, 4.0, False, device)
+        self._near = _ShadowMap(0.007 / fine, 1024 * fine, 2.5, 0.8, True, device)
+        self._far = _ShadowMap(0.035, 1024, 12.0, 4.0, False, device)
 
-    def _shine(self, time: float) -> None:
+    def _update_light(self, time: float) -> None:
         """Take the light from where the sun is now, if it has moved."""
         direction = np.asarray(self._path(time), float)
         direction = direction / np.linalg.norm(direction)
-        if direction @ self._stands > _STEP:
+        if direction @ self._direction > _MIN_COS_CHANGE:
             return
-        self._stands, light = direction, self.light
+        self._direction, light = direction, self.light
         sun, dim = daylight(direction[2])
         light.sun = _vector(direction)
         light.sun_colour = _vector(sun)
-        light.sky_colour, light.haze = _vector(_SKY * dim), _vector(_HAZE * dim)
-        table = textures.sky(tuple(direction), tuple(sun)) * np.float32(dim)
-        light.table = wp.array(table, dtype=wp.vec3, device=self._device)
-        falls = sun * max(direction[2], 0.05) + _SKY * dim
-        usual = _NOON * _HIGH + _SKY
+        light.sky_colour, light.haze_colour = _vector(_SKY_COLOUR * dim), _vector(_HAZE_COLOUR * dim)
+        table = textures.sky_texture(tuple(direction), tuple(sun)) * np.float32(dim)
+        light.sky_table = wp.array(table, dtype=wp.vec3, device=self._device)
+        falls = sun * max(direction[2], 0.05) + _SKY_COLOUR * dim
+        usual = _NOON_SUN * _NOON_SINE + _SKY_COLOUR
         self.brightness = float(falls.mean() / usual.mean())
-        light.bounce, light.leaves = _vector(_BOUNCE * self.brightness), _vector(_LEAVES * self.brightness)
-        self.balance = (usual / usual.mean() / (falls / falls.mean())) ** _ADAPTED
+        light.ground_colour, light.canopy_colour = (
+            _vector(_GROUND_COLOUR * self.brightness),
+            _vector(_CANOPY_COLOUR * self.brightness),
+        )
+        self.balance = (usual / usual.mean() / (falls / falls.mean())) ** _WHITE_BALANCE_SHARE
         raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])
         raised /= np.linalg.norm(raised)
-        self._near.aim(raised)
-        self._far.aim(raised)
+        self._near.set_sun(raised)
+        self._far.set_sun(raised)
 
-    def follow(
+    def update(
         self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
     ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
         """The fine and the coarse shadow map for a camera at ``eye`` that looks along ``forward``."""
-        self._shine(time)
+        self._update_light(time)
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)
         return self._near.struct, self._far.struct

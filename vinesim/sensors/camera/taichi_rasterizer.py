@@ -29,10 +29,14 @@ from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSO
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
 
-FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.CLOSE)
-EMPTY, SMOOTH_SIZE, TEXELS = int(camera_raster.EMPTY), float(camera_raster.SMOOTH_SIZE), float(shapes.OUTLINE_TEXELS)
-_NOBODY = 2**31 - 1
-_NEARLY = 2**30
+FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.NEAR_DEPTH)
+EMPTY, SMOOTH_SIZE, TEXELS = (
+    int(camera_raster.EMPTY_KEY),
+    float(camera_raster.SMOOTH_SIZE),
+    float(shapes.OUTLINE_TEXELS),
+)
+_NO_PRIMITIVE = 2**31 - 1
+_INEXACT = 2**30
 """Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
 _CORES, _GPU = (64, 1), (24, 32)
 """How many share the primitives of a cluster, and the rows of each of them. Taichi hands 512 iterations at once to a
@@ -47,7 +51,7 @@ Placed = ti.types.struct(a=vec4, b=vec4, c=vec4, d=vec4)
 Lens = ti.types.struct(eye=vec3, turn=mat3, focal=vec2, centre=vec2, size=vec2, reach=ti.f32, close=ti.f32)
 Bound = ti.types.struct(box=vec4, rising=vec3, falling=vec3, depth=ti.f32)
 """Box: lowest and highest x, lowest and highest y [pixel]; strips: slope, low, high; no point of it is nearer [m]."""
-NOTHING, ANYWHERE = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND), vec3(0.0, -UNBOUND, UNBOUND)
+EMPTY_BOUNDS, UNBOUNDED_STRIP = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND), vec3(0.0, -UNBOUND, UNBOUND)
 
 
 # ------------------------------------------------------------------------------------------------- bounds
@@ -90,7 +94,7 @@ def leaf_outline(s, hull: ti.template(), lens):
     side = cross(rib, up)
     reach = s.d.xyz * vec3(0.9, 1.1, 0.95)
     levels = vec2(ti.min(reach, 0.0).sum(), ti.max(reach, 0.0).sum())
-    depth, box, turned = FAR, NOTHING, NOTHING
+    depth, box, turned = FAR, EMPTY_BOUNDS, EMPTY_BOUNDS
     for n in ti.static(range(16)):
         u, v = hull[int(s.b[3]), n // 2, 0], hull[int(s.b[3]), n // 2, 1]
         q = p + (side * u + rib * v + up * levels[n % 2]) * size
@@ -102,19 +106,19 @@ def leaf_outline(s, hull: ti.template(), lens):
         turned = vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
         box = ball(lens, p + rib * (0.25 * size), 1.45 * size)
         if p[2] < -1.6 * size:
-            box = NOTHING
+            box = EMPTY_BOUNDS
     return Bound(box=box, rising=vec3(1.0, turned[0], turned[1]), falling=vec3(-1.0, turned[2], turned[3]), depth=depth)
 
 
 @ti.func
 def cone_outline(s, hull: ti.template(), lens):
     a, b, r = s.a.xyz, s.b.xyz, ti.max(s.a[3], s.b[3])
-    box, strip = NOTHING, ANYWHERE
+    box, strip = EMPTY_BOUNDS, UNBOUNDED_STRIP
     if ti.max(a[2], b[2]) > -r:
         # what comes closer than CLOSE may be cut there if its axis stays clear of all that is so close and in view
         axis, cut, start, end, clear = b - a, CLOSE - r, a, b, True
         if ti.min(a[2], b[2]) < cut:
-            clear = length(a + axis * clamp(-dot(a, axis) / dot(axis, axis), 0.0, 1.0)) - r > lens.close
+            clear = length(a + axis * clamp(-dot(a, axis) / dot(axis, axis), 0.0, 1.0)) - r > lens.near_radius
             if a[2] < cut and b[2] > cut:
                 start = a + axis * ((cut - a[2]) / axis[2])
             if b[2] < cut and a[2] > cut:
@@ -129,15 +133,15 @@ def cone_outline(s, hull: ti.template(), lens):
                 middle = 0.5 * (f[0] + f[1] - slope * (f[2] + f[3]))
                 half = 0.5 * (ti.max(f[1] - f[0], g[1] - g[0]) + ti.abs(slope) * ti.max(f[3] - f[2], g[3] - g[2]))
                 strip = vec3(slope, middle - half, middle + half)
-    return Bound(box=box, rising=strip, falling=ANYWHERE, depth=ti.min(a[2], b[2]) - r)
+    return Bound(box=box, rising=strip, falling=UNBOUNDED_STRIP, depth=ti.min(a[2], b[2]) - r)
 
 
 @ti.func
 def ball_outline(lens, centre, r):
-    box = NOTHING
+    box = EMPTY_BOUNDS
     if centre[2] > -r:
         box = ball(lens, centre, r)
-    return Bound(box=box, rising=ANYWHERE, falling=ANYWHERE, depth=centre[2] - r)
+    return Bound(box=box, rising=UNBOUNDED_STRIP, falling=UNBOUNDED_STRIP, depth=centre[2] - r)
 
 
 @ti.func
@@ -159,7 +163,7 @@ def cylinder_outline(s, hull: ti.template(), lens):
 def box_outline(s, hull: ti.template(), lens):
     o = ball_outline(lens, s.a.xyz, length(vec3(s.a[3], s.b[3], s.c[3])))
     if o.depth > CLOSE:
-        o.box = NOTHING
+        o.box = EMPTY_BOUNDS
         x, y, z = s.b.xyz * s.a[3], s.c.xyz * s.b[3], cross(s.b.xyz, s.c.xyz) * s.c[3]
         for n in ti.static(range(8)):
             corner = x * (n % 2 * 2 - 1) + y * (n // 2 % 2 * 2 - 1) + z * (n // 4 * 2 - 1)
@@ -170,14 +174,14 @@ def box_outline(s, hull: ti.template(), lens):
 @ti.func
 def triangle_outline(s, hull: ti.template(), lens):
     a, b, c = s.a.xyz, s.b.xyz, s.c.xyz
-    depth, box = ti.min(a[2], b[2], c[2]), NOTHING
+    depth, box = ti.min(a[2], b[2], c[2]), EMPTY_BOUNDS
     if dot(a, cross(b - a, c - a)) < 0.0 and ti.max(a[2], b[2], c[2]) > 0.0:
         if depth > CLOSE:
             box = widened(widened(widened(box, pixel_of(lens, a)), pixel_of(lens, b)), pixel_of(lens, c))
         else:
             middle = (a + b + c) / 3.0
             box = ball(lens, middle, ti.max(length(a - middle), length(b - middle), length(c - middle)) * 1.001)
-    return Bound(box=box, rising=ANYWHERE, falling=ANYWHERE, depth=depth)
+    return Bound(box=box, rising=UNBOUNDED_STRIP, falling=UNBOUNDED_STRIP, depth=depth)
 
 
 # --------------------------------------------------------------------------------------------------- rays
@@ -350,12 +354,12 @@ def hit_leaf(s, outlines: ti.template(), ray, smooth):
 
 @ti.func
 def point(lens, v):
-    return vec4(lens.turn @ (v.xyz - lens.eye), v[3])
+    return vec4(lens.rotation @ (v.xyz - lens.eye), v[3])
 
 
 @ti.func
 def arrow(lens, v):
-    return vec4(lens.turn @ v.xyz, v[3])
+    return vec4(lens.rotation @ v.xyz, v[3])
 
 
 @ti.func
@@ -406,7 +410,7 @@ def lens_of(view: ti.template()):
 
 
 @functools.cache
-def _drawer(kind: int, phase: int):
+def _draw_kernel(kind: int, phase: int):
     """The kernel that draws clusters of one kind.
 
     One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster.
@@ -429,7 +433,7 @@ def _drawer(kind: int, phase: int):
                 s = place(lens, a[i], b[i], c[i], d[i])
                 o = outline(s, hull, lens)
                 smooth = s.a[3] * lens.focal[0] > s.a[2] * SMOOTH_SIZE
-                nearest = int(clamp(o.depth, 0.0, lens.reach) * 1.0e6)
+                nearest = int(clamp(o.depth, 0.0, lens.max_depth) * 1.0e6)
                 left, right = clamp(o.box[0] - 0.01, 0.0, lens.size[0]), clamp(o.box[1] + 1.01, 0.0, lens.size[0])
                 top, bottom = (
                     int(clamp(o.box[2] - 0.01, 0.0, lens.size[1])),
@@ -450,7 +454,7 @@ def _drawer(kind: int, phase: int):
                             if not hidden:
                                 ray = vec3((vec2(x, y) - lens.centre) / lens.focal, 1.0)
                                 t = hit(s, outlines, ray, smooth)
-                                if t < lens.reach:
+                                if t < lens.max_depth:
                                     z = int(t * 1.0e6)
                                     if ti.static(phase == KEY):
                                         key = (ti.cast(z, ti.i64) << 32) | i
@@ -459,14 +463,14 @@ def _drawer(kind: int, phase: int):
                                     elif ti.static(phase == DEPTH):
                                         ti.atomic_min(keys[at], z)
                                     elif z <= keys[at] + 1:
-                                        ti.atomic_min(number[at], i + ti.select(z == keys[at], 0, _NEARLY))
+                                        ti.atomic_min(number[at], i + ti.select(z == keys[at], 0, _INEXACT))
                         y += slices
                 i += lanes
 
     return draw
 
 
-class Twin:
+class TaichiRasterizer:
     """Fills the keys of pictures as Warp's rasteriser does: on all cores of the CPU, or on a Vulkan or Metal GPU."""
 
     def __init__(self, gpu: bool = False) -> None:
@@ -478,30 +482,30 @@ class Twin:
         self._tables: list = []
         self._pixels: list = []
 
-    def fill(
+    def rasterize(
         self, primitives: "Primitives", lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
-        which = _in_view(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
+        which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
         kind = primitives.cluster_kind[which]
         mine = {number: which[kind == number] for number in _KINDS}
         mine = {number: these for number, these in mine.items() if len(these)}
         if self._gpu:
-            self._fill_there(primitives, lens, mine, keys.numpy())
+            self._rasterize_on_gpu(primitives, lens, mine, keys.numpy())
             return
-        s, eye, pixels = primitives.shapes, _numbers(lens), keys.numpy()
+        s, eye, pixels = primitives.shapes, _pinhole_values(lens), keys.numpy()
         tables = [t.numpy() for t in (s.a, s.b, s.c, s.d, s.outline, s.hull)]
         pixels.fill(EMPTY)
         for number, these in mine.items():
             clusters_of = primitives.cluster_first, primitives.cluster_size, these
-            _drawer(number, KEY)(*tables, *clusters_of, eye, *_CORES, pixels, self._number)
+            _draw_kernel(number, KEY)(*tables, *clusters_of, eye, *_CORES, pixels, self._number)
 
-    def _fill_there(
+    def _rasterize_on_gpu(
         self, primitives: "Primitives", lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
         """On a GPU: depths, then numbers; what has not moved stays there."""
-        if self._of != (primitives, primitives.version):
-            s, self._of = primitives.shapes, (primitives, primitives.version)
+        if self._of != (primitives, primitives.pose_version):
+            s, self._of = primitives.shapes, (primitives, primitives.pose_version)
             vectors = [(ti.Vector.ndarray(4, ti.f32, len(t)), t.numpy()) for t in (s.a, s.b, s.c, s.d)]
             flat = [(ti.ndarray(ti.i32, s.outline.shape), s.outline.numpy().astype(np.int32))]
             hull = s.hull.numpy()
@@ -512,14 +516,14 @@ class Twin:
         if not self._pixels or self._pixels[0].shape != keys.shape:
             self._pixels = [ti.ndarray(ti.i32, keys.shape) for _ in range(2)]
         for array in self._pixels:
-            array.fill(_NOBODY)
-        eye = _numbers(lens)
+            array.fill(_NO_PRIMITIVE)
+        eye = _pinhole_values(lens)
         for phase in (DEPTH, NUMBER):
             for number, these in mine.items():
                 clusters_of = primitives.cluster_first, primitives.cluster_size, these
-                _drawer(number, phase)(*self._tables, *clusters_of, eye, *_GPU, *self._pixels)
+                _draw_kernel(number, phase)(*self._tables, *clusters_of, eye, *_GPU, *self._pixels)
         depth, number = (array.to_numpy().astype(np.int64) for array in self._pixels)
-        keys[:] = np.where(number == _NOBODY, EMPTY, (depth << 32) | (number & (_NEARLY - 1)))
+        keys[:] = np.where(number == _NO_PRIMITIVE, EMPTY, (depth << 32) | (number & (_INEXACT - 1)))
 
 
 @functools.cache
@@ -533,18 +537,18 @@ def _start(gpu: bool) -> None:
         ti.sync()
 
 
-def _numbers(lens: camera_raster.Pinhole) -> np.ndarray:
+def _pinhole_values(lens: camera_raster.Pinhole) -> np.ndarray:
     """What :func:`lens_of` reads."""
-    others = lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.reach, lens.close
-    return np.concatenate([np.array(lens.eye), np.array(lens.turn).ravel(), others]).astype(np.float32)
+    others = lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.max_depth, lens.near_radius
+    return np.concatenate([np.array(lens.eye), np.array(lens.rotation).ravel(), others]).astype(np.float32)
 
 
-def _in_view(primitives: "Primitives", lens: camera_raster.Pinhole) -> np.ndarray:
+def _visible_clusters(primitives: "Primitives", lens: camera_raster.Pinhole) -> np.ndarray:
     """Clusters of which a pixel may see something, near ones first [k]."""
     ball = primitives.ball.numpy()
     r = ball[:, 3]
-    p = (ball[:, :3] - np.array(lens.eye)) @ np.array(lens.turn).reshape(3, 3).T
-    seen = (r > 0.0) & (p[:, 2] > -r) & (p[:, 2] - r < lens.reach)
+    p = (ball[:, :3] - np.array(lens.eye)) @ np.array(lens.rotation).reshape(3, 3).T
+    seen = (r > 0.0) & (p[:, 2] > -r) & (p[:, 2] - r < lens.max_depth)
     for x, low, high in (
         (p[:, 0], -lens.cx / lens.fx, (lens.width - lens.cx) / lens.fx),
         (p[:, 1], -lens.cy / lens.fy, (lens.height - lens.cy) / lens.fy),

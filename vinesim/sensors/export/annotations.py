@@ -13,18 +13,18 @@ import numpy as np
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Kind, Organ, thing, thing_name
 from vinesim.scene.values import CameraInfo
-from vinesim.sensors.truth.truth import BERRY_PIXELS, Box, BunchTruth, Look
+from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
 
-_FURTHER = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
+_EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
 """What annotations tell of a bunch beside what COCO asks for."""
-LEAST_PIXELS = 16
+MIN_ANNOTATED_PIXELS = 16
 """A bunch is annotated (COCO, YOLO) if at least so many pixels show it; records name all."""
 
 CATEGORIES = [{"id": int(Organ.BUNCH), "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
 """The categories of COCO: numbers of :class:`Organ`."""
 
 
-def run_lengths(mask: np.ndarray) -> dict[str, Any]:
+def encode_mask(mask: np.ndarray) -> dict[str, Any]:
     """A mask [height, width] as COCO's compressed run lengths."""
     from pycocotools import mask as coco
 
@@ -32,7 +32,7 @@ def run_lengths(mask: np.ndarray) -> dict[str, Any]:
     return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}
 
 
-def camera(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
+def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
     """Intrinsics as sensor_msgs/CameraInfo names them [px], and the pose of the optical frame in the world."""
     return {
         "model": model,
@@ -47,7 +47,9 @@ def camera(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
     }
 
 
-def record(truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray | None = None) -> list[dict[str, Any]]:
+def bunch_records(
+    truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray | None = None
+) -> list[dict[str, Any]]:
     """Bunches of one picture as JSON: metres in world axes; boxes are [column, row, width, height] px.
 
     ``ripeness`` [bunch], 0 green to 1 ripe; all are ripe unless given.
@@ -66,8 +68,8 @@ def record(truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray 
             "occlusion": one.occlusion,
             "box": _xywh(one.visible_box),
             "amodal_box": _xywh(one.amodal_box),
-            "mask": run_lengths(one.mask(one.visible, info)),
-            "amodal_mask": run_lengths(one.mask(one.amodal, info)),
+            "mask": encode_mask(one.mask(one.visible, info)),
+            "amodal_mask": encode_mask(one.mask(one.amodal, info)),
             "berries": one.berries,
             "berries_seen": one.berries_seen,
             "box_3d": {
@@ -83,10 +85,10 @@ def record(truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray 
     ]
 
 
-def actors(told: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
+def actor_records(actors: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
     """What else was set down in a picture of these ``labels`` [height, width]: with its pixels and its visible box."""
     found = []
-    for one in told:
+    for one in actors:
         rows, columns = np.nonzero(labels == one["label"])
         box = (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())) if len(rows) else None
         found.append({**one, "pixels": len(rows), "box": _xywh(box)})
@@ -98,27 +100,27 @@ def _xywh(box: Box | None) -> list[int] | None:
     return None if box is None else [box[0], box[1], box[2] - box[0] + 1, box[3] - box[1] + 1]
 
 
-def yolo(bunches: list[dict[str, Any]], width: int, height: int) -> str:
+def yolo_labels(bunches: list[dict[str, Any]], width: int, height: int) -> str:
     """One line for each annotated bunch: class 0, middle and size of its visible box in shares of the picture."""
     lines = []
-    for one in annotated(bunches):
+    for one in annotated_bunches(bunches):
         x, y, w, h = one["box"]
         share = (x + 0.5 * w) / width, (y + 0.5 * h) / height, w / width, h / height
         lines.append("0 " + " ".join(f"{s:.6f}" for s in share))
     return "".join(f"{line}\n" for line in lines)
 
 
-def annotated(bunches: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def annotated_bunches(bunches: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Those of a record that are large enough to be annotated."""
-    return [one for one in bunches if one["pixels"] >= LEAST_PIXELS]
+    return [one for one in bunches if one["pixels"] >= MIN_ANNOTATED_PIXELS]
 
 
-def coco(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
+def coco_json(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
     """The text of a COCO instances (and keypoints) file, piece by piece, from the records of its images.
 
     ``read`` gives the records of all images, in order; it is called twice, so that never more than one is in memory.
     """
-    info = {"description": "vinesim", "berry_pixels": BERRY_PIXELS, "least_pixels": LEAST_PIXELS}
+    info = {"description": "vinesim", "berry_pixels": MIN_BERRY_PIXELS, "least_pixels": MIN_ANNOTATED_PIXELS}
     yield f'{{"info": {json.dumps(info)}, "licenses": [], "categories": {json.dumps(CATEGORIES)},\n"images": ['
     for number, one in enumerate(read()):
         image = {
@@ -132,7 +134,7 @@ def coco(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
     yield '],\n"annotations": ['
     number = 0
     for one in read():
-        for bunch in annotated(one["bunches"]):
+        for bunch in annotated_bunches(one["bunches"]):
             yield (",\n" if number else "\n") + json.dumps(_annotation(number + 1, one, bunch))
             number += 1
     yield "]}\n"
@@ -154,21 +156,21 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
         "num_keypoints": int(within),
         "amodal_bbox": bunch["amodal_box"],
         "amodal_segmentation": bunch["amodal_mask"],
-        **{name: bunch[name] for name in _FURTHER},
+        **{name: bunch[name] for name in _EXTRA_FIELDS},
     }
 
 
-def ids(labels: np.ndarray) -> np.ndarray:
+def encode_labels(labels: np.ndarray) -> np.ndarray:
     """Labels [height, width] as RGB, ``id = R + 256 G + 65536 B``, which is how COCO's panoptic images write ids."""
     return np.stack([labels & 255, labels >> 8 & 255, labels >> 16 & 255], -1).astype(np.uint8)
 
 
-def berry_ids(seen: Look) -> np.ndarray:
+def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:
     """Number of the berry in its bunch plus one [height, width] uint16; 0 where none is seen."""
     return (seen.berries + 1).astype(np.uint16)
 
 
-def overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
+def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
     """A picture with what is true of it: visible boxes green, amodal boxes where they differ white, cut points yellow
     discs (rings where hidden), and of each bunch its number, berries seen and share that is hidden.
     """

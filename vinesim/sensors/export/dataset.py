@@ -22,34 +22,34 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.spec import Scene, Season, sun_at
+from vinesim.scene.spec import Scene, Season, sun_direction
 from vinesim.scene.values import CameraInfo, View
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
 from vinesim.sensors.scene.plant_primitives import Ripeness
-from vinesim.sensors.scene.primitives import Primitives, still_view
-from vinesim.sensors.scene.ray_caster import RayCaster, enclosing
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
+from vinesim.sensors.scene.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.spec_file import SensorError
 from vinesim.sensors.truth import truth
 
-IMAGES_A_VINEYARD = 5
+IMAGES_PER_VINEYARD = 5
 """So many images are taken in one vineyard before another one is grown."""
-SMALLEST, LARGEST = 16, 4096
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 16, 4096
 """Width and height of pictures [px]."""
-HEIGHT = (0.7, 1.7)
+CAMERA_HEIGHT = (0.7, 1.7)
 """Of the camera above the ground [m]: robots' arms and heads."""
-DISTANCE = (0.35, 1.8)
+BUNCH_DISTANCE = (0.35, 1.8)
 """From the camera to the bunch it looks at [m]."""
-NEAR = 2.5
+MAX_ACTOR_DISTANCE = 2.5
 """So far from where something happens hangs the bunch that is looked at [m]."""
-TOO_NEAR = 0.15
+MIN_CLEARANCE = 0.15
 """What is nearer [m] than this and fills more than a fiftieth of the picture makes it a bad one."""
 LATITUDE = np.radians(41.6)
 """Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
-SEEN = 0.01
+MIN_ACTOR_SHARE = 0.01
 """Share of the pixels that show somebody or something else than the vineyard, where something happens."""
-_TRIES, _SOCIABLE = 60, 30
+_MAX_TRIES, _TRIES_WITH_ACTORS = 60, 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 
 
@@ -57,11 +57,13 @@ class DatasetError(SensorError):
     """A data set that cannot be made or gone on with. The text is one line."""
 
 
-def sized(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
+def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
     """Intrinsics of a camera at another size [px]: the same horizontal field of view, square pixels kept so."""
     width, height = size or (int(spec.width.value), int(spec.height.value))
-    if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
-        raise SensorError(f"size is {width}x{height}; give WxH from {SMALLEST}x{SMALLEST} to {LARGEST}x{LARGEST}")
+    if not (MIN_IMAGE_SIZE <= width <= MAX_IMAGE_SIZE and MIN_IMAGE_SIZE <= height <= MAX_IMAGE_SIZE):
+        raise SensorError(
+            f"size is {width}x{height}; give WxH from {MIN_IMAGE_SIZE}x{MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}x{MAX_IMAGE_SIZE}"
+        )
     if size is None:
         return spec.info("camera_optical_frame")
     scale = width / spec.width.value
@@ -69,14 +71,14 @@ def sized(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
     return CameraInfo(width, height, *focal, 0.5 * (width - 1), 0.5 * (height - 1), "camera_optical_frame")
 
 
-class Life(Protocol):
+class SnapshotSource(Protocol):
     """What moves in an image and who is there beside the vines; sensors draw it and do not know where it comes from."""
 
     def settings(self) -> dict[str, Any]:
         """All that decides what happens, as JSON."""
         ...
 
-    def view(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
+    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
         """What there is, near which point [2] m of the ground to look, and a record of it; None if nothing happens.
 
         It follows from the model and the random numbers alone. ``actors`` of the record are what
@@ -86,7 +88,7 @@ class Life(Protocol):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Plan:
+class DatasetPlan:
     """What a data set is made from; image ``n`` of equal plans is the same image."""
 
     scene: Scene
@@ -94,13 +96,13 @@ class Plan:
     camera: str
     size: tuple[int, int] | None = None
     """Width and height [px]; the camera's own unless given."""
-    life: Life | None = None
+    snapshot_source: SnapshotSource | None = None
     """Without it plants hang at rest and nobody is there."""
     renderer: str = "warp"
 
     def settings(self) -> dict[str, Any]:
         """All that decides what the images show, as JSON."""
-        info = sized(CameraSpec.load(self.camera), self.size)
+        info = resized_intrinsics(CameraSpec.load(self.camera), self.size)
         return {
             "vinesim": vinesim.__version__,
             "scene": msgspec.to_builtins(self.scene),
@@ -108,7 +110,7 @@ class Plan:
             "camera": self.camera,
             "size": [info.width, info.height],
             "renderer": self.renderer,
-            "life": None if self.life is None else self.life.settings(),
+            "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
         }
 
     def vineyard(self, number: int) -> Scene:
@@ -120,33 +122,33 @@ class Plan:
         return msgspec.structs.replace(self.scene, seed=int(rng.integers(1 << 31)), season=season, fruit=fruit)
 
 
-class Vineyard:
+class VineyardRenderer:
     """One vineyard of a plan, ready to be looked at."""
 
-    def __init__(self, plan: Plan, number: int) -> None:
+    def __init__(self, plan: DatasetPlan, number: int) -> None:
         self.plan, self.scene = plan, plan.vineyard(number)
         self.model = generate(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
-        self.still: View = still_view(self.model)
+        self.still: View = rest_snapshot(self.model)
         self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
         self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer)
         self.primitives.update(self.still)
         self.caster = RayCaster(self.primitives)
         self.spec = CameraSpec.load(plan.camera)
-        self.info = sized(self.spec, plan.size)
+        self.info = resized_intrinsics(self.spec, plan.size)
 
-    def draw(self, image: int, folder: pathlib.Path) -> None:
+    def write_image(self, image: int, folder: pathlib.Path) -> None:
         """Write everything about one image; its record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
-        hour, sun = _daylight(rng)
-        view, near, happens = self._happening(image)
-        seen = self._look(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
-        truths = truth.of_bunches(self.primitives, view, seen, self.caster)
-        camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image=image)
+        hour, sun = _random_sun(rng)
+        view, near, happens = self._pose_scene(image)
+        seen = self._choose_view(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
+        truths = truth.bunch_truths(self.primitives, view, seen, self.caster)
+        camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image)
         frame = camera.render(self.primitives, seen.pose)
-        bunches = formats.record(truths, self.info, self.ripeness.bunch)
-        happens["actors"] = formats.actors(happens.get("actors", []), seen.labels)
+        bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)
+        happens["actors"] = formats.actor_records(happens.get("actors", []), seen.labels)
         name = f"{image:06d}"
         record = {
             "image": image,
@@ -160,89 +162,97 @@ class Vineyard:
             },
             "sun": {"hour": hour, "direction": list(sun)},
             **happens,
-            "camera": formats.camera(self.spec.model, self.info, seen.pose),
+            "camera": formats.camera_record(self.spec.model, self.info, seen.pose),
             "bunches": bunches,
         }
         images = {
             "images": frame.rgb,
             "depth": picture.depth_millimetres(frame.exact_depth),
             "measured": picture.depth_millimetres(frame.depth),
-            "ids": formats.ids(frame.labels),
-            "berries": formats.berry_ids(seen),
+            "ids": formats.encode_labels(frame.labels),
+            "berries": formats.encode_berry_numbers(seen),
         }
         for kind, pixels in images.items():
-            with _part(folder / kind / f"{name}.png") as part:
+            with _atomic_file(folder / kind / f"{name}.png") as part:
                 picture.write_png(part, pixels)
-        with _part(folder / "labels" / f"{name}.txt") as part:
-            part.write_text(formats.yolo(bunches, self.info.width, self.info.height))
-        with _part(_record(folder, image)) as part:
+        with _atomic_file(folder / "labels" / f"{name}.txt") as part:
+            part.write_text(formats.yolo_labels(bunches, self.info.width, self.info.height))
+        with _atomic_file(_record_path(folder, image)) as part:
             formats.write_json(part, record)
 
-    def _happening(self, image: int) -> tuple[View, np.ndarray | None, dict[str, Any]]:
+    def _pose_scene(self, image: int) -> tuple[View, np.ndarray | None, dict[str, Any]]:
         """What there is in an image, drawn; whatever was there in the image before leaves no trace."""
         every = np.arange(len(self.model.tree_first))
         self.primitives.update(self.still, every)
-        life = self.plan.life
-        happens = life and life.view(self.model, np.random.default_rng([self.plan.seed, 5, image]))
+        life = self.plan.snapshot_source
+        happens = life and life.snapshot(self.model, np.random.default_rng([self.plan.seed, 5, image]))
         if happens is None:
             return self.still, None, {}
         self.primitives.update(happens[0], every)
         return happens
 
-    def _look(
-        self, rng: np.random.Generator, view: View, near: np.ndarray | None, company: list[tuple[float, float]]
-    ) -> truth.Look:
+    def _choose_view(
+        self, rng: np.random.Generator, view: View, near: np.ndarray | None, actors: list[tuple[float, float]]
+    ) -> truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 
-        If something happens, the bunch hangs ``near`` there, and somebody of the ``company`` [m] is seen too, if a
+        If something happens, the bunch hangs ``near`` there, and somebody of the ``actors`` [m] is seen too, if a
         place for that is soon found.
         """
         model = self.model
         hanging = np.flatnonzero(view.bunch_attached)
         if near is not None:
             away = np.linalg.norm(view.body_q[model.bunch_body[hanging], :2] - near, axis=1)
-            hanging = hanging[away < NEAR] if (away < NEAR).any() else hanging
+            hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
         if not len(hanging):
             raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
-        for attempt in range(_TRIES):
+        for attempt in range(_MAX_TRIES):
             bunch = int(hanging[rng.integers(len(hanging))])
             pose = view.body_q[model.bunch_body[bunch]].astype(float)
             middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
-            height, away, around = rng.uniform(*HEIGHT), rng.uniform(*DISTANCE), rng.uniform(0.0, 2.0 * np.pi)
-            if company and attempt < _SOCIABLE:  # somebody is behind the bunch
-                behind = np.array(company[rng.integers(len(company))]) - middle[:2]
+            height, away, around = (
+                rng.uniform(*CAMERA_HEIGHT),
+                rng.uniform(*BUNCH_DISTANCE),
+                rng.uniform(0.0, 2.0 * np.pi),
+            )
+            if actors and attempt < _TRIES_WITH_ACTORS:  # somebody is behind the bunch
+                behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
             rise = height - middle[2]
             level = np.sqrt(max(away**2 - rise**2, rise**2))  # never steeper than 45 degrees
             eye = np.array([*(middle[:2] + level * np.array([np.cos(around), np.sin(around)])), height])
             aim = middle + rng.normal(0.0, 0.12, 3) * min(away, 1.0)
             roll = frames.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.03)]))
-            if np.linalg.norm(aim - eye) < 0.1 or enclosing(self.primitives, eye) >= 0:
+            if np.linalg.norm(aim - eye) < 0.1 or enclosing_primitive(self.primitives, eye) >= 0:
                 continue
-            optical = picture.looking(eye, aim)
+            optical = picture.look_at(eye, aim)
             optical[3:] = frames.multiply(optical[3:], roll)
-            seen = truth.look(self.primitives, self.info, optical)
+            seen = truth.render_buffers(self.primitives, self.info, optical)
             shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
-            if company and attempt < _SOCIABLE and (seen.labels >= label(Organ.BOX, 0)).mean() < SEEN:
+            if (
+                actors
+                and attempt < _TRIES_WITH_ACTORS
+                and (seen.labels >= label(Organ.BOX, 0)).mean() < MIN_ACTOR_SHARE
+            ):
                 continue
-            if (seen.depth < TOO_NEAR).mean() < 0.02 and shown >= formats.LEAST_PIXELS:
+            if (seen.depth < MIN_CLEARANCE).mean() < 0.02 and shown >= formats.MIN_ANNOTATED_PIXELS:
                 return seen
-        raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_TRIES} tries")
+        raise DatasetError(f"scene {self.scene.name!r} has no open place near its bunches, in {_MAX_TRIES} tries")
 
 
-def _daylight(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
+def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
     """An hour of solar time [h] on a day from August to October, and where the sun stands: 6 degrees up or more."""
     declination = np.radians(rng.uniform(-8.0, 16.0))
     lowest = np.sin(np.radians(6.0)) - np.sin(LATITUDE) * np.sin(declination)
     half_day = float(np.degrees(np.arccos(lowest / (np.cos(LATITUDE) * np.cos(declination))))) / 15.0
     hour = 12.0 + half_day * float(rng.uniform(-1.0, 1.0))
-    return hour, sun_at(hour, float(declination), float(LATITUDE))
+    return hour, sun_direction(hour, float(declination), float(LATITUDE))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-class _part:  # noqa: N801  (reads as a word where it is used)
+class _atomic_file:  # noqa: N801  (reads as a word where it is used)
     """A file under another name until it is whole."""
 
     def __init__(self, path: pathlib.Path) -> None:
@@ -259,29 +269,29 @@ class _part:  # noqa: N801  (reads as a word where it is used)
             self.part.unlink(missing_ok=True)
 
 
-def _record(folder: pathlib.Path, image: int) -> pathlib.Path:
+def _record_path(folder: pathlib.Path, image: int) -> pathlib.Path:
     return folder / "records" / f"{image:06d}.json"
 
 
-def begin(plan: Plan, folder: pathlib.Path) -> None:
+def prepare_folder(plan: DatasetPlan, folder: pathlib.Path) -> None:
     """Make the folder, or go on with it if it was begun with the same plan; :class:`DatasetError` otherwise."""
     file, settings = folder / "dataset.json", plan.settings()
     try:
         if file.exists():
-            _same(json.loads(file.read_text(encoding="utf-8")), settings, folder)
+            _check_same_settings(json.loads(file.read_text(encoding="utf-8")), settings, folder)
         elif folder.exists() and any(folder.iterdir()):
             raise DatasetError(f"{folder} holds other things than a data set; give an empty folder or a new one")
         for name in _FOLDERS:
             (folder / name).mkdir(parents=True, exist_ok=True)
-        sweep(folder)
+        remove_partial_files(folder)
         if not file.exists():
-            with _part(file) as part:
+            with _atomic_file(file) as part:
                 formats.write_json(part, settings)
     except (OSError, json.JSONDecodeError) as bad:
         raise DatasetError(f"{folder} cannot be used: {bad}; give a folder that can be written") from None
 
 
-def _same(there: dict[str, Any], wanted: dict[str, Any], folder: pathlib.Path) -> None:
+def _check_same_settings(there: dict[str, Any], wanted: dict[str, Any], folder: pathlib.Path) -> None:
     wanted = json.loads(json.dumps(wanted))
     for name, value in wanted.items():
         if there.get(name) != value:
@@ -291,26 +301,26 @@ def _same(there: dict[str, Any], wanted: dict[str, Any], folder: pathlib.Path) -
             )
 
 
-def sweep(folder: pathlib.Path) -> None:
+def remove_partial_files(folder: pathlib.Path) -> None:
     """Take away what a killed run left half-written."""
     for part in folder.glob("**/.*.part"):
         part.unlink(missing_ok=True)
 
 
-def missing(folder: pathlib.Path, images: int) -> list[int]:
+def missing_images(folder: pathlib.Path, images: int) -> list[int]:
     """Which of the first images are not there yet."""
-    return [n for n in range(images) if not _record(folder, n).exists()]
+    return [n for n in range(images) if not _record_path(folder, n).exists()]
 
 
-def draw(plan: Plan, folder: pathlib.Path, images: Iterable[int]) -> Iterator[int]:
+def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]) -> Iterator[int]:
     """Draw images, in order; yields the number of each when it is done."""
     number, vineyard = -1, None
     for image in images:
-        if vineyard is None or image // IMAGES_A_VINEYARD != number:
-            number = image // IMAGES_A_VINEYARD
-            vineyard = Vineyard(plan, number)
+        if vineyard is None or image // IMAGES_PER_VINEYARD != number:
+            number = image // IMAGES_PER_VINEYARD
+            vineyard = VineyardRenderer(plan, number)
         try:
-            vineyard.draw(image, folder)
+            vineyard.write_image(image, folder)
         except OSError as bad:
             raise DatasetError(
                 f"image {image} cannot be written into {folder}: {bad.strerror or bad}; "
@@ -324,14 +334,14 @@ def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
 
     def read() -> Iterator[dict[str, Any]]:
         for number in range(images):
-            yield json.loads(_record(folder, number).read_text(encoding="utf-8"))
+            yield json.loads(_record_path(folder, number).read_text(encoding="utf-8"))
 
     try:
-        with _part(folder / "data.yaml") as part:
+        with _atomic_file(folder / "data.yaml") as part:
             part.write_text("path: .\ntrain: images\nval: images\nnames:\n  0: bunch\n")
         target = folder / "annotations.json"
-        with _part(target) as part, part.open("w", encoding="utf-8") as file:
-            for piece in formats.coco(read):
+        with _atomic_file(target) as part, part.open("w", encoding="utf-8") as file:
+            for piece in formats.coco_json(read):
                 file.write(piece)
     except OSError as bad:
         raise DatasetError(

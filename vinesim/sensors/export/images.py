@@ -16,7 +16,7 @@ from vinesim.sensors.camera.sunlight import DEFAULT_SUN
 from vinesim.sensors.scene.primitives import Primitives
 
 
-def looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
+def look_at(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Pose [7] of an optical frame at ``eye`` that looks ``at`` a point, level."""
     eye, at = np.asarray(eye, float), np.asarray(at, float)
     forward = frames.normalize(at - eye)
@@ -87,7 +87,7 @@ def write_png(path: str | pathlib.Path, image: np.ndarray) -> pathlib.Path:
     return path
 
 
-def save(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "frame") -> list[pathlib.Path]:
+def save_frame(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "frame") -> list[pathlib.Path]:
     """Write ``<stem>_rgb``, ``_depth`` (colours), ``_depth_mm`` (16UC1) and ``_labels`` PNGs; returns their paths.
 
     An empty ``stem`` leaves plain names: ``rgb.png`` and so on.
@@ -104,16 +104,16 @@ def save(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "frame") ->
     return [write_png(folder / f"{prefix}{name}.png", image) for name, image in images.items()]
 
 
-def standpoint(model: Model) -> np.ndarray:
+def overview_pose(model: Model) -> np.ndarray:
     """Pose [7] of an optical frame from which a scene shows itself: in the alley, at eye height, along the rows."""
     spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2], np.zeros((1, 2))])
     low, high = spots.min(0), spots.max(0)
     middle = 0.5 * (low + high)
     eye = np.array([low[0] - 0.6, middle[1] - 0.25, 1.45])
-    return looking(eye, np.array([high[0], middle[1] + 0.1, 1.40]))
+    return look_at(eye, np.array([high[0], middle[1] + 0.1, 1.40]))
 
 
-def portrait(
+def render_overview(
     model: Model,
     view: View,
     out: str | pathlib.Path | None = None,
@@ -135,7 +135,7 @@ def portrait(
     focal = 0.5 * width / np.tan(0.5 * view_angle)
     info = CameraInfo(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), "portrait")
     camera = Camera(CameraSpec.load("pinhole"), info, "portrait", sun, quality=quality)
-    image = camera.render(primitives, standpoint(model) if pose is None else pose, view.time).rgb
+    image = camera.render(primitives, overview_pose(model) if pose is None else pose, view.time).rgb
     if out is not None:
         write_png(out, image)
     return image

@@ -4,7 +4,7 @@ Each shot is a handful of rays over the beam's footprint. What they meet closer 
 is long comes back as one echo, whose range lies in between: mixed returns at the edges of leaves. Points are raw, as
 drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
 
-Two halves, so that either can be exchanged: a :class:`Grid` tells what rays meet, a :class:`Lidar` what is reported.
+Two halves, so that either can be exchanged: a :class:`RayGrid` tells what rays meet, a :class:`Lidar` what is reported.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import LidarScan
 from vinesim.sensors import spec_file
-from vinesim.sensors.lidar.lidar_rasterizer import Sweep
+from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.spec_file import Numbers
 
-MOST_RAYS = 8
+MAX_RAYS = 8
 """Of one shot."""
-FOOTPRINT_AT = 3.0
+FOOTPRINT_RANGE = 3.0
 """All rays leave from one point; beams are as wide as in life at this range [m], thinner nearer, wider beyond."""
-NEARLY_STILL, NEARLY_STRAIGHT = 4e-3, 3.5e-3
+MAX_SHARED_TRANSLATION, MAX_SHARED_ROTATION = 4e-3, 3.5e-3
 """Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place, their middle one.
 
 That is at most half a step of the head aside, and saves the finding of what is near for every few firings.
@@ -54,7 +54,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """Revolutions a second."""
     nearest: Annotated[Number, "m", (0.0, 100.0)]
     farthest: Annotated[Number, "m", (0.1, 500.0)]
-    rays: Annotated[Number, "1", (1, MOST_RAYS)]
+    rays: Annotated[Number, "1", (1, MAX_RAYS)]
     """Of one shot."""
     aperture: Annotated[Numbers, "m", (0.0, 0.1)]
     """Width and height of the beam where it leaves."""
@@ -121,8 +121,8 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return msgspec.structs.replace(self, rays=but(self.rays, 1), returns="strongest", **thin, **exact)
 
 
-class Grid(Protocol):
-    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.Sweep` unless another one is given."""
+class RayGrid(Protocol):
+    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer` unless another one is given."""
 
     direction: wp.array
     """[column * row] unit vectors in the head's frame."""
@@ -131,7 +131,7 @@ class Grid(Protocol):
     primitive: wp.array
     """[column * row], -2 the ground, -1 nothing."""
 
-    def hits(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
+    def cast(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
         """Fill distances and primitives of ``count`` columns from ``first`` on, with the head at ``pose`` [7]."""
         ...
 
@@ -147,14 +147,14 @@ class Lidar:
         device: str = "cpu",
         *,
         seed: int = 0,
-        grid: Callable[[np.ndarray, np.ndarray, float, int, str], Grid] = Sweep,
+        grid: Callable[[np.ndarray, np.ndarray, float, int, str], RayGrid] = LidarRasterizer,
     ) -> None:
         """Noise follows from (``seed``, ``name``, number of the revolution).
 
-        ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits: see :class:`Sweep`.
+        ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits: see :class:`LidarRasterizer`.
         """
         self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
-        self.number = 0
+        self.revolution = 0
         """Of the present revolution."""
         self.lasers = len(spec.elevation.value)
         self.firings = round(1.0 / (spec.rate.value * spec.firing_period.value))
@@ -171,7 +171,7 @@ class Lidar:
         beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
         azimuth = beside - 2.0 * np.pi * spec.rate.value * within
         across, up = self._footprint()
-        self.grid = grid(
+        self.ray_grid = grid(
             (elevation[:, None] + up).ravel(),
             (azimuth[:, None] + across / np.maximum(np.cos(elevation[:, None]), 0.01)).ravel(),
             -2.0 * np.pi * spec.rate.value * spec.firing_period.value,
@@ -179,9 +179,9 @@ class Lidar:
             device,
         )
         """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
-        self._receiver = self._made_of()
+        self._receiver = self._receiver_parameters()
         kept = 2 if spec.returns == "dual" else 1
-        self._luck = wp.zeros((len(self.offset), 3), dtype=float, device=device)
+        self._noise = wp.zeros((len(self.offset), 3), dtype=float, device=device)
         self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
         self._intensity = wp.zeros((len(self.offset), kept), dtype=float, device=device)
         self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
@@ -195,10 +195,10 @@ class Lidar:
         ring = np.sqrt(-0.5 * np.log(0.5 * (1.0 - 1.0 / count))) if count > 1 else 0.0
         turn = (np.arange(count - 1) + 0.5) * 2.0 * np.pi / max(count - 1, 1)
         sizes = zip(self.spec.aperture.value, self.spec.divergence.value, strict=True)
-        wide, high = (0.5 * leaving / FOOTPRINT_AT + 0.5e-3 * growing for leaving, growing in sizes)
+        wide, high = (0.5 * leaving / FOOTPRINT_RANGE + 0.5e-3 * growing for leaving, growing in sizes)
         return tuple(np.append(0.0, ring * size * wave(turn)) for size, wave in ((wide, np.cos), (high, np.sin)))
 
-    def _made_of(self) -> lidar_echoes.Receiver:
+    def _receiver_parameters(self) -> lidar_echoes.Receiver:
         spec, receiver = self.spec, lidar_echoes.Receiver()
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
@@ -217,14 +217,16 @@ class Lidar:
     def scan(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> LidarScan:
         """One revolution from ``pose`` [7], the lidar in the world (x forward, z up), while nothing moves."""
         pose = np.array(pose, float)
-        self.begin()
+        self.begin_revolution()
         self.fire(primitives, 0, np.broadcast_to(pose, (self.firings, 7)))
-        return self.finish(pose, time)
+        return self.finish_revolution(pose, time)
 
-    def begin(self) -> None:
+    def begin_revolution(self) -> None:
         """A new revolution."""
-        luck = spec_file.dice(self.seed, self.name, self.number).standard_normal((len(self.offset), 3), np.float32)
-        self._luck.assign(luck)
+        noise = spec_file.noise_rng(self.seed, self.name, self.revolution).standard_normal(
+            (len(self.offset), 3), np.float32
+        )
+        self._noise.assign(noise)
 
     def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
         """Firings from ``first`` on, one for each pose [firing, 7] of the lidar."""
@@ -233,24 +235,24 @@ class Lidar:
             wrong = poses[~np.isfinite(poses).all(1)][0]
             raise ValueError(f"lidar {self.name!r} has the pose {wrong.tolist()}; give finite numbers")
         poses[:, 3:] = frames.normalize(poses[:, 3:])
-        together = self._together(poses)
+        together = self._firings_per_pose(poses)
         for start in range(0, len(poses), together):
             part = poses[start : start + together]
             self._fire(primitives, first + start, len(part), part[len(part) // 2])
 
-    def _together(self, poses: np.ndarray) -> int:
+    def _firings_per_pose(self, poses: np.ndarray) -> int:
         """How many firings may be taken from one place, so slowly does the lidar move."""
         if len(poses) < 2:
             return 1
-        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / NEARLY_STILL
-        turn = 2.0 * np.linalg.norm(np.diff(poses[:, 3:], axis=0), axis=1).max() / NEARLY_STRAIGHT
+        way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / MAX_SHARED_TRANSLATION
+        turn = 2.0 * np.linalg.norm(np.diff(poses[:, 3:], axis=0), axis=1).max() / MAX_SHARED_ROTATION
         return max(int(1.0 / max(way, turn, 1e-6)), 1)
 
     def _fire(self, primitives: Primitives, first: int, count: int, pose: np.ndarray) -> None:
-        grid = self.grid
-        grid.hits(primitives, pose, first, count, self.spec.farthest.value)
+        grid = self.ray_grid
+        grid.cast(primitives, pose, first, count, self.spec.farthest.value)
         wp.launch(
-            lidar_echoes.receive,
+            lidar_echoes.detect_returns,
             count * self.lasers,
             inputs=[
                 primitives.shapes,
@@ -264,17 +266,17 @@ class Lidar:
                 grid.primitive,
                 label(Organ.GROUND, 0),
                 int(Organ.GROUND),
-                self._luck,
+                self._noise,
             ],
             outputs=[self._xyz, self._intensity, self._label],
             device=self.device,
         )
 
-    def finish(self, pose: np.ndarray, time: float) -> LidarScan:
+    def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
         """What was reported since :meth:`begin`; ``pose`` [7] and ``time`` [s] of the first firing."""
         labels = self._label.numpy()
         shot, which = np.nonzero(labels >= 0)
-        self.number += 1
+        self.revolution += 1
         return LidarScan(
             time=float(time),
             name=self.name,

@@ -13,16 +13,16 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels.raster import camera_raster, lidar_raster
 from vinesim.kernels.raster import primitives as shapes
-from vinesim.sensors.camera.camera import REACH
+from vinesim.sensors.camera.camera import MAX_DEPTH
 from vinesim.sensors.scene.primitives import Primitives
 
 
-def _numbers(vectors: wp.array) -> wp.array:
+def _as_floats(vectors: wp.array) -> wp.array:
     """The same memory [n, 3] as numbers."""
     return wp.array(ptr=vectors.ptr, shape=(len(vectors), 3), dtype=float, device=vectors.device, copy=False)
 
 
-class Sweep:
+class LidarRasterizer:
     """The rays of one revolution, and what they met when they were fired last."""
 
     def __init__(
@@ -42,24 +42,29 @@ class Sweep:
         self.primitive = wp.full(columns * self.rows, -1, dtype=wp.int32, device=device)
         """What was met [column * row]: -2 the ground, -1 nothing."""
         self._keys = wp.empty(columns * self.rows, dtype=wp.int64, device=device)
-        self._distance = wp.empty(0, dtype=float, device=device)
+        self._cluster_distance = wp.empty(0, dtype=float, device=device)
         order = np.argsort(elevation, kind="stable")
         tangent = np.clip(np.tan(elevation[order]), -1.0e6, 1.0e6).astype(np.float32)
-        slot = ((tangent / (1.0 + np.abs(tangent)) + 1.0) * (0.5 * lidar_raster.SLOTS - 0.01)).astype(int)
-        head = lidar_raster.Head()
+        slot = ((tangent / (1.0 + np.abs(tangent)) + 1.0) * (0.5 * lidar_raster.ELEVATION_SLOTS - 0.01)).astype(int)
+        head = lidar_raster.LidarHead()
         head.tangent, head.azimuth = (
             wp.array(v.astype(np.float32), dtype=float, device=device) for v in (tangent, azimuth[order])
         )
-        head.number = wp.array(order.astype(np.int32), device=device)
+        head.row_index = wp.array(order.astype(np.int32), device=device)
         # one slot early: the division above may round otherwise than a kernel's
-        slots = np.searchsorted(slot, np.arange(lidar_raster.SLOTS + 3) - 1).astype(np.int32)
-        head.slots = wp.array(slots, device=device)
-        head.direction, head.step = _numbers(self.direction), self.step
+        slots = np.searchsorted(slot, np.arange(lidar_raster.ELEVATION_SLOTS + 3) - 1).astype(np.int32)
+        head.row_slots = wp.array(slots, device=device)
+        head.direction, head.step = _as_floats(self.direction), self.step
         self._head = head
-        self._fan = azimuth.min(), azimuth.max()
+        self._azimuth_range = azimuth.min(), azimuth.max()
 
-    def hits(
-        self, primitives: Primitives, pose: np.ndarray, first: int = 0, count: int | None = None, reach: float = REACH
+    def cast(
+        self,
+        primitives: Primitives,
+        pose: np.ndarray,
+        first: int = 0,
+        count: int | None = None,
+        reach: float = MAX_DEPTH,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Fire ``count`` columns from ``first`` on (all that follow), with the head at ``pose`` [7] in the world.
 
@@ -69,32 +74,38 @@ class Sweep:
         part = slice(first * self.rows, (first + count) * self.rows)
         head = self._head
         head.eye = wp.vec3(*map(float, pose[:3]))
-        head.turn = wp.mat33(*map(float, frames.matrix(frames.normalize(pose[3:])).T.ravel()))
-        head.first, head.end, head.reach = first, first + count, float(reach)
-        low, high = self._fan
+        head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
+        head.first_column, head.end_column, head.max_range = first, first + count, float(reach)
+        low, high = self._azimuth_range
         turn = 0.5 * (low + high) + (first + 0.5 * (count - 1)) * self.step
         reaches = 0.5 * (high - low + abs(self.step) * count) + 1e-4
-        head.middle = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
-        head.within = wp.vec2(float(np.cos(reaches)), float(np.sin(reaches))) if reaches < 1.5 else wp.vec2(-1.0, 0.0)
-        self._keys[part].fill_(int(camera_raster.EMPTY))
-        clusters = len(primitives.cluster_first)
-        if len(self._distance) != clusters:
-            self._distance = wp.empty(clusters, dtype=float, device=self.device)
-        wp.launch(
-            lidar_raster.cull, clusters, inputs=[primitives.ball, head], outputs=[self._distance], device=self.device
+        head.azimuth_middle = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
+        head.azimuth_half_range = (
+            wp.vec2(float(np.cos(reaches)), float(np.sin(reaches))) if reaches < 1.5 else wp.vec2(-1.0, 0.0)
         )
-        distance = self._distance.numpy()
+        self._keys[part].fill_(int(camera_raster.EMPTY_KEY))
+        clusters = len(primitives.cluster_first)
+        if len(self._cluster_distance) != clusters:
+            self._cluster_distance = wp.empty(clusters, dtype=float, device=self.device)
+        wp.launch(
+            lidar_raster.cull_clusters,
+            clusters,
+            inputs=[primitives.ball, head],
+            outputs=[self._cluster_distance],
+            device=self.device,
+        )
+        distance = self._cluster_distance.numpy()
         seen = np.flatnonzero(distance < float(shapes.FAR))
         seen = seen[np.argsort(distance[seen], kind="stable")].astype(np.int32)
         lanes = 1 if self.device == "cpu" else 24
         wp.launch(
-            lidar_raster.raster,
+            lidar_raster.raster_clusters,
             (len(seen), lanes),
             inputs=[
                 primitives.shapes,
                 primitives.clusters,
-                _numbers(primitives.lower),
-                _numbers(primitives.upper),
+                _as_floats(primitives.lower),
+                _as_floats(primitives.upper),
                 wp.array(seen, device=self.device),
                 head,
                 lanes,
@@ -104,7 +115,7 @@ class Sweep:
         )
         run = self.rows if self.device == "cpu" else 1
         wp.launch(
-            lidar_raster.resolve,
+            lidar_raster.resolve_keys,
             count * self.rows // run,
             inputs=[self._keys, head, run],
             outputs=[self.distance, self.primitive],

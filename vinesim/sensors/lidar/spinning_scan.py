@@ -16,7 +16,7 @@ from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.scene.primitives import Primitives
 
 
-class Track:
+class PoseHistory:
     """Where a sensor was lately."""
 
     def __init__(self) -> None:
@@ -30,12 +30,12 @@ class Track:
         self._times.append(time)
         self._poses.append(np.array(pose, float))
 
-    def forget(self, before: float) -> None:
+    def discard_before(self, before: float) -> None:
         """What is not needed for times from ``before`` on [s]."""
         old = max(int(np.searchsorted(self._times, before, side="right")) - 1, 0)
         del self._times[:old], self._poses[:old]
 
-    def at(self, times: np.ndarray) -> np.ndarray:
+    def interpolate(self, times: np.ndarray) -> np.ndarray:
         """Poses [k, 7] at ``times`` [k] s, straight between those that are known; the nearest one beyond them."""
         known = np.asarray(self._times)
         poses = np.stack(self._poses)
@@ -50,50 +50,50 @@ class Track:
         return between
 
 
-class Rolling:
+class SpinningScan:
     """One lidar, fired bit by bit."""
 
     def __init__(self, lidar: Lidar, rate: float | None = None) -> None:
         """``rate``: revolutions a second that are wanted [Hz]; as fast as the head turns unless given, never faster."""
         self.lidar = lidar
-        self.track = Track()
+        self.pose_history = PoseHistory()
         self.dropped = 0
         """Revolutions that were over before they were begun."""
-        self._turn = 1.0 / lidar.rate
-        self._period = max(self._turn, 1.0 / rate if rate else 0.0)
+        self._revolution_period = 1.0 / lidar.rate
+        self._period = max(self._revolution_period, 1.0 / rate if rate else 0.0)
         self._start: float | None = None
-        self._fired = 0
+        self._next_column = 0
 
-    def stop(self, now: float) -> None:
+    def cancel(self, now: float) -> None:
         """Forget the present revolution: at ``now`` [s] nobody wants it."""
         self._start = None
-        self.track.forget(now)
+        self.pose_history.discard_before(now)
 
-    def due(self, now: float) -> bool:
+    def is_due(self, now: float) -> bool:
         """Whether there is something to fire at ``now`` [s]: a head that waits for its next revolution has nothing."""
         return self._start is None or now >= self._start - 1e-9 or now < self._start - self._period
 
-    def go(self, primitives: Primitives, now: float) -> Iterator[LidarScan]:
+    def advance(self, primitives: Primitives, now: float) -> Iterator[LidarScan]:
         """Fire what is due at ``now`` [s] of simulation time; yields the revolutions that are complete with it."""
         if self._start is None or now < self._start - self._period:
             self._begin(now)
         while self._start is not None:
             lidar, start, step = self.lidar, self._start, self.lidar.spec.firing_period.value
             due = min(int((now - start) / step + 1e-6) + 1, lidar.firings) if now >= start - 1e-9 else 0
-            if due > self._fired:
-                times = start + step * np.arange(self._fired, due)
-                lidar.fire(primitives, self._fired, self.track.at(times))
-                self._fired = due
+            if due > self._next_column:
+                times = start + step * np.arange(self._next_column, due)
+                lidar.fire(primitives, self._next_column, self.pose_history.interpolate(times))
+                self._next_column = due
             if due < lidar.firings:
                 return
-            yield lidar.finish(self.track.at(np.array([start]))[0], start)
+            yield lidar.finish_revolution(self.pose_history.interpolate(np.array([start]))[0], start)
             start += self._period
             late = max(int((now - start) / self._period + 1e-6), 0)
             self.dropped += late
-            lidar.number += late
+            lidar.revolution += late
             self._begin(start + late * self._period)
 
     def _begin(self, start: float) -> None:
-        self._start, self._fired = start, 0
-        self.track.forget(start)
-        self.lidar.begin()
+        self._start, self._next_column = start, 0
+        self.pose_history.discard_before(start)
+        self.lidar.begin_revolution()

@@ -9,30 +9,30 @@ import numpy as np
 from vinesim import frames
 from vinesim.kernels.shading import materials
 from vinesim.scene import leaves
-from vinesim.scene.berries import VARIETIES, berries, piece_of
+from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID, Batch, batch, columns
+from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID, Batch, make_batch, stack_columns
 
 _BROWN = (0.30, 0.17, 0.08)
 _STEM = (0.19, 0.22, 0.075)
 
 
-def pieces_of(model: Model, bunch: int) -> np.ndarray:
+def bunch_bodies(model: Model, bunch: int) -> np.ndarray:
     """Bodies that carry one bunch's berries [piece]: its own, then its clusters."""
     first, count = int(model.bunch_cluster[bunch]), int(model.bunch_clusters[bunch])
     return np.append(model.bunch_body[bunch], np.arange(first, first + count))
 
 
-def canes(model: Model, still: int) -> Batch:
+def cane_batch(model: Model, still: int) -> Batch:
     """One round cone for each piece of cane and peduncle."""
     bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
     rng = np.random.default_rng(5)
     seed = rng.uniform(size=len(model.tree_first))
     organ, tree = model.body_organ[bodies], model.body_tree[bodies]
     index = tree.copy()
-    bunch_of = model.bunch_of()[bodies]
+    bunch_of = model.bunch_of_body()[bodies]
     index = np.where(bunch_of >= 0, bunch_of, index)
     # shoots ripen from the base: green towards the tip, brown where the wood is thick
     green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
@@ -41,11 +41,11 @@ def canes(model: Model, still: int) -> Batch:
     material = np.where(green[:, 0] > 0.5, int(materials.STEM), int(materials.CANE))
     length = model.body_length[bodies]
     zero = np.zeros(len(bodies))
-    return batch(
+    return make_batch(
         CONE,
-        columns(zero, zero, zero, model.body_radius[bodies, 0]),
-        b=columns(length, zero, zero, model.body_radius[bodies, 1]),
-        c=columns(zero, seed[tree] * 7.0, zero, zero),
+        stack_columns(zero, zero, zero, model.body_radius[bodies, 0]),
+        b=stack_columns(length, zero, zero, model.body_radius[bodies, 1]),
+        c=stack_columns(zero, seed[tree] * 7.0, zero, zero),
         material=material,
         tint=tint,
         organ=organ,
@@ -55,13 +55,13 @@ def canes(model: Model, still: int) -> Batch:
     )
 
 
-def foliage(model: Model) -> list[Batch]:
+def leaf_batches(model: Model) -> list[Batch]:
     """Blades, their petioles, and the nodes from which they grow."""
     count = len(model.leaf_body)
     if not count:
         return []
     rng = np.random.default_rng(11)
-    shape = leaves.shape_of(np.arange(count))
+    shape = leaves.blade_shape(np.arange(count))
     q = model.leaf_pose[:, 3:]
     rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
     base, petiole_end, size = model.leaf_base, model.leaf_pose[:, :3], model.leaf_size * textures.leaf_scale(shape)
@@ -71,12 +71,12 @@ def foliage(model: Model) -> list[Batch]:
     bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
     body, tree = model.leaf_body, model.body_tree[model.leaf_body]
     names = label(Organ.LEAF, 0) + tree
-    blade = batch(
+    blade = make_batch(
         LEAF,
-        columns(petiole_end, size),
-        b=columns(rib, shape),
-        c=columns(up, rng.uniform(size=count)),
-        d=columns(bend, model.leaf_age),
+        stack_columns(petiole_end, size),
+        b=stack_columns(rib, shape),
+        c=stack_columns(up, rng.uniform(size=count)),
+        d=stack_columns(bend, model.leaf_age),
         material=int(materials.FOLIAGE),
         tint=tint,
         organ=int(Organ.LEAF),
@@ -84,10 +84,10 @@ def foliage(model: Model) -> list[Batch]:
         carrier=body,
         group=tree,
     )
-    petiole = batch(
+    petiole = make_batch(
         CONE,
-        columns(base, 0.0017),
-        b=columns(petiole_end, 0.0012),
+        stack_columns(base, 0.0017),
+        b=stack_columns(petiole_end, 0.0012),
         material=int(materials.STEM),
         tint=(0.21, 0.13, 0.06),
         organ=int(Organ.LEAF),
@@ -100,10 +100,10 @@ def foliage(model: Model) -> list[Batch]:
     r = model.body_radius[body, 0] * (1.0 - along) + model.body_radius[body, 1] * along
     reach = np.array([1.0, 0.0, 0.0]) * r[:, None]
     axis = base * np.array([1.0, 0.0, 0.0])
-    node = batch(
+    node = make_batch(
         CONE,
-        columns(axis - 0.7 * reach, 1.25 * r),
-        b=columns(axis + 0.4 * reach, 1.45 * r),
+        stack_columns(axis - 0.7 * reach, 1.25 * r),
+        b=stack_columns(axis + 0.4 * reach, 1.45 * r),
         material=int(materials.CANE),
         tint=(0.24, 0.15, 0.07),
         organ=int(Organ.CANE),
@@ -116,9 +116,9 @@ def foliage(model: Model) -> list[Batch]:
 
 _UNRIPE = {"green": np.array([0.085, 0.150, 0.022]), "shot": 0.45}
 """Colour of a hard green berry (linear RGB reflectance, GUESSED by eye), and the size of a berry without seeds."""
-_SPREAD = 0.10
+_RIPENESS_SPREAD = 0.10
 """Standard deviation of ripeness within a bunch: berries soften and colour one by one. GUESSED."""
-_SHOT = 0.06
+_SHOT_BERRY_SHARE = 0.06
 """Share of the berries of a quite unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
 
 
@@ -138,7 +138,7 @@ class Ripeness:
         return cls(np.round(rng.beta(2.2, 0.7, count), 3), seed)
 
 
-def bunches(
+def bunch_batches(
     model: Model,
     which: np.ndarray,
     place: list[np.ndarray] | None,
@@ -152,17 +152,17 @@ def bunches(
     without clusters is one piece. ``group`` [k]; without ``ripeness`` all are ripe.
     """
     found: list[Batch] = []
-    for first in range(0, len(which), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        found += _bunches(model, which[part], place and place[part], carrier[part], group[part], ripeness)
+    for first in range(0, len(which), _BATCH_SIZE):
+        part = slice(first, first + _BATCH_SIZE)
+        found += _bunch_group_batches(model, which[part], place and place[part], carrier[part], group[part], ripeness)
     return found
 
 
-_AT_ONCE = 256
+_BATCH_SIZE = 256
 """Bunches that are laid out together: numpy then works on rows, and temporary arrays stay small."""
 
 
-def _bunches(
+def _bunch_group_batches(
     model: Model,
     which: np.ndarray,
     place: list[np.ndarray] | None,
@@ -171,7 +171,7 @@ def _bunches(
     ripeness: Ripeness | None,
 ) -> list[Batch]:
     ones = [
-        berries(
+        lay_out_berries(
             float(model.bunch_length[b]),
             float(model.bunch_radius[b]),
             int(model.bunch_berries[b]),
@@ -187,7 +187,7 @@ def _bunches(
     whole = model.bunch_length[which].astype(float)
 
     def piece_at(position: np.ndarray, owner: np.ndarray) -> np.ndarray:
-        inner = piece_of(position, whole[owner], pieces[owner])
+        inner = segment_of(position, whole[owner], pieces[owner])
         return first_piece[owner] + inner
 
     def placed(points: np.ndarray, piece: np.ndarray, owner: np.ndarray) -> np.ndarray:
@@ -214,13 +214,13 @@ def _bunches(
     reddish = (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(0.5 * blush[:, None], 0.0, 1.0)
     colour = colour + np.array([0.055, 0.014, 0.010]) * reddish
     if ripeness is not None:
-        colour, radius = _unripe(colour, radius, ripeness, which, count)
+        colour, radius = _apply_ripeness(colour, radius, ripeness, which, count)
     away = np.hypot(*position[:, 1:].T)
-    edge = np.array([_reach(a) for a in np.split(away, np.cumsum(count)[:-1])])[owner]
+    edge = np.array([_quantile_80(a) for a in np.split(away, np.cumsum(count)[:-1])])[owner]
     depth = np.clip(0.35 + 0.65 * away / np.maximum(edge, 1e-6), 0.0, 1.0)
     start_row = (np.cumsum(count) - count)[owner][:, None]
-    near = np.concatenate([_padded(one.neighbours) for one in ones])
-    crowding = _crowding(position, radius, np.where(near >= 0, near + start_row, -1))
+    near = np.concatenate([_padded_neighbours(one.neighbours) for one in ones])
+    crowding = _neighbour_occlusion(position, radius, np.where(near >= 0, near + start_row, -1))
     names = label(Organ.BUNCH, 0) + which
     on_berry = piece_at(position, owner)
 
@@ -230,12 +230,12 @@ def _bunches(
             "carrier": on[piece],
         }  # fmt: skip
 
-    fruit = batch(
+    fruit = make_batch(
         SPHEROID,
-        columns(placed(position, on_berry, owner), radius),
-        b=columns(turned(axis, on_berry), elongation),
-        c=columns(speck, depth, 0.0, 0.0),
-        d=columns(turned(crowding[:, :3], on_berry), crowding[:, 3]),
+        stack_columns(placed(position, on_berry, owner), radius),
+        b=stack_columns(turned(axis, on_berry), elongation),
+        c=stack_columns(speck, depth, 0.0, 0.0),
+        d=stack_columns(turned(crowding[:, :3], on_berry), crowding[:, 3]),
         material=int(materials.BERRY),
         tint=colour,
         **common(on_berry, owner),
@@ -245,10 +245,10 @@ def _bunches(
     taper = np.concatenate([np.tile(np.linspace(0.0028, 0.0013, r.shape[1] - 1), len(r)) for r in lines])
     line_owner = np.repeat(np.arange(len(ones)), [len(r) * (r.shape[1] - 1) for r in lines])
     middle = piece_at(0.5 * (start + end), line_owner)
-    rachis = batch(
+    rachis = make_batch(
         CONE,
-        columns(placed(start, middle, line_owner), taper),
-        b=columns(placed(end, middle, line_owner), 0.9 * taper),
+        stack_columns(placed(start, middle, line_owner), taper),
+        b=stack_columns(placed(end, middle, line_owner), 0.9 * taper),
         material=int(materials.STEM),
         tint=_STEM,
         **common(middle, line_owner),
@@ -256,10 +256,10 @@ def _bunches(
     berry_end = position - axis * (radius * elongation * 0.95)[:, None]
     loose = np.linalg.norm(berry_end - foot, axis=1) > 0.002
     loose_piece, loose_owner = on_berry[loose], owner[loose]
-    pedicel = batch(
+    pedicel = make_batch(
         CONE,
-        columns(placed(foot[loose], loose_piece, loose_owner), 0.0010),
-        b=columns(placed(berry_end[loose], loose_piece, loose_owner), 0.0014),
+        stack_columns(placed(foot[loose], loose_piece, loose_owner), 0.0010),
+        b=stack_columns(placed(berry_end[loose], loose_piece, loose_owner), 0.0014),
         material=int(materials.STEM),
         tint=_STEM,
         **common(loose_piece, loose_owner),
@@ -267,7 +267,7 @@ def _bunches(
     return [b for b in (fruit, rachis, pedicel) if len(b)]
 
 
-def _unripe(
+def _apply_ripeness(
     colour: np.ndarray, radius: np.ndarray, ripeness: Ripeness, which: np.ndarray, count: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours and radii of berries that are not all ripe: each on its way from green, and some that never set out."""
@@ -275,15 +275,15 @@ def _unripe(
     draws = zip(which, count, strict=True)
     draw = np.concatenate([np.random.default_rng([ripeness.seed, 4, int(b)]).uniform(size=(n, 2)) for b, n in draws])
     mean = ripeness.bunch[which][owner]
-    own = mean + _SPREAD * np.sqrt(12.0) * (draw[:, 0] - 0.5) * np.minimum(4.0 * (1.0 - mean), 1.0)
-    shot = draw[:, 1] < _SHOT * (1.0 - mean)
+    own = mean + _RIPENESS_SPREAD * np.sqrt(12.0) * (draw[:, 0] - 0.5) * np.minimum(4.0 * (1.0 - mean), 1.0)
+    shot = draw[:, 1] < _SHOT_BERRY_SHARE * (1.0 - mean)
     own = np.where(shot, 0.0, np.clip(own, 0.0, 1.0))
     share = (own * own * (3.0 - 2.0 * own))[:, None]
     size = np.where(shot, _UNRIPE["shot"], 0.9 + 0.1 * own)
     return _UNRIPE["green"] * (1.0 - share) + colour * share, radius * size
 
 
-def _reach(away: np.ndarray) -> float:
+def _quantile_80(away: np.ndarray) -> float:
     """The 80 % quantile, without the ceremony of np.quantile."""
     at = 0.8 * (len(away) - 1)
     low = int(at)
@@ -291,13 +291,13 @@ def _reach(away: np.ndarray) -> float:
     return float(ends[low] + (at - low) * (ends[min(low + 1, len(away) - 1)] - ends[low]))
 
 
-def _padded(neighbours: np.ndarray) -> np.ndarray:
+def _padded_neighbours(neighbours: np.ndarray) -> np.ndarray:
     """Eight neighbours of each berry [n, 8], -1 where there are fewer."""
     missing = 8 - neighbours.shape[1]
     return np.pad(neighbours, ((0, 0), (0, missing)), constant_values=-1) if missing else neighbours
 
 
-def _crowding(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Light that the nearest neighbours take from each berry: share(n) = w + v . n as (v, w) [n, 4].
 
     A touching sphere of equal size takes (1/4 + 0.85 cos) r^2 / l^2 as seen from the berry's surface.

@@ -53,7 +53,7 @@ class Batch:
         return len(self.a)
 
 
-def batch(kind: int, a, *, b=0.0, c=0.0, d=0.0, material, tint, organ, label, carrier, group, bunch=-1) -> Batch:
+def make_batch(kind: int, a, *, b=0.0, c=0.0, d=0.0, material, tint, organ, label, carrier, group, bunch=-1) -> Batch:
     """A batch with scalars and rows broadcast to the count of ``a`` [n, 4]."""
     a = np.atleast_2d(np.asarray(a, np.float32))
     n = len(a)
@@ -63,19 +63,19 @@ def batch(kind: int, a, *, b=0.0, c=0.0, d=0.0, material, tint, organ, label, ca
     return Batch(kind, a, *wide, np.broadcast_to(np.asarray(material, np.int32), n), tint, *flat)
 
 
-def columns(*parts) -> np.ndarray:
+def stack_columns(*parts) -> np.ndarray:
     """Vectors [n, k] and scalars, one or [n], side by side."""
     columns = [np.asarray(p, float).reshape(-1, 1) if np.ndim(p) < 2 else np.asarray(p, float) for p in parts]
     n = max(len(c) for c in columns)
     return np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in columns], 1)
 
 
-def nothing(still: int) -> Batch:
+def placeholder_batch(still: int) -> Batch:
     """A stand-in for a world without plants, far below the ground: no array is ever empty."""
-    return batch(
+    return make_batch(
         CONE,
-        [[0.0, 0.0, float(primitives.HIDDEN), 1e-6]],
-        b=[[1e-3, 0.0, float(primitives.HIDDEN), 1e-6]],
+        [[0.0, 0.0, float(primitives.HIDDEN_HEIGHT), 1e-6]],
+        b=[[1e-3, 0.0, float(primitives.HIDDEN_HEIGHT), 1e-6]],
         material=0,
         tint=0.0,
         organ=0,

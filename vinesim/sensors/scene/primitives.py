@@ -20,14 +20,14 @@ from vinesim.scene.state import State
 from vinesim.scene.values import Link, View
 from vinesim.sensors.camera import renderers
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.plant_primitives import Ripeness, bunches, canes, foliage, pieces_of
-from vinesim.sensors.scene.primitive_batches import CONE, KINDS, LEAF, nothing
-from vinesim.sensors.scene.rigid_primitives import rigid
-from vinesim.sensors.scene.static_primitives import fixed, litter, meadow, rows_of
+from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches, bunch_bodies, cane_batch, leaf_batches
+from vinesim.sensors.scene.primitive_batches import CONE, KINDS, LEAF, placeholder_batch
+from vinesim.sensors.scene.rigid_primitives import rigid_batches
+from vinesim.sensors.scene.static_primitives import grass_batch, litter_batch, row_layout, trellis_batch
 
 log = logging.getLogger(__name__)
 
-_CLUSTER = 24
+_MAX_CLUSTER = 24
 """Most primitives of one cluster."""
 
 
@@ -47,39 +47,39 @@ class Primitives:
         the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.camera.renderers`).
         """
         self.model, self.device, self._ripeness = model, device, ripeness
-        self.raster = renderers.raster_of(renderer, device)
-        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.camera.Visibility` does so itself."""
+        self.rasterizer = renderers.create_rasterizer(renderer, device)
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.camera.CameraRasterizer` does so itself."""
         bodies = len(model.body_mass)
-        self._still = bodies
+        self._static_carrier = bodies
         """Carrier of what stands still; links follow it."""
         spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
         low, high = (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
         trees = len(model.tree_first)
-        batches = [canes(model, bodies), *foliage(model)]
+        batches = [cane_batch(model, bodies), *leaf_batches(model)]
         every = np.arange(len(model.bunch_body))
-        pieces = [pieces_of(model, bunch) for bunch in every]
-        batches += bunches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
-        around = [fixed(model, bodies)]
+        pieces = [bunch_bodies(model, bunch) for bunch in every]
+        batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
+        around = [trellis_batch(model, bodies)]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
-            around += [meadow(rows_of(model), low, high, grass, bodies), litter(low, high, age, bodies)]
+            around += [grass_batch(row_layout(model), low, high, grass, bodies), litter_batch(low, high, age, bodies)]
         batches += [b for b in around if b is not None]
-        self._plants = [b for b in batches if len(b)] or [nothing(bodies)]
-        self._groups = trees
+        self._fixed_batches = [b for b in batches if len(b)] or [placeholder_batch(bodies)]
+        self._tree_count = trees
         self._links: tuple[Link, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
-        self._picked: dict[int, np.ndarray] = {}
+        self._picked_shapes: dict[int, np.ndarray] = {}
         self._moved = np.zeros(0, np.int64)
-        outline, hull = textures.outlines()
+        outline, hull = textures.leaf_outlines()
         self._outline, self._hull = wp.array(outline, device=device), wp.array(hull, dtype=wp.vec2, device=device)
         self._rest = self._body_q = State.at_rest(model).body_q
-        self.version = 0
+        self.pose_version = 0
         """Counts changes of any pose."""
-        self.built = 0
+        self.layout_version = 0
         """Counts changes of the set of primitives."""
         self._poses = np.zeros((0, 7), np.float32)
         self._build(())
-        self._bake(low, high)
+        self._bake_sky(low, high)
         self._pose(np.arange(len(self.cluster_first)))
 
     # -- reading
@@ -89,16 +89,16 @@ class Primitives:
         """How many primitives there are."""
         return len(self.label)
 
-    def counts(self) -> dict[str, int]:
+    def counts_by_kind(self) -> dict[str, int]:
         """How many there are of each kind."""
         kinds = self.shapes.kind.numpy()
         return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
 
-    def shown(self) -> np.ndarray:
+    def clusters_shown(self) -> np.ndarray:
         """Whether each cluster is there at all [cluster]: what has been picked is not."""
         return self.ball.numpy()[:, 3] > 0.0
 
-    def carriers(self, primitive: np.ndarray) -> np.ndarray:
+    def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
         """Poses [..., 7] m, 1 of what carries some primitives [...]: a plant's body, a link, or the world."""
         return self._poses[self._carrier.numpy()[primitive]].astype(float)
 
@@ -106,9 +106,11 @@ class Primitives:
 
     def _build(self, links: tuple[Link, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
-        moving = rigid(self.model, links, self._still + 1, 0, self._shapes_of_picked(links), self._ripeness)
-        batches = self._plants + moving
-        first_rigid = len(self._plants)
+        moving = rigid_batches(
+            self.model, links, self._static_carrier + 1, 0, self._picked_bunch_shapes(links), self._ripeness
+        )
+        batches = self._fixed_batches + moving
+        first_rigid = len(self._fixed_batches)
         pieces: dict[str, list[np.ndarray]] = {
             name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
         }
@@ -119,11 +121,11 @@ class Primitives:
             group, bunch = batch.group[order], batch.bunch[order]
             starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])
             runs = np.diff(np.r_[starts, len(group)])
-            parts = (runs + _CLUSTER - 1) // _CLUSTER
+            parts = (runs + _MAX_CLUSTER - 1) // _MAX_CLUSTER
             inner = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
-            first = np.repeat(starts, parts) + inner * _CLUSTER
-            size = np.minimum(_CLUSTER, np.repeat(runs, parts) - inner * _CLUSTER)
-            still = number < first_rigid and bool((batch.carrier == self._still).all())
+            first = np.repeat(starts, parts) + inner * _MAX_CLUSTER
+            size = np.minimum(_MAX_CLUSTER, np.repeat(runs, parts) - inner * _MAX_CLUSTER)
+            still = number < first_rigid and bool((batch.carrier == self._static_carrier).all())
             firsts.append(total + first)
             sizes.append(size)
             kinds.append(np.full(len(first), batch.kind))
@@ -134,7 +136,7 @@ class Primitives:
                 pile.append(getattr(batch, name)[order])
             total += len(batch)
         whole = {name: np.concatenate(pile) for name, pile in pieces.items()}
-        if self.built:
+        if self.layout_version:
             whole["c"][: len(self._baked_c)] = self._baked_c
         self.label, self.organ = whole["label"].astype(np.int32), whole["organ"].astype(np.int32)
         self.cluster_first, self.cluster_size, self.cluster_kind, self._owner, self._cluster_bunch = (
@@ -145,7 +147,7 @@ class Primitives:
         """:attr:`version` at which each cluster moved last."""
         order = np.argsort(self._owner, kind="stable")
         self._by_owner = order
-        self._owner_start = np.searchsorted(self._owner[order], np.arange(self._groups + 1))
+        self._owner_start = np.searchsorted(self._owner[order], np.arange(self._tree_count + 1))
         shown = (
             (self._cluster_bunch < 0) | self._attached[self._cluster_bunch]
             if len(self._attached)
@@ -155,11 +157,11 @@ class Primitives:
         def array(values: np.ndarray, kind: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=kind, device=self.device)
 
-        self._local, self.shapes, self.clusters, self.looks = (
+        self._local, self.shapes, self.clusters, self.materials = (
             primitives.Shapes(),
             primitives.Shapes(),
             primitives.Clusters(),
-            materials.Looks(),
+            materials.Materials(),
         )
         primitive_kind = np.repeat(self.cluster_kind, self.cluster_size)
         for name in "abcd":
@@ -176,38 +178,47 @@ class Primitives:
         self.organs = array(self.organ, wp.int32)
         self.lower, self.upper = (wp.empty(total, dtype=wp.vec3, device=self.device) for _ in range(2))
         self.ball = wp.empty(len(self.cluster_first), dtype=wp.vec4, device=self.device)
-        self.looks.material, self.looks.tint = (
+        self.materials.material, self.materials.tint = (
             array(whole["material"].astype(np.int32), wp.int32),
             array(whole["tint"], wp.vec3),
         )
-        self.lamps = np.flatnonzero(whole["material"] == int(materials.LAMP))
+        self.lamp_primitives = np.flatnonzero(whole["material"] == int(materials.LAMP))
         """Primitives that shine."""
         sky = np.full(total, 0.7, np.float32)
-        if self.built:
+        if self.layout_version:
             known = self._sky[: min(len(self._sky), total)]
             sky[: len(known)] = known
-            for name in ("blade", "noise", "soil", "rows", "ground_sky", "ground_x", "ground_y", "ground_cell"):
-                setattr(self.looks, name, getattr(self._baked, name))
-        self.looks.sky = array(sky, float)
-        poses = np.zeros((self._still + 1 + len(links), 7), np.float32)
+            for name in (
+                "leaf_texture",
+                "noise_texture",
+                "soil_texture",
+                "rows",
+                "ground_sky",
+                "ground_x",
+                "ground_y",
+                "ground_cell",
+            ):
+                setattr(self.materials, name, getattr(self._baked_materials, name))
+        self.materials.sky = array(sky, float)
+        poses = np.zeros((self._static_carrier + 1 + len(links), 7), np.float32)
         poses[:, 6] = 1.0
-        poses[: self._still] = self._poses[: self._still] if len(self._poses) else self._rest
+        poses[: self._static_carrier] = self._poses[: self._static_carrier] if len(self._poses) else self._rest
         self._poses = poses
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._links = links
         self.plant_count = total - sum(len(b) for b in moving)
-        self.built += 1
+        self.layout_version += 1
 
-    def _shapes_of_picked(self, links: tuple[Link, ...]) -> dict[int, np.ndarray]:
+    def _picked_bunch_shapes(self, links: tuple[Link, ...]) -> dict[int, np.ndarray]:
         """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
         picked = {}
         for bunch in (link.index for link in links if link.organ == Organ.BUNCH):
-            q = np.asarray(self._body_q[pieces_of(self.model, bunch)], float)
-            picked[bunch] = self._picked.get(bunch, frames.compose(frames.inverse(q[0]), q))
-        self._picked = picked
+            q = np.asarray(self._body_q[bunch_bodies(self.model, bunch)], float)
+            picked[bunch] = self._picked_shapes.get(bunch, frames.compose(frames.inverse(q[0]), q))
+        self._picked_shapes = picked
         return picked
 
-    def _bake(self, low: np.ndarray, high: np.ndarray) -> None:
+    def _bake_sky(self, low: np.ndarray, high: np.ndarray) -> None:
         """Share of the sky that every primitive and the ground see through the leaves, in the shape at rest."""
         self._pose(np.arange(len(self.cluster_first)))
         low, high = low - 3.0, high + 3.0
@@ -226,7 +237,7 @@ class Primitives:
             out = wp.zeros(len(points), dtype=float, device=self.device)
             at = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device=self.device)
             wp.launch(
-                shadow_maps.see_sky,
+                shadow_maps.sky_visibility,
                 len(points),
                 inputs=[grid, wp.vec3(*map(float, corner)), float(cell), at],
                 outputs=[out],
@@ -241,19 +252,19 @@ class Primitives:
         self._local.c.assign(wood_c)
         self._baked_c = wood_c.copy()
         self._sky = seen(posed[:, :3]) if len(posed) else np.zeros(0, np.float32)
-        self.looks.sky = wp.array(self._sky, dtype=float, device=self.device)
+        self.materials.sky = wp.array(self._sky, dtype=float, device=self.device)
         step = max(0.2, float((high - low).max()) / 500.0)
         x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
         ground = seen(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1)).reshape(x.shape)
-        looks = self.looks
-        looks.rows = wp.vec2(*rows_of(self.model))
-        looks.ground_sky = wp.array(ground, dtype=float, device=self.device)
-        looks.ground_x, looks.ground_y, looks.ground_cell = float(low[0]), float(low[1]), float(step)
-        looks.blade, looks.noise, looks.soil = (
+        baked = self.materials
+        baked.rows = wp.vec2(*row_layout(self.model))
+        baked.ground_sky = wp.array(ground, dtype=float, device=self.device)
+        baked.ground_x, baked.ground_y, baked.ground_cell = float(low[0]), float(low[1]), float(step)
+        baked.leaf_texture, baked.noise_texture, baked.soil_texture = (
             wp.array(t, dtype=wp.vec4, device=self.device)
-            for t in (textures.blades(), textures.noise(), textures.soil())
+            for t in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
         )
-        self._baked = looks
+        self._baked_materials = baked
 
     # -- following the world
 
@@ -282,19 +293,19 @@ class Primitives:
         if everything:
             dirty = np.arange(len(self.cluster_first))
         else:
-            dirty = self._clusters_of(trees)
+            dirty = self._tree_clusters(trees)
             if len(changed):
                 dirty = np.union1d(dirty, np.flatnonzero(np.isin(self._cluster_bunch, changed)))
             link_q = np.asarray(view.link_q, np.float32).reshape(-1, 7)
-            if len(self.rigid_clusters) and not np.array_equal(self._poses[self._still + 1 :], link_q):
+            if len(self.rigid_clusters) and not np.array_equal(self._poses[self._static_carrier + 1 :], link_q):
                 dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
-            self._poses[: self._still] = view.body_q
-            self._poses[self._still + 1 :] = np.asarray(view.link_q, np.float32).reshape(-1, 7)
+            self._poses[: self._static_carrier] = view.body_q
+            self._poses[self._static_carrier + 1 :] = np.asarray(view.link_q, np.float32).reshape(-1, 7)
             self._pose(dirty)
         return dirty
 
-    def _clusters_of(self, trees: np.ndarray) -> np.ndarray:
+    def _tree_clusters(self, trees: np.ndarray) -> np.ndarray:
         """Clusters that ride on the given trees, without a loop over trees."""
         start, size = self._owner_start[trees], self._owner_start[trees + 1] - self._owner_start[trees]
         inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
@@ -315,11 +326,11 @@ class Primitives:
             outputs=[self.shapes.a, self.shapes.b, self.shapes.c, self.shapes.d, self.lower, self.upper, self.ball],
             device=self.device,
         )
-        self.version += 1
-        self.cluster_version[dirty] = self.version
+        self.pose_version += 1
+        self.cluster_version[dirty] = self.pose_version
 
 
-def still_view(model: Model, links: tuple[Link, ...] = (), link_q: np.ndarray | None = None) -> View:
+def rest_snapshot(model: Model, links: tuple[Link, ...] = (), link_q: np.ndarray | None = None) -> View:
     """A view of the vineyard at rest, for pictures and tests without physics."""
     return View(
         time=0.0,

@@ -7,12 +7,12 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.raster import camera_raster, ray_cast
-from vinesim.sensors.camera.camera import REACH
+from vinesim.sensors.camera.camera import MAX_DEPTH
 from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 
 
-def enclosing(primitives: Primitives, point: np.ndarray) -> int:
+def enclosing_primitive(primitives: Primitives, point: np.ndarray) -> int:
     """A solid primitive that holds a point [3] m, -1 if none does. Leaves and meshes hold nothing."""
     point = np.asarray(point, float)
     reach = primitives.ball.numpy()
@@ -26,11 +26,11 @@ def enclosing(primitives: Primitives, point: np.ndarray) -> int:
     held = np.zeros(len(which), bool)
     for number in np.unique(kind):
         mine = kind == number
-        held[mine] = _holds(int(number), a[mine], b[mine], c[mine], point)
+        held[mine] = _contains(int(number), a[mine], b[mine], c[mine], point)
     return int(which[held][0]) if held.any() else -1
 
 
-def _holds(kind: int, a: np.ndarray, b: np.ndarray, c: np.ndarray, point: np.ndarray) -> np.ndarray:
+def _contains(kind: int, a: np.ndarray, b: np.ndarray, c: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Whether primitives [k] of one kind hold a point (vectors as in :mod:`vinesim.kernels.raster.primitives`)."""
     away = point - a[:, :3]
     if kind == SPHEROID:
@@ -54,19 +54,19 @@ class RayCaster:
 
     def __init__(self, primitives: Primitives) -> None:
         self.primitives = primitives
-        self._built = self._version = -1
+        self._layout_version = self._pose_version = -1
         self._struct = ray_cast.Hierarchies()
         self._refit()
 
     def hierarchies(self) -> ray_cast.Hierarchies:
         """The hierarchies around the present poses."""
-        if self._version != self.primitives.version or self._built != self.primitives.built:
+        if self._pose_version != self.primitives.pose_version or self._layout_version != self.primitives.layout_version:
             self._refit()
         return self._struct
 
     def _refit(self) -> None:
         p = self.primitives
-        if self._built != p.built:
+        if self._layout_version != p.layout_version:
             split = p.plant_count
             constructor = "sah" if p.device == "cpu" else None
             lower, upper = (p.lower, p.upper) if split == p.count else (p.lower[:split], p.upper[:split])
@@ -79,9 +79,11 @@ class RayCaster:
             self._plants.refit()
             if self._rigid:
                 self._rigid.refit()
-        self._built, self._version = p.built, p.version
+        self._layout_version, self._pose_version = p.layout_version, p.pose_version
 
-    def cast(self, origin: np.ndarray, direction: np.ndarray, reach: float = REACH) -> tuple[np.ndarray, np.ndarray]:
+    def cast(
+        self, origin: np.ndarray, direction: np.ndarray, reach: float = MAX_DEPTH
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Distances [ray], in lengths of ``direction`` (inf: nothing is met), and primitives (-2 ground, -1 none)."""
         p = self.primitives
         direction = np.ascontiguousarray(direction, np.float32).reshape(-1, 3)
@@ -90,7 +92,7 @@ class RayCaster:
         distance = wp.empty(len(direction), dtype=float, device=p.device)
         primitive = wp.empty(len(direction), dtype=wp.int32, device=p.device)
         wp.launch(
-            ray_cast.cast,
+            ray_cast.cast_rays,
             len(direction),
             inputs=[p.shapes, self.hierarchies(), start, ray, float(reach)],
             outputs=[distance, primitive],
@@ -99,7 +101,7 @@ class RayCaster:
         found = primitive.numpy()
         return np.where(found == -1, np.inf, distance.numpy()), found
 
-    def see(self, lens: camera_raster.Pinhole) -> tuple[np.ndarray, np.ndarray]:
+    def cast_camera(self, lens: camera_raster.Pinhole) -> tuple[np.ndarray, np.ndarray]:
         """Depth [height, width] m (inf: nothing) and primitives [height, width] of a camera; as :meth:`cast`."""
         p, count = self.primitives, lens.width * lens.height
         depth = wp.empty(count, dtype=float, device=p.device)

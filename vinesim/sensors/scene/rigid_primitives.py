@@ -9,19 +9,19 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.kernels.shading import materials
-from vinesim.scene.appearance import smooth
+from vinesim.scene.appearance import smooth_normals
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import Link, Mesh, Shape
-from vinesim.sensors.scene.plant_primitives import Ripeness, bunches
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, batch
+from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches
+from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, make_batch
 
-_MESH_FACES = 4000
+_MAX_MESH_FACES = 4000
 """Most triangles of one mesh; finer ones are simplified."""
 
-_USUAL = {Organ.BOX: "plastic", Organ.HUMAN: "cloth"}
+_DEFAULT_SURFACE = {Organ.BOX: "plastic", Organ.HUMAN: "cloth"}
 """What things are made of that do not say so; robots are painted."""
-_MATERIAL = {
+_MATERIALS = {
     "paint": int(materials.PAINT),
     "plastic": int(materials.PLASTIC),
     "cloth": int(materials.CLOTH),
@@ -33,11 +33,11 @@ _MATERIAL = {
     "glass": int(materials.GLASS),
     "lamp": int(materials.LAMP),
 }
-_SMOOTH_STEPS = 2047
+_NORMAL_LEVELS = 2047
 """Levels of either coordinate of a packed normal."""
 
 
-def rigid(
+def rigid_batches(
     model: Model,
     links: tuple[Link, ...],
     first: int,
@@ -54,14 +54,14 @@ def rigid(
         if link.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
             place = shape[link.index]
             which, on = np.array([link.index]), np.full(len(place), first + k)
-            mine = bunches(model, which, [place], [on], np.array([groups + k]), ripeness)
+            mine = bunch_batches(model, which, [place], [on], np.array([groups + k]), ripeness)
             batches += [dataclasses.replace(b, bunch=np.full(len(b), -1)) for b in mine]
             continue
-        usual = _USUAL.get(link.organ, "paint")
+        usual = _DEFAULT_SURFACE.get(link.organ, "paint")
         name = label(link.organ, link.index)
         for piece in link.shapes:
             common = {
-                "material": _MATERIAL[piece.surface or usual],
+                "material": _MATERIALS[piece.surface or usual],
                 "tint": np.asarray(piece.rgba[:3]) ** 2.2,
                 "organ": int(link.organ),
                 "label": name,
@@ -80,39 +80,39 @@ def _rigid_shape(shape: Shape, common: dict) -> Batch:
         low, high = (size[0], size[1]) if shape.kind == "cone" else (size[0], size[0])
         half = frames.rotate(turn, np.array([0.0, 0.0, size[-1]]))
         kind = CYLINDER if shape.kind == "cylinder" else CONE
-        return batch(kind, [[*(centre - half), low]], b=[[*(centre + half), high]], **common)
+        return make_batch(kind, [[*(centre - half), low]], b=[[*(centre + half), high]], **common)
     if shape.kind == "sphere":
-        return batch(ELLIPSOID, [[*centre, size[0]]], b=[turn], c=[[size[0], size[0], 0, 0]], **common)
+        return make_batch(ELLIPSOID, [[*centre, size[0]]], b=[turn], c=[[size[0], size[0], 0, 0]], **common)
     if shape.kind in ("ellipsoid", "box"):
         kind = ELLIPSOID if shape.kind == "ellipsoid" else BOX
-        return batch(kind, [[*centre, size[0]]], b=[turn], c=[[size[1], size[2], 0, 0]], **common)
+        return make_batch(kind, [[*centre, size[0]]], b=[turn], c=[[size[1], size[2], 0, 0]], **common)
     if shape.kind == "mesh":
-        mesh = shape.mesh or _read(shape.file, tuple(size) if len(size) == 3 else (size[0],) * 3)
+        mesh = shape.mesh or _load_mesh(shape.file, tuple(size) if len(size) == 3 else (size[0],) * 3)
         corners = centre + frames.rotate(turn, mesh.corners)
-        normals = packed(frames.rotate(turn, mesh.normals))
+        normals = pack_normals(frames.rotate(turn, mesh.normals))
         a, b, c = (np.concatenate([corners[:, k], normals[:, k, None]], 1) for k in range(3))
-        return batch(TRIANGLE, a, b=b, c=c, **common)
+        return make_batch(TRIANGLE, a, b=b, c=c, **common)
     raise ValueError(
         f"shape kind {shape.kind!r} of a link is unknown; use capsule, cone, sphere, ellipsoid, box, cylinder or mesh"
     )
 
 
-def packed(normals: np.ndarray) -> np.ndarray:
-    """Unit vectors [..., 3] each in one float, as :func:`vinesim.kernels.shading.materials.unpacked` reads them.
+def pack_normals(normals: np.ndarray) -> np.ndarray:
+    """Unit vectors [..., 3] each in one float, as :func:`vinesim.kernels.shading.materials.unpack_normal` reads them.
 
     Octahedral (Meyer et al. 2010), two times eleven bits: exact to 0.001 rad.
     """
     flat = normals / np.maximum(np.abs(normals).sum(-1, keepdims=True), 1e-12)
     side = np.where(flat[..., :2] >= 0.0, 1.0, -1.0)
     folded = np.where(flat[..., 2:] < 0.0, (1.0 - np.abs(flat[..., 1::-1])) * side, flat[..., :2])
-    level = np.round((0.5 + 0.5 * folded) * (_SMOOTH_STEPS - 1))
-    return (1.0 + level[..., 0] + _SMOOTH_STEPS * level[..., 1]).astype(np.float32)
+    level = np.round((0.5 + 0.5 * folded) * (_NORMAL_LEVELS - 1))
+    return (1.0 + level[..., 0] + _NORMAL_LEVELS * level[..., 1]).astype(np.float32)
 
 
 _meshes: dict[tuple[str, tuple[float, ...]], Mesh] = {}
 
 
-def _read(file: str, scale: tuple[float, ...]) -> Mesh:
+def _load_mesh(file: str, scale: tuple[float, ...]) -> Mesh:
     """A mesh file [m], simplified by merging near vertices until it has few enough faces."""
     key = (file, scale)
     if key not in _meshes:
@@ -126,7 +126,7 @@ def _read(file: str, scale: tuple[float, ...]) -> Mesh:
             faces = faces[:, ::-1]
         extent = float(np.ptp(vertices, axis=0).max(initial=1e-6))
         cells = 256
-        while len(faces) > _MESH_FACES and cells > 8:
+        while len(faces) > _MAX_MESH_FACES and cells > 8:
             spot = np.floor(vertices / extent * cells).astype(np.int64)
             _, member = np.unique(spot, axis=0, return_inverse=True)
             member = member.reshape(-1)
@@ -135,5 +135,5 @@ def _read(file: str, scale: tuple[float, ...]) -> Mesh:
             linked = member[faces]
             whole = (linked[:, 0] != linked[:, 1]) & (linked[:, 1] != linked[:, 2]) & (linked[:, 0] != linked[:, 2])
             vertices, faces, cells = merged, linked[whole], int(cells * 0.75)
-        _meshes[key] = Mesh(vertices[faces].astype(np.float32), smooth(vertices, faces))
+        _meshes[key] = Mesh(vertices[faces].astype(np.float32), smooth_normals(vertices, faces))
     return _meshes[key]

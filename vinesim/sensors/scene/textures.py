@@ -12,13 +12,13 @@ import numpy as np
 
 from vinesim.scene import leaves
 
-GRASS, HERB = leaves.SHAPES, leaves.SHAPES + 1
+GRASS_OUTLINE, HERB_OUTLINE = leaves.SHAPE_COUNT, leaves.SHAPE_COUNT + 1
 """Numbers of the outlines that are not vine leaves: a tuft of grass, a broad weed."""
-OUTLINES = leaves.SHAPES + 2
-SIDE = 256
+OUTLINE_COUNT = leaves.SHAPE_COUNT + 2
+TEXTURE_SIZE = 256
 """Texels along each side of the tables."""
-_EDGE_SCALE = 400.0
-_SUPER = 4
+_DISTANCE_STEPS = 400.0
+_SUPERSAMPLING = 4
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -30,21 +30,23 @@ def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
 
 def leaf_scale(shape: np.ndarray) -> np.ndarray:
     """Length from petiole to tip in units of ``Model.leaf_size``, by outline [shape]."""
-    tips = np.array([leaves.outline(np.zeros(1), i)[0] for i in range(leaves.SHAPES)])
+    tips = np.array([leaves.blade_outline(np.zeros(1), i)[0] for i in range(leaves.SHAPE_COUNT)])
     return tips[shape]
 
 
-def _distance(mask: np.ndarray) -> np.ndarray:
+def _signed_distance(mask: np.ndarray) -> np.ndarray:
     """Signed distance to the edge of a finely sampled mask, positive inside [leaf units], [SIDE, SIDE]."""
     inside = mask.astype(np.uint8)
     pixels = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
-    return cv2.resize(pixels, (SIDE, SIDE), interpolation=cv2.INTER_AREA) * (2.0 / (SIDE * _SUPER))
+    return cv2.resize(pixels, (TEXTURE_SIZE, TEXTURE_SIZE), interpolation=cv2.INTER_AREA) * (
+        2.0 / (TEXTURE_SIZE * _SUPERSAMPLING)
+    )
 
 
-def _tuft() -> np.ndarray:
+def _grass_mask() -> np.ndarray:
     """Mask of a tuft of grass: bent blades that taper, rooted along the lower edge."""
     rng = np.random.default_rng(31)
-    side = SIDE * _SUPER
+    side = TEXTURE_SIZE * _SUPERSAMPLING
     mask = np.zeros((side, side), np.uint8)
     along = np.linspace(0.0, 1.0, 20)
     for _ in range(30):
@@ -60,23 +62,23 @@ def _tuft() -> np.ndarray:
 
 
 @functools.cache
-def outlines() -> tuple[np.ndarray, np.ndarray]:
+def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
     """Signed distances [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and octagons around them [outline, 8, 2]."""
-    u, v = _grid(SIDE * _SUPER)
+    u, v = _grid(TEXTURE_SIZE * _SUPERSAMPLING)
     theta, radius = np.arctan2(u, v), np.hypot(u, v)
-    table = np.zeros((OUTLINES, SIDE, SIDE))
+    table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE))
     knots = np.linspace(-np.pi, np.pi, 8193)
-    for shape in range(leaves.SHAPES):
-        edge = leaves.outline(knots, shape) / leaf_scale(shape)
-        table[shape] = _distance(radius < np.interp(theta, knots, edge))
-    table[GRASS] = _distance(_tuft())
-    table[HERB] = _distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
-    table = np.clip(table * _EDGE_SCALE, -127, 127).astype(np.int8)
+    for shape in range(leaves.SHAPE_COUNT):
+        edge = leaves.blade_outline(knots, shape) / leaf_scale(shape)
+        table[shape] = _signed_distance(radius < np.interp(theta, knots, edge))
+    table[GRASS_OUTLINE] = _signed_distance(_grass_mask())
+    table[HERB_OUTLINE] = _signed_distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
+    table = np.clip(table * _DISTANCE_STEPS, -127, 127).astype(np.int8)
     angle = (np.arange(8) + 0.5) * np.pi / 4.0
     normal = np.stack([np.sin(angle), np.cos(angle)], 1)
-    hull = np.zeros((OUTLINES, 8, 2), np.float32)
-    u, v = _grid(SIDE)
-    for shape in range(OUTLINES):
+    hull = np.zeros((OUTLINE_COUNT, 8, 2), np.float32)
+    u, v = _grid(TEXTURE_SIZE)
+    for shape in range(OUTLINE_COUNT):
         inside = table[shape] > -4
         reach = (np.stack([u[inside], v[inside]], 1) @ normal.T).max(0) + 0.012
         for k in range(8):
@@ -85,18 +87,18 @@ def outlines() -> tuple[np.ndarray, np.ndarray]:
     return table, hull
 
 
-def _blurred(rng: np.random.Generator, sigma: float) -> np.ndarray:
+def _smooth_noise(rng: np.random.Generator, sigma: float) -> np.ndarray:
     """Smooth noise of unit variance [SIDE, SIDE]."""
-    noise = cv2.GaussianBlur(rng.normal(size=(SIDE, SIDE)).astype(np.float32), (0, 0), sigma)
+    noise = cv2.GaussianBlur(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE)).astype(np.float32), (0, 0), sigma)
     return noise / noise.std()
 
 
 @functools.cache
-def blades() -> np.ndarray:
+def leaf_texture() -> np.ndarray:
     """Vein strength, relief slope along u and v, tone: [outline, SIDE/2, SIDE/2, 4] float32."""
-    u, v = _grid(SIDE)
-    table = np.zeros((OUTLINES, SIDE, SIDE, 4), np.float32)
-    for shape in range(leaves.SHAPES):
+    u, v = _grid(TEXTURE_SIZE)
+    table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE, 4), np.float32)
+    for shape in range(leaves.SHAPE_COUNT):
         rng = np.random.default_rng(71 + shape)
         vein, crease = np.zeros_like(u), np.zeros_like(u)
         for angle, length in ((0.0, 1.0), (54.0, 0.86), (-54.0, 0.86), (112.0, 0.62), (-112.0, 0.62)):
@@ -113,14 +115,14 @@ def blades() -> np.ndarray:
                     away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
                     vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
                     crease += 0.009 * np.exp(-((away / 0.03) ** 2))
-        fine, wide = _blurred(rng, 3.0), _blurred(rng, 8.0)
+        fine, wide = _smooth_noise(rng, 3.0), _smooth_noise(rng, 8.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
-        slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / SIDE)
+        slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / TEXTURE_SIZE)
         table[shape] = np.stack([np.maximum(vein, 0.25 * net), slope_u, slope_v, 0.5 + 0.2 * wide + 0.12 * fine], -1)
-    table[GRASS, ..., 3] = 0.5 + 0.5 * v
-    table[HERB, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
-    table[HERB, ..., 3] = 0.5
-    half = table.reshape(OUTLINES, SIDE // 2, 2, SIDE // 2, 2, 4).mean((2, 4))
+    table[GRASS_OUTLINE, ..., 3] = 0.5 + 0.5 * v
+    table[HERB_OUTLINE, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
+    table[HERB_OUTLINE, ..., 3] = 0.5
+    half = table.reshape(OUTLINE_COUNT, TEXTURE_SIZE // 2, 2, TEXTURE_SIZE // 2, 2, 4).mean((2, 4))
     return np.ascontiguousarray(half, np.float32)
 
 
@@ -131,32 +133,36 @@ def _segment(u: np.ndarray, v: np.ndarray, a: np.ndarray, b: np.ndarray) -> tupl
     return np.hypot(u - a[0] - along * d[0], v - a[1] - along * d[1]), along
 
 
-def _tileable(rng: np.random.Generator, lowest: float, power: float) -> np.ndarray:
+def _periodic_noise(rng: np.random.Generator, lowest: float, power: float) -> np.ndarray:
     """Periodic noise with a 1/f^power spectrum above a lowest frequency; zero mean, unit variance."""
-    cycles = np.fft.fftfreq(SIDE) * SIDE
+    cycles = np.fft.fftfreq(TEXTURE_SIZE) * TEXTURE_SIZE
     f = np.hypot(*np.meshgrid(cycles, cycles))
     gain = np.where(f >= lowest, 1.0 / np.maximum(f, lowest) ** power, 0.0)
-    field = np.fft.ifft2(np.fft.fft2(rng.normal(size=(SIDE, SIDE))) * gain).real
+    field = np.fft.ifft2(np.fft.fft2(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE))) * gain).real
     return field / field.std()
 
 
 @functools.cache
-def noise() -> np.ndarray:
+def noise_texture() -> np.ndarray:
     """Four octaves of periodic noise around 0.5, coarse to fine: [SIDE, SIDE, 4] float32 in 0..1."""
     rng = np.random.default_rng(17)
-    bands = [_tileable(rng, low, power) for low, power in ((1, 1.6), (3, 1.4), (10, 1.1), (30, 0.4))]
+    bands = [_periodic_noise(rng, low, power) for low, power in ((1, 1.6), (3, 1.4), (10, 1.1), (30, 0.4))]
     return np.clip(0.5 + 0.2 * np.stack(bands, -1), 0.0, 1.0).astype(np.float32)
 
 
 @functools.cache
-def soil() -> np.ndarray:
+def soil_texture() -> np.ndarray:
     """Clods, sod, slope along x and y of 1.25 m of ground: [SIDE, SIDE, 4] float32."""
     rng = np.random.default_rng(43)
-    clods = 0.55 * _tileable(rng, 3, 1.5) + 0.6 * np.abs(_tileable(rng, 4, 1.5)) + 0.35 * _tileable(rng, 20, 1.0)
-    sod = _tileable(rng, 25, 0.7)
-    straw = np.zeros((SIDE, SIDE), np.float32)
+    clods = (
+        0.55 * _periodic_noise(rng, 3, 1.5)
+        + 0.6 * np.abs(_periodic_noise(rng, 4, 1.5))
+        + 0.35 * _periodic_noise(rng, 20, 1.0)
+    )
+    sod = _periodic_noise(rng, 25, 0.7)
+    straw = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE), np.float32)
     for x, y, turn, length in zip(*rng.uniform(size=(4, 90)), strict=True):
-        start = np.array([x, y]) * SIDE
+        start = np.array([x, y]) * TEXTURE_SIZE
         step = (6.0 + 14.0 * length) * np.array([np.cos(np.pi * turn), np.sin(np.pi * turn)])
         cv2.line(straw, *(tuple(map(int, p)) for p in (start, start + step)), 1.0, 1, cv2.LINE_AA)
     height = 0.5 * clods + 0.35 * sod
@@ -170,12 +176,12 @@ SKY_ROWS, SKY_COLUMNS = 512, 1024
 
 
 @functools.cache
-def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
+def _sky_layers() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
     """What of the sky no sun changes: the share of cloud, and layers in front of it, each a colour and a share."""
-    height, azimuth = _directions()
+    height, azimuth = _sky_directions()
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
-    cover = sample(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
+    cover = sample_noise(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
     cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55
     turns = azimuth / (2.0 * np.pi)
     layers = []
@@ -183,29 +189,31 @@ def _scenery() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
         (np.array([0.36, 0.47, 0.62]), 0.045, 0.085, 2.0),
         (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
     ):
-        ridge = base + rise * (sample(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35)
+        ridge = base + rise * (
+            sample_noise(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35
+        )
         layers.append((tone, smoothstep(0.004, -0.004, height - ridge)))
-    crowns = 0.014 + 0.020 * sample(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
-    leafy = sample(turns * 20.0, height * 8.0, slice(2, 3))
+    crowns = 0.014 + 0.020 * sample_noise(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
+    leafy = sample_noise(turns * 20.0, height * 8.0, slice(2, 3))
     trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
     layers.append((trees, smoothstep(0.004, -0.004, height - crowns)))
     return cloud, tuple(layers)
 
 
-def _directions() -> tuple[np.ndarray, np.ndarray]:
+def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
     """Sine of elevation and azimuth [rad] of the sky's table."""
     height = (np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2) * np.ones((1, SKY_COLUMNS))
     return height, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
 
 
 @functools.lru_cache(maxsize=4)
-def sky(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
+def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
     """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
 
     Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
     hills in the haze.
     """
-    (height, azimuth), (cloud, layers) = _directions(), _scenery()
+    (height, azimuth), (cloud, layers) = _sky_directions(), _sky_layers()
     flat = np.sqrt(1.0 - height**2)
     x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
     horizon = np.exp(-5.5 * height)[..., None]
@@ -219,13 +227,13 @@ def sky(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, floa
     return colour.astype(np.float32)
 
 
-def sample(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
+def sample_noise(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
     """Noise at positions of period 1, bilinear [..., 4], or some octaves of it."""
-    table, fx, fy = noise()[..., octaves], (x % 1.0) * SIDE, (y % 1.0) * SIDE
-    i, j = fx.astype(int) % SIDE, fy.astype(int) % SIDE
+    table, fx, fy = noise_texture()[..., octaves], (x % 1.0) * TEXTURE_SIZE, (y % 1.0) * TEXTURE_SIZE
+    i, j = fx.astype(int) % TEXTURE_SIZE, fy.astype(int) % TEXTURE_SIZE
     ax, ay = (fx % 1.0)[..., None], (fy % 1.0)[..., None]
-    upper = table[j, i] * (1.0 - ax) + table[j, (i + 1) % SIDE] * ax
-    lower = table[(j + 1) % SIDE, i] * (1.0 - ax) + table[(j + 1) % SIDE, (i + 1) % SIDE] * ax
+    upper = table[j, i] * (1.0 - ax) + table[j, (i + 1) % TEXTURE_SIZE] * ax
+    lower = table[(j + 1) % TEXTURE_SIZE, i] * (1.0 - ax) + table[(j + 1) % TEXTURE_SIZE, (i + 1) % TEXTURE_SIZE] * ax
     return upper * (1.0 - ay) + lower * ay
 
 

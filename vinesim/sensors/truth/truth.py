@@ -2,7 +2,7 @@
 
 All of it follows from the primitives, not from the picture: noise and range limits of a camera change nothing here.
 Everything is tied to ids that are the same on every client: bunch numbers of the model, and berry numbers as
-:func:`vinesim.scene.berries.berries` counts them.
+:func:`vinesim.scene.berries.lay_out_berries` counts them.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraInfo, View
 from vinesim.sensors.camera import point_cloud
-from vinesim.sensors.camera.camera import Visibility, pinhole
+from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
 from vinesim.sensors.scene.primitive_batches import CONE, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.ray_caster import RayCaster
 
-BERRY_PIXELS = 4
+MIN_BERRY_PIXELS = 4
 """A berry is seen if at least so many pixels show it."""
 
 Box = tuple[int, int, int, int]
@@ -31,7 +31,7 @@ Box = tuple[int, int, int, int]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Sighting:
+class Detection:
     """One bunch in one picture."""
 
     bunch: int
@@ -44,7 +44,7 @@ class Sighting:
     """Median depth [m] of the pixels that measured; NaN if none did."""
 
 
-def bunches(frame: CameraFrame) -> tuple[Sighting, ...]:
+def detect_bunches(frame: CameraFrame) -> tuple[Detection, ...]:
     """Every bunch of which at least one pixel is seen, by index."""
     rows, columns = np.nonzero(frame.labels // LABEL_STRIDE == int(Organ.BUNCH))
     index = frame.labels[rows, columns] % LABEL_STRIDE
@@ -57,7 +57,7 @@ def bunches(frame: CameraFrame) -> tuple[Sighting, ...]:
         depth = frame.depth[r, c]
         depth = depth[np.isfinite(depth)]
         sightings.append(
-            Sighting(
+            Detection(
                 int(index[first]),
                 int(last - first),
                 (int(c.min()), int(r.min()), int(c.max()), int(r.max())),
@@ -68,7 +68,7 @@ def bunches(frame: CameraFrame) -> tuple[Sighting, ...]:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Look:
+class PixelBuffers:
     """What every pixel of an ideal pinhole camera sees at one instant."""
 
     info: CameraInfo
@@ -82,34 +82,36 @@ class Look:
     """[height, width] int32, :func:`vinesim.scene.ids.label`."""
     berries: np.ndarray
     """[height, width] int32, number of the berry in its bunch; -1 where none is seen."""
-    carriers: np.ndarray
+    carrier_poses: np.ndarray
     """[primitive, 7] poses of what carries the primitives, for :func:`flow`."""
-    built: int
+    layout_version: int
     """:attr:`Primitives.built`: only numbers of the same set of primitives mean the same."""
 
 
-def look(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -> Look:
+def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -> PixelBuffers:
     """Look from ``pose`` [7] (optical frame) through a pinhole."""
-    seen = Visibility(info.width, info.height, primitives.device)
+    seen = CameraRasterizer(info.width, info.height, primitives.device)
     seen.draw(primitives, pinhole(info, pose))
     primitive, depth, labels = (
         a.numpy().reshape(info.height, info.width).copy() for a in (seen.primitive, seen.depth, seen.labels)
     )
     depth[primitive == -1] = np.inf
     numbers = np.append(_berry_numbers(primitives), [-1, -1])  # so that -1 and -2 find no berry
-    everything = primitives.carriers(np.arange(primitives.count))
-    return Look(info, np.array(pose, float), primitive, depth, labels, numbers[primitive], everything, primitives.built)
+    everything = primitives.carrier_poses(np.arange(primitives.count))
+    return PixelBuffers(
+        info, np.array(pose, float), primitive, depth, labels, numbers[primitive], everything, primitives.layout_version
+    )
 
 
-def _shown(primitives: Primitives) -> np.ndarray:
+def _primitives_shown(primitives: Primitives) -> np.ndarray:
     """Whether each primitive is there [primitive]."""
-    return np.repeat(primitives.shown(), primitives.cluster_size)
+    return np.repeat(primitives.clusters_shown(), primitives.cluster_size)
 
 
 def _berry_numbers(primitives: Primitives) -> np.ndarray:
     """Number of the berry in its bunch [primitive], -1 for all that is no berry."""
     kind = np.repeat(primitives.cluster_kind, primitives.cluster_size)
-    fruit = np.flatnonzero((kind == SPHEROID) & (primitives.organ == int(Organ.BUNCH)) & _shown(primitives))
+    fruit = np.flatnonzero((kind == SPHEROID) & (primitives.organ == int(Organ.BUNCH)) & _primitives_shown(primitives))
     bunch = primitives.label[fruit]
     starts = np.flatnonzero(np.diff(bunch, prepend=-1))
     numbers = np.full(primitives.count, -1, np.int32)
@@ -183,20 +185,20 @@ class BunchTruth:
         return whole
 
 
-def of_bunches(
-    primitives: Primitives, view: View, seen: Look, caster: RayCaster | None = None
+def bunch_truths(
+    primitives: Primitives, view: View, seen: PixelBuffers, caster: RayCaster | None = None
 ) -> tuple[BunchTruth, ...]:
     """Every bunch of which some pixel would be seen if it were alone, by index.
 
     ``primitives`` as they were posed by ``view`` when ``seen`` was taken; ``caster`` saves building one.
     """
     model, info = primitives.model, seen.info
-    alone, lens = Visibility(info.width, info.height, primitives.device), pinhole(info, seen.pose)
+    alone, lens = CameraRasterizer(info.width, info.height, primitives.device), pinhole(info, seen.pose)
     caster = caster or RayCaster(primitives)
     named = primitives.label[primitives.cluster_first]
     fruit = np.flatnonzero(named // LABEL_STRIDE == int(Organ.BUNCH))
-    fruit = fruit[np.isin(named[fruit], named[fruit][alone.distances(primitives, lens)[fruit] < float(FAR)])]
-    fruit = fruit[primitives.shown()[fruit]]
+    fruit = fruit[np.isin(named[fruit], named[fruit][alone.cluster_distances(primitives, lens)[fruit] < float(FAR)])]
+    fruit = fruit[primitives.clusters_shown()[fruit]]
     count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
     posed = [getattr(primitives.shapes, k).numpy() for k in "ab"]
     loose = {one.index: k for k, one in enumerate(view.links) if one.organ == Organ.BUNCH}
@@ -205,11 +207,11 @@ def of_bunches(
         for bunch in np.unique(named[fruit] % LABEL_STRIDE)
         if view.bunch_attached[bunch]
     }
-    clear = _unhidden(caster, seen.pose[:3], cuts)
+    clear = _visible_cut_points(caster, seen.pose[:3], cuts)
     found = []
     for bunch in np.unique(named[fruit] % LABEL_STRIDE).tolist():
         mine = fruit[named[fruit] % LABEL_STRIDE == bunch]
-        whole = alone.alone(primitives, lens, mine)
+        whole = alone.coverage(primitives, lens, mine)
         rows, columns = np.flatnonzero(whole.any(1)), np.flatnonzero(whole.any(0))
         if not len(rows):
             continue
@@ -230,7 +232,7 @@ def of_bunches(
         pixel = None
         if attached:
             local = frames.rotate(frames.conjugate(seen.pose[3:]), cuts[bunch] - seen.pose[:3])
-            pixel = point_cloud.project(local, info) if local[2] > 0.0 else None
+            pixel = point_cloud.project_points(local, info) if local[2] > 0.0 else None
         found.append(
             BunchTruth(
                 bunch=bunch,
@@ -241,7 +243,7 @@ def of_bunches(
                 amodal=whole[window].copy(),
                 visible=visible,
                 visible_box=_box_of(visible, box),
-                berries_seen=int((count[parts] >= BERRY_PIXELS).sum()),
+                berries_seen=int((count[parts] >= MIN_BERRY_PIXELS).sum()),
                 berries=int(model.bunch_berries[bunch]),
                 frame=frame,
                 size=size,
@@ -269,14 +271,14 @@ def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:
     return pose[:3] + frames.rotate(pose[3:], np.array([along, 0.0, 0.0]))
 
 
-def flow(first: Look, second: Look) -> tuple[np.ndarray, np.ndarray]:
+def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray, np.ndarray]:
     """How the surface points of one picture move to another: of the camera, of the plants, or of both.
 
     Displacement [height, width, 2] of each pixel's point, columns and rows [px], exact for the point that its ray
     meets and that then moves with what carries it; NaN for the sky and for what has come behind the camera. And
     whether the second picture shows the same primitive there [height, width].
     """
-    if first.built != second.built:
+    if first.layout_version != second.layout_version:
         raise ValueError("things came or went between the two looks; flow needs the same ones in both")
     info, other = first.info, second.info
     v, u = np.nonzero(np.isfinite(first.depth))
@@ -284,13 +286,13 @@ def flow(first: Look, second: Look) -> tuple[np.ndarray, np.ndarray]:
     local = np.stack([(u - info.cx) / info.fx * z, (v - info.cy) / info.fy * z, z], 1)
     point = first.pose[:3] + frames.rotate(first.pose[3:], local)
     solid = primitive >= 0  # the ground stays
-    before, after = (one.carriers[primitive[solid]] for one in (first, second))
+    before, after = (one.carrier_poses[primitive[solid]] for one in (first, second))
     attached = frames.rotate(frames.conjugate(before[:, 3:]), point[solid] - before[:, :3])
     moved = point.copy()
     # as a difference, so that what did not move does not move by a rounding either
     still = frames.rotate(before[:, 3:], attached) + before[:, :3]
     moved[solid] += frames.rotate(after[:, 3:], attached) + after[:, :3] - still
-    there = point_cloud.project(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
+    there = point_cloud.project_points(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
     shift = np.full((info.height, info.width, 2), np.nan)
     shift[v, u] = there - np.stack([u, v], 1)
     shown = np.zeros((info.height, info.width), bool)
@@ -301,7 +303,7 @@ def flow(first: Look, second: Look) -> tuple[np.ndarray, np.ndarray]:
     return shift, shown
 
 
-def _unhidden(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
+def _visible_cut_points(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
     """Bunches between whose cut point and the eye there is nothing but their own peduncle."""
     if not points:
         return set()
