@@ -48,9 +48,7 @@ class Physics:
             max_rate=p.max_joint_rate, fault_rate=p.fault_joint_rate,
         )  # fmt: skip
         self.rigid = Rigid(model, parameters=p)
-        self.contact_solver = ContactSolver(
-            model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
-        )
+        self.contact_solver = ContactSolver(model, self.plants, self.rigid)
         self.parting = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
         self.holding = Holding(self.plants, self.rigid, self.contact_solver)
         self.riding = Riding(self.rigid)

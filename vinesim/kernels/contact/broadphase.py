@@ -64,7 +64,7 @@ def geom_aabbs(
     # out
     states_out: GeomStates,
 ):
-    """Motion of one geom's centre, and its box, grown by how far it can come in the step."""
+    """One thread per geom: motion of its centre, and its box, grown by how far it can come in the step."""
     g = wp.tid()
     rotation = rigid.xmat[geoms.id[g]]
     center = rigid.xpos[geoms.id[g]] + rotation * geoms.center[g]
@@ -126,7 +126,10 @@ def tree_aabbs(
     wood_boxes_out: Aabbs,
     tree_boxes_out: Aabbs,
 ):
-    """Put the capsules of one tree into the world and find their boxes, that of the tree, and that of its wood."""
+    """One thread per tree: capsules in the world, their boxes, that of the tree, and that of its wood.
+
+    Thread i takes the tree ``trees.awake[order[i]]``.
+    """
     tree = trees.awake[order[wp.tid()]]
     is_fine = trees.is_fine[tree]
     dt = wp.float32(parameters.dt)
@@ -171,7 +174,7 @@ def actor_aabbs(
     # out
     actor_boxes_out: Aabbs,
 ):
-    """Find the box around one actor; an empty one for a box or a free bunch that does not move."""
+    """One thread per actor: the box around it; an empty one for a box or a free bunch that does not move."""
     actor = wp.tid()
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
@@ -195,7 +198,7 @@ def block_aabbs(
     # out
     block_boxes_out: Aabbs,
 ):
-    """Find the box around the boxes of one block."""
+    """One thread per block of 32 boxes: the box around them. Thread i takes the block ``blocks[i]``."""
     block = blocks[wp.tid()]
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
@@ -219,7 +222,10 @@ def mark_near_trees(
     # out
     is_near_out: wp.array(dtype=wp.bool),
 ):
-    """Mark those trees of one block whose box a geom of an actor overlaps; a remote actor counts at remote trees only."""
+    """One thread per block: mark those of its trees whose box a geom of an actor overlaps.
+
+    A remote actor counts at remote trees only.
+    """
     block = wp.tid()
     for actor in range(actors.start.shape[0] - 1):
         actor_low = actor_boxes.low[actor]

@@ -46,9 +46,7 @@ def solve_rigid_row(
         i = end - 1 - k
         for e in range(factors.row_start[i], factors.row_start[i] + factors.row_count[i] - 1):
             j = factors.column[e]
-            response_out[row, j] = (
-                response_out[row, j] - factor_entry(is_implicit, e, factors) * response_out[row, i]
-            )
+            response_out[row, j] = response_out[row, j] - factor_entry(is_implicit, e, factors) * response_out[row, i]
     for i in range(first, end):
         pivot = factors.plain_inverse[i]
         if is_implicit:
@@ -74,7 +72,11 @@ def inverse_mass_times_jacobian(
     # out
     rows_out: Rows,
 ):
-    """Find M^-1 j for one row j: of all plant bodies in contact, and of one kinematic tree if it is unconstrained."""
+    """One thread per row j: M^-1 j of all plant bodies in contact, and of one kinematic tree if it is unconstrained.
+
+    ``body_response`` [6 body, 6 body]: change of velocity of a plant body in contact for a unit impulse on another. The
+    rigid response was zeroed before.
+    """
     row = wp.tid()
     c = row // 3
     at = 6 * contacts.body_slot[c]
@@ -113,7 +115,7 @@ def assemble_delassus(
     # out
     rows_out: Rows,
 ):
-    """Write one row of the Delassus matrix: entries of the contacts of its island; the others are never read."""
+    """One thread per row of the Delassus matrix: entries of the contacts of its island; the others are never read."""
     row = wp.tid()
     c = row // 3
     at = 6 * contacts.body_slot[c]

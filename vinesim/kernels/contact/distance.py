@@ -174,9 +174,7 @@ def on_same_face(closest: wp.vec4d, other: wp.vec4d, tolerance: wp.float64):
 
 
 @wp.func
-def interval_along_face(
-    kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64, tolerance: wp.float64
-):
+def interval_along_face(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64, tolerance: wp.float64):
     """Both ends (0 to 1) of the part of a segment along a primitive's face about its closest point ``t``.
 
     They are the same if it crosses the face. What lies along a face needs two contacts: with one, it rocks about it from

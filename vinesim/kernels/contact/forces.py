@@ -18,7 +18,7 @@ def store_warm_start(
     contacts_out: Contacts,
     warm_start_out: WarmStart,
 ):
-    """Turn one contact's impulse into a force on the plant, and keep what the next step starts from."""
+    """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
     c = wp.tid()
     n = 3 * c
     axes = contacts_out.axes[c]
@@ -57,7 +57,7 @@ def accumulate_wrenches(
     # out
     wrench_out: wp.array2d(dtype=wp.float64),
 ):
-    """Add up the wrenches [N, N m] of all contacts on one plant body."""
+    """One thread per plant body in contact: the sum of the wrenches [N, N m] of all contacts on it."""
     body = wp.tid()
     for k in range(6):
         wrench_out[body, k] = wp.float64(0.0)

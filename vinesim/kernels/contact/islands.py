@@ -33,7 +33,7 @@ def compact_candidates(
     contacts_out: Contacts,
     counters_out: wp.array(dtype=wp.int32),
 ):
-    """List the candidates of all trees one after the other; what exceeds the capacity is only counted."""
+    """One thread in all: list the candidates of all trees; what exceeds the capacity is only counted."""
     slots = candidates.feature.shape[1]
     count = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
     overflow = int(0)  # noqa: RUF046
@@ -122,7 +122,7 @@ def build_islands(
     contacts_out: Contacts,
     islands_out: Islands,
 ):
-    """Number the plant bodies in contact, sorted, each once, and part the contacts into islands."""
+    """One thread in all: number the plant bodies in contact, sorted, each once; part the contacts into islands."""
     contact_count = counters_out[CONTACTS]
     slots = candidates.feature.shape[1]
     body_count = int(0)  # noqa: RUF046

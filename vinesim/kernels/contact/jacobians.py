@@ -46,7 +46,12 @@ def write_plant_row(
 
 @wp.func
 def write_rigid_row(
-    row: int, last_dof: int, axis: wp.vec3d, arm: wp.vec3d, rigid: RigidBodies, jacobian_out: wp.array2d(dtype=wp.float64)
+    row: int,
+    last_dof: int,
+    axis: wp.vec3d,
+    arm: wp.vec3d,
+    rigid: RigidBodies,
+    jacobian_out: wp.array2d(dtype=wp.float64),
 ):
     """Write a row of the rigid world's Jacobian; returns the geom's free velocity along it [m/s]."""
     velocity = wp.float64(0.0)
@@ -100,7 +105,7 @@ def write_contact_rows(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """Write the three rows of one contact; the rigid Jacobian was zeroed before."""
+    """One thread per contact: its three rows. The rigid Jacobian was zeroed before."""
     c = wp.tid()
     slots = candidates.feature.shape[1]
     tree_row = contacts_out.source[c] // slots

@@ -136,7 +136,10 @@ def find_plant_contacts(
     # out
     candidates_out: Candidates,
 ):
-    """Find the contacts of one awake tree with itself and with the trees behind it in the order of their boxes."""
+    """One thread per awake tree: its contacts with itself and with the trees behind it in the order of their boxes.
+
+    Thread i takes the place ``order[i]`` in that order: the row ``sorted_rows[order[i]]`` of the candidates.
+    """
     place = order[wp.tid()]
     row = sorted_rows[place]
     tree = trees.awake[row]
@@ -148,7 +151,9 @@ def find_plant_contacts(
         other = trees.awake[sorted_rows[other_place]]
         if tree_boxes.low[other][axis] > tree_boxes.high[tree][axis]:
             break
-        if not aabbs_disjoint(tree_boxes.low[tree], tree_boxes.high[tree], tree_boxes.low[other], tree_boxes.high[other]):
+        if not aabbs_disjoint(
+            tree_boxes.low[tree], tree_boxes.high[tree], tree_boxes.low[other], tree_boxes.high[other]
+        ):
             low = wp.max(tree_boxes.low[tree], tree_boxes.low[other])
             high = wp.min(tree_boxes.high[tree], tree_boxes.high[other])
             for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
@@ -180,9 +185,7 @@ def find_plant_contacts(
                             radii = capsules.radius[s] + capsules.radius[t]
                             margin = radii + skin + (capsule_states.speed[s] + capsule_states.speed[t]) * dt
                             if nearest[3] < wp.float64(margin):
-                                candidate = plant_candidate(
-                                    parameters, s, t, nearest, bodies, capsules, capsule_states
-                                )
+                                candidate = plant_candidate(parameters, s, t, nearest, bodies, capsules, capsule_states)
                                 if candidate.exists:
                                     if candidate.is_impact:
                                         candidates_out.is_impact[row] = True

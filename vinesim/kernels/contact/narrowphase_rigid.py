@@ -225,7 +225,10 @@ def find_rigid_contacts(
     # out
     candidates_out: Candidates,
 ):
-    """Find the contacts of one awake tree and rigid geoms, in the order of (capsule, geom, end)."""
+    """One thread per awake tree: its contacts with rigid geoms, in the order of (capsule, geom, end).
+
+    Thread i takes the tree ``trees.awake[order[i]]`` and writes the row ``order[i]`` of the candidates.
+    """
     row = order[wp.tid()]
     tree = trees.awake[row]
     near_count = list_near_geoms(
@@ -247,7 +250,9 @@ def find_rigid_contacts(
             for k in range(near_count):
                 g = candidates_out.near_geoms[row, k]
                 center = geom_states.center[g]
-                margin = parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
+                margin = (
+                    parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
+                )
                 between = middle - center
                 limit = bound + geoms.radius[g] + margin
                 overlap = not aabbs_disjoint(

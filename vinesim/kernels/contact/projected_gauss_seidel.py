@@ -31,7 +31,12 @@ def row_residual(
     r = velocity_free[row] + bias[row] + compliance * impulse[row]
     for m in range(first, last):
         i = 3 * island_contact[m]
-        r = r + delassus[row, i] * impulse[i] + delassus[row, i + 1] * impulse[i + 1] + delassus[row, i + 2] * impulse[i + 2]
+        r = (
+            r
+            + delassus[row, i] * impulse[i]
+            + delassus[row, i + 1] * impulse[i + 1]
+            + delassus[row, i + 2] * impulse[i + 2]
+        )
     return r
 
 
@@ -123,10 +128,12 @@ def solve_islands(
     islands_out: Islands,
     rows_out: Rows,
 ):
-    """Solve one island from the guess in ``impulse`` on."""
-    # Contacts that depend on each other (two fingers about a bunch) slow Gauss-Seidel down: within a few sweeps it finds
-    # which contacts stick, slide or open, and takes a hundred for the rest. So small islands take a Newton step after
-    # every other sweep, at first. If these do not settle, sweeps alone go on from where they began.
+    """One thread per island: solve it from the guess in ``impulse`` on.
+
+    Contacts that depend on each other (two fingers about a bunch) slow Gauss-Seidel down: within a few sweeps it finds
+    which contacts stick, slide or open, and takes a hundred for the rest. So small islands take a Newton step after
+    every other sweep, at first. If these do not settle, sweeps alone go on from where they began.
+    """
     island = wp.tid()
     first = islands_out.start[island]
     last = islands_out.start[island + 1]
