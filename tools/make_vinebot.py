@@ -33,6 +33,9 @@ COLOURS = {
 }
 """Lamps shine, rubber, steel and glass look like it, all else is painted: sensors go by these words."""
 
+ROUNDING_ERROR = 1e-12
+"""Largest size of a value [m, rad, kg m2] that is taken for rounding, which differs between processors."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
@@ -195,8 +198,8 @@ class Urdf:
 
 
 def numbers(*values: float) -> str:
-    """Numbers as URDF writes them, to twelve digits, without a negative zero."""
-    return " ".join(f"{value + 0.0:.12g}" for value in values)
+    """Numbers as URDF writes them, to twelve digits; what is left of a sum that should be zero is written as 0."""
+    return " ".join(f"{value:.12g}" if abs(value) > ROUNDING_ERROR else "0" for value in values)
 
 
 def vinebot() -> str:

@@ -152,10 +152,10 @@ def test_the_same_image_has_the_same_noise_and_no_other_has() -> None:
     def depth(**others) -> np.ndarray:
         return _see(_wall(1.5), **others).depth
 
-    first = depth(seed=3, image=7)
-    assert np.array_equal(first, depth(seed=3, image=7))
-    assert not np.array_equal(first, depth(seed=3, image=8))
-    assert not np.array_equal(first, depth(seed=4, image=7))
+    first = depth(seed=3, image_index=7)
+    assert np.array_equal(first, depth(seed=3, image_index=7))
+    assert not np.array_equal(first, depth(seed=3, image_index=8))
+    assert not np.array_equal(first, depth(seed=4, image_index=7))
     primitives, _ = sensor_scenes.world(_wall(1.5))
     camera = Camera(SPEC, INFO, "camera", seed=3, image_index=6)
     camera.render(primitives, sensor_scenes.AHEAD)

@@ -18,7 +18,7 @@ from vinesim.physics.contact.impulse_solver import ImpulseSolver
 from vinesim.physics.contact.plant_capsules import nearest_body, plant_capsules
 from vinesim.physics.contact.scene_arrays import PlantArrays, RigidArrays, kernel_parameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.model import Model
 from vinesim.scene.values import Contact
 
@@ -27,7 +27,7 @@ class ContactSolver:
     """Contacts between the plants and the rigid world of one step.
 
     ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to; ``solve()`` (after it)
-    leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.finish()``.
+    leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
 
     Robots, people, boxes and free bunches wake the trees that they are near to. Static geoms (ground, poles, trunks) and
     other plants only hold back what moves already. What overlaps in the scene as generated is in contact only beyond
@@ -35,7 +35,7 @@ class ContactSolver:
     ``dropped_contacts`` and ``overflow_message`` report it.
     """
 
-    def __init__(self, model: Model, plants: ArticulationSolver, rigid: Rigid) -> None:
+    def __init__(self, model: Model, plants: ArticulationSolver, rigid: RigidWorld) -> None:
         self.model, self.plants, self.rigid, self.parameters = model, plants, rigid, rigid.parameters
         self.capsules = plant_capsules(model)
         self.plant_plant_contacts = True

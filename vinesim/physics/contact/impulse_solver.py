@@ -16,7 +16,7 @@ from vinesim.physics.contact.scene_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.shared_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 
 REMOVED_GEOM = np.iinfo(np.int32).max
 """Number that a warm start keeps for a geom that is gone."""
@@ -28,7 +28,7 @@ class ImpulseSolver:
     def __init__(
         self,
         plants: ArticulationSolver,
-        rigid: Rigid,
+        rigid: RigidWorld,
         arrays: PlantArrays,
         parameters: PhysicsParameters,
         kernel_parameters: structs.Parameters,
@@ -70,7 +70,7 @@ class ImpulseSolver:
             for k, geom in enumerate(other[: self.warm_start.count[0]].tolist()):
                 if geom >= 0:
                     other[k] = at.get(previous.names[geom], REMOVED_GEOM)
-        size = (3 * self.capacity, self.rigid.world.nv)
+        size = (3 * self.capacity, self.rigid.mj_model.nv)
         self.rows = SharedArrays(
             structs.Rows, rigid_jacobian=np.zeros(size), rigid_response=np.zeros(size), **self._row_arrays
         )
@@ -83,7 +83,7 @@ class ImpulseSolver:
     def solve(self, count: int, counters: np.ndarray) -> None:
         """Find the impulses of the first ``count`` contacts, and what they do to either side."""
         n, row_count, rows = count, 3 * count, self.rows
-        self.rigid_arrays.bodies.tree_island[:] = self.rigid.group
+        self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._build_islands(1)
         touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
         self.bodies = bodies = self._touched_bodies[:touched].copy()
@@ -94,10 +94,10 @@ class ImpulseSolver:
 
         self._body_response[:touched, :, :touched] = self.plants.impulse_response(bodies)
         geom_bodies = self.rigid_arrays.geoms.body[self.contacts.other[:n].clip(0)]
-        is_constrained = counters[structs.IS_CONSTRAINED] = self.rigid.bound(geom_bodies)
+        is_constrained = counters[structs.IS_CONSTRAINED] = self.rigid.is_constrained(geom_bodies)
         self._inverse_mass_times_jacobian(row_count)
         if is_constrained:
-            rigid_response[:] = self.rigid.inverse(rigid_jacobian).T
+            rigid_response[:] = self.rigid.impulse_response(rigid_jacobian).T
         self._assemble_delassus(row_count)
         self._solve_islands(island_count)
         self.sweeps, self.island_count = int(self.islands.sweeps[:island_count].max()), island_count

@@ -13,7 +13,7 @@ from vinesim.physics.contact.plant_capsules import PlantCapsules
 from vinesim.physics.contact.shared_arrays import SharedArrays
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.model import Model
 
 
@@ -78,10 +78,10 @@ class PlantArrays:
 class RigidArrays:
     """Geoms and degrees of freedom of the rigid world, from one recompilation or listing of it to the next."""
 
-    def __init__(self, rigid: Rigid, remote_actors: set[str], previous: RigidArrays | None) -> None:
+    def __init__(self, rigid: RigidWorld, remote_actors: set[str], previous: RigidArrays | None) -> None:
         """``previous``: where the velocities of the last step are taken from, by the names of degrees of freedom."""
-        world, data = rigid.world, rigid.data
-        listed = self.listed = concatenate(rigid.geoms, rigid.standing)
+        world, data = rigid.mj_model, rigid.mj_data
+        listed = self.listed = concatenate(rigid.geoms, rigid.static_geoms)
         self.count, self.movable = len(listed.id), len(rigid.geoms.id)
         self.names = persistent_names(listed)
         fields = {f.name: getattr(listed, f.name) for f in dataclasses.fields(RigidGeoms)}
@@ -133,9 +133,9 @@ class RigidArrays:
             plain_inverse=data.qLDiagInv,
         )
 
-    def begin_step(self, rigid: Rigid) -> None:
+    def begin_step(self, rigid: RigidWorld) -> None:
         """Take over the free velocities of the coming step, and what plants changed in the last one."""
         bodies = self.bodies
         bodies.correction_before[:] = bodies.correction
-        np.subtract(rigid.data.qvel, bodies.velocity_free, out=bodies.correction)
+        np.subtract(rigid.mj_data.qvel, bodies.velocity_free, out=bodies.correction)
         bodies.velocity_free[:] = rigid.velocity_free

@@ -48,7 +48,9 @@ mat3 = ti.types.matrix(3, 3, ti.f32)
 Table = ti.types.ndarray(dtype=vec4, ndim=1)
 Placed = ti.types.struct(a=vec4, b=vec4, c=vec4, d=vec4)
 """A primitive in the optical frame; boxes and ellipsoids keep two axes in b and c, with a half size beside each."""
-Lens = ti.types.struct(eye=vec3, turn=mat3, focal=vec2, centre=vec2, size=vec2, reach=ti.f32, close=ti.f32)
+Lens = ti.types.struct(
+    eye=vec3, rotation=mat3, focal=vec2, centre=vec2, size=vec2, max_depth=ti.f32, near_radius=ti.f32
+)
 Bound = ti.types.struct(box=vec4, rising=vec3, falling=vec3, depth=ti.f32)
 """Box: lowest and highest x, lowest and highest y [pixel]; strips: slope, low, high; no point of it is nearer [m]."""
 EMPTY_BOUNDS, UNBOUNDED_STRIP = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND), vec3(0.0, -UNBOUND, UNBOUND)
@@ -400,12 +402,12 @@ def lens_of(view: ti.template()):
     """The camera out of one array: a struct of vectors costs Taichi a millisecond a launch."""
     return Lens(
         eye=vec3(view[0], view[1], view[2]),
-        turn=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
+        rotation=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
         focal=vec2(view[12], view[13]),
         centre=vec2(view[14], view[15]),
         size=vec2(view[16], view[17]),
-        reach=view[18],
-        close=view[19],
+        max_depth=view[18],
+        near_radius=view[19],
     )
 
 
