@@ -13,6 +13,7 @@ import time
 import pytest
 import zenoh
 
+from tests.support.waiting import wait
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Fact, Hello, Welcome
 from vinesim.net.counters import Counters
@@ -25,13 +26,6 @@ from vinesim.net.transport.bus import EVERY, NameTaken, Refused
 from vinesim.net.transport.endpoints import chosen
 from vinesim.net.transport.zenoh_bus import ZenohBus, close_session, config, open_session
 from vinesim.scene.ids import Kind, thing
-
-
-def wait(condition, what: str) -> None:
-    end = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for: {what}"
-        time.sleep(0.002)
 
 
 def test_a_free_port_is_chosen_and_reported():
@@ -85,7 +79,7 @@ def test_run_returns_when_stopped():
         thread.start()
         assert thread.is_alive()
         server.stop()
-        thread.join(timeout=10.0)
+        thread.join(timeout=60.0)
         assert not thread.is_alive()
     server.close()
 
