@@ -25,7 +25,7 @@ from rich.table import Table
 
 from vinesim.client.recording import touch_plot
 from vinesim.client.recording.trace import Rows, remote_error
-from vinesim.robot.description.description import SensorMount
+from vinesim.robot.description.sidecar import SensorMount
 from vinesim.ros import ros_setup
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
@@ -141,7 +141,7 @@ def process_group() -> Iterator[list[Process]]:
 
 def run(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
     """Run the demo and write ``out``; 0 if all went well."""
-    from vinesim.robot.description.description import load_description as load_robot
+    from vinesim.robot.description.loader import load_description as load_robot
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
 
@@ -209,7 +209,7 @@ def run_job(
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     from vinesim.client.tasks.tasks import UnknownTask
-    from vinesim.robot.description.description import load_description as load_robot
+    from vinesim.robot.description.loader import load_description as load_robot
     from vinesim.scene.spec import load_scene, with_seed
 
     if job not in JOBS:

@@ -66,7 +66,7 @@ def run(
     from vinesim.client.tasks.start_poses import start_pose, validate_bunch, with_start_pose
     from vinesim.client.tasks.tasks import DriveTo, LookAt, plan_task, validate_task_name
     from vinesim.net.transport.bus import MemoryHub
-    from vinesim.robot.description.description import load_description as load_robot
+    from vinesim.robot.description.loader import load_description as load_robot
     from vinesim.robot.tasks.push import PushBunch
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
