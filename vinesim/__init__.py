@@ -1,3 +1,113 @@
-"""vinesim: soft vines and grapes, where robots and people meet."""
+"""vinesim: a simulator of soft vines and grapes that robots, people and sensors meet.
+
+    import vinesim
+
+    simulation = vinesim.Simulation("demo")
+    robot = simulation.add_robot("vinebot", pose=(1.5, -1.0, 1.57))
+    simulation.step(100)
+
+Every name below is loaded when it is first used; ``import vinesim`` alone takes milliseconds.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from vinesim import frames as frames
+    from vinesim.api.client import Client as Client
+    from vinesim.api.energy import Energy as Energy
+    from vinesim.api.energy import Momentum as Momentum
+    from vinesim.api.recording import RecordedMessage as RecordedMessage
+    from vinesim.api.recording import Recording as Recording
+    from vinesim.api.sensors import Camera as Camera
+    from vinesim.api.sensors import Lidar as Lidar
+    from vinesim.api.sensors import look_at as look_at
+    from vinesim.api.simulation import Simulation as Simulation
+    from vinesim.errors import UsageError as UsageError
+    from vinesim.net.server.server import Server as Server
+    from vinesim.robot.drives import Robot as Robot
+    from vinesim.scene.cane import CaneBuilder as CaneBuilder
+    from vinesim.scene.cane import assemble as assemble
+    from vinesim.scene.cane import cane as cane
+    from vinesim.scene.generation.vineyard import generate as generate
+    from vinesim.scene.ids import Organ as Organ
+    from vinesim.scene.ids import unlabel as unlabel
+    from vinesim.scene.model import Model as Model
+    from vinesim.scene.physics_parameters import PhysicsParameters as PhysicsParameters
+    from vinesim.scene.spec import Scene as Scene
+    from vinesim.scene.spec import load_scene as load_scene
+    from vinesim.scene.state import State as State
+
+_MODULES = {
+    "CaneBuilder": "scene.cane",
+    "Camera": "api.sensors",
+    "Client": "api.client",
+    "Energy": "api.energy",
+    "Lidar": "api.sensors",
+    "Model": "scene.model",
+    "Momentum": "api.energy",
+    "Organ": "scene.ids",
+    "PhysicsParameters": "scene.physics_parameters",
+    "RecordedMessage": "api.recording",
+    "Recording": "api.recording",
+    "Robot": "robot.drives",
+    "Scene": "scene.spec",
+    "Server": "net.server.server",
+    "Simulation": "api.simulation",
+    "State": "scene.state",
+    "UsageError": "errors",
+    "assemble": "scene.cane",
+    "cane": "scene.cane",
+    "frames": "frames",
+    "generate": "scene.generation.vineyard",
+    "load_scene": "scene.spec",
+    "look_at": "api.sensors",
+    "unlabel": "scene.ids",
+}
+"""Module of each public name, below this package."""
+
+__all__ = [
+    "Camera",
+    "CaneBuilder",
+    "Client",
+    "Energy",
+    "Lidar",
+    "Model",
+    "Momentum",
+    "Organ",
+    "PhysicsParameters",
+    "RecordedMessage",
+    "Recording",
+    "Robot",
+    "Scene",
+    "Server",
+    "Simulation",
+    "State",
+    "UsageError",
+    "__version__",
+    "assemble",
+    "cane",
+    "frames",
+    "generate",
+    "load_scene",
+    "look_at",
+    "unlabel",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first used."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'vinesim' has no attribute {name!r}; it offers {', '.join(__all__)}")
+    module = importlib.import_module(f"vinesim.{_MODULES[name]}")
+    value = module if _MODULES[name] == name else getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

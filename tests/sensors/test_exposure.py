@@ -12,7 +12,7 @@ PLAIN = np.ones(3)
 class _Lamps:
     """Primitives of which number 7 shines."""
 
-    lamps = np.array([7])
+    lamp_primitives = np.array([7])
 
 
 def _exposed(of: Exposure) -> float:
@@ -73,8 +73,8 @@ def test_samples_are_averaged_as_light() -> None:
     assert np.array_equal(mixed, _even(0.2, 16, 16, fixed=1.0).tone_map(PLAIN, 0.0).numpy())
 
 
-def test_a_lamp_has_a_halo_and_nothing_else_has() -> None:
-    """The halo falls off with distance, is even in all directions, and its light is the share that a lens scatters."""
+def test_a_lamp_has_glare_and_nothing_else_has() -> None:
+    """The glare falls off with distance, is even in all directions, and its light is the share that a lens scatters."""
     import warp as wp
 
     film = Exposure(161, 161, fixed=1.0)
@@ -89,5 +89,5 @@ def test_a_lamp_has_a_halo_and_nothing_else_has() -> None:
     around[20, 20] = 0.0
     assert around[80, 84] > around[80, 90] > around[80, 100] > 0.0
     assert around[80, 90] == pytest.approx(around[90, 80], rel=1e-4)
-    assert around.sum() == pytest.approx(50.0 * sum(strength for _, strength in exposure._HALO), rel=0.02)
+    assert around.sum() == pytest.approx(50.0 * sum(strength for _, strength in exposure._GLARE), rel=0.02)
     assert (light[..., 0] == 0.0).sum() == 161 * 161 - 1

@@ -10,7 +10,8 @@ from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors import spec_file
-from vinesim.sensors.camera.camera import Camera, CameraSpec, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.spec_file import SensorError
 
 SPEC = CameraSpec.load("d435")
@@ -152,10 +153,10 @@ def test_the_same_image_has_the_same_noise_and_no_other_has() -> None:
     def depth(**others) -> np.ndarray:
         return _see(_wall(1.5), **others).depth
 
-    first = depth(seed=3, image=7)
-    assert np.array_equal(first, depth(seed=3, image=7))
-    assert not np.array_equal(first, depth(seed=3, image=8))
-    assert not np.array_equal(first, depth(seed=4, image=7))
+    first = depth(seed=3, image_index=7)
+    assert np.array_equal(first, depth(seed=3, image_index=7))
+    assert not np.array_equal(first, depth(seed=3, image_index=8))
+    assert not np.array_equal(first, depth(seed=4, image_index=7))
     primitives, _ = sensor_scenes.world(_wall(1.5))
     camera = Camera(SPEC, INFO, "camera", seed=3, image_index=6)
     camera.render(primitives, sensor_scenes.AHEAD)

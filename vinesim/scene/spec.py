@@ -151,8 +151,11 @@ class Scene(_Part, frozen=True, kw_only=True):
     """Parameters that differ from their defaults; they are not part of the vineyard's digest."""
 
 
-def load_scene(path_or_name: str | pathlib.Path) -> Scene:
-    """The scene in a file, or the one of that name in ``data/scenes``; :class:`SceneError` in one line otherwise."""
+def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Scene:
+    """The scene in a file, or the one of that name in ``data/scenes``; :class:`SceneError` in one line otherwise.
+
+    ``seed`` replaces the file's: the same layout with other vines.
+    """
     try:
         path = find_data_file("scenes", str(path_or_name), ".toml")
     except DataFileNotFound as missing:
@@ -161,7 +164,7 @@ def load_scene(path_or_name: str | pathlib.Path) -> Scene:
     trouble = _find_error(scene)
     if trouble:
         raise SceneError(f"{path}: {trouble}")
-    return scene
+    return with_seed(scene, seed)
 
 
 def _find_error(scene: Scene) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.sidecar import SensorMount
 from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, Wrench
@@ -16,10 +16,10 @@ from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, Wrenc
 class BodySensors:
     """Force-torque sensors and IMUs of one robot, at the frames that its description names."""
 
-    def __init__(self, rigid: Rigid, name: str, description: RobotDescription) -> None:
+    def __init__(self, rigid: RigidWorld, name: str, description: RobotDescription) -> None:
         self._rigid, self._name, self._description = rigid, name, description
         for mount in (*description.wrenches, *description.imus):
-            rigid.instrument(name, mount.frame)
+            rigid.add_link_sensor(name, mount.frame)
         self._distal_links = {mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches}
 
     def wrenches(self, time: float, contacts: Sequence[Contact]) -> tuple[Wrench, ...]:
@@ -31,7 +31,7 @@ class BodySensors:
         return tuple(self._imu(mount, time) for mount in self._description.imus)
 
     def _wrench(self, mount: SensorMount, time: float, contacts: Sequence[Contact]) -> Wrench:
-        wrench = self._rigid.wrench(self._name, mount.frame)
+        wrench = self._rigid.link_wrench(self._name, mount.frame)
         distal = [contact for contact in contacts if contact.link in self._distal_links[mount.frame]]
         if distal:
             pose = self._rigid.link_pose(self._name, mount.frame)
@@ -44,8 +44,8 @@ class BodySensors:
 
     def _imu(self, mount: SensorMount, time: float) -> Imu:
         orientation = self._rigid.link_pose(self._name, mount.frame)[3:]
-        angular_velocity = self._rigid.angular_velocity(self._name, mount.frame)
-        acceleration = self._rigid.acceleration(self._name, mount.frame)[3:]
+        angular_velocity = self._rigid.link_angular_velocity(self._name, mount.frame)
+        acceleration = self._rigid.link_acceleration(self._name, mount.frame)[3:]
         return Imu(time, mount.name, mount.frame, orientation, angular_velocity, acceleration)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.drives.commands import CommandInterface
 from vinesim.scene.values import Drive
 
@@ -29,7 +29,7 @@ MIN_DIVISOR = 1e-9
 class JointServos:
     """The servos of one robot's driven joints; all arrays are [joint], in the order of ``drives``."""
 
-    def __init__(self, rigid: Rigid, name: str, drives: Sequence[Drive]) -> None:
+    def __init__(self, rigid: RigidWorld, name: str, drives: Sequence[Drive]) -> None:
         """``name``: the robot's in ``rigid``."""
         self._rigid, self._name, self._drives = rigid, name, tuple(drives)
         self.lower_limit = np.array([drive.lower for drive in drives])
@@ -57,7 +57,7 @@ class JointServos:
 
     def hold(self) -> None:
         """Drop all commands: position control at the present positions. Gains and effort limits stay."""
-        self.setpoint = self._rigid.read(self._name)[0].copy()
+        self.setpoint = self._rigid.joint_measurements(self._name)[0].copy()
         """[joint] position that the servos are asked for [rad or m]"""
         self.interface = np.full(len(self.setpoint), CommandInterface.POSITION)
         """[joint] :class:`CommandInterface` by which each was commanded last"""
@@ -105,7 +105,7 @@ class JointServos:
         """Carry the set-points over from links to motors or back, so that nothing jumps."""
         before = self.interface[joints] == CommandInterface.MOTOR_POSITION
         if before.any() or interface == CommandInterface.MOTOR_POSITION:
-            position, _, effort, _ = self._rigid.read(self._name)
+            position, _, effort, _ = self._rigid.joint_measurements(self._name)
             motor = position + effort / self.series_stiffness
             self.setpoint[joints] = np.where(
                 before == (interface == CommandInterface.MOTOR_POSITION),
@@ -121,7 +121,7 @@ class JointServos:
         """Pass the set-points of the coming step to the servos in the physics."""
         if self._gains_changed:
             self._prepare_interfaces()
-        position, velocity = self._rigid.state(self._name)
+        position, velocity = self._rigid.joint_state(self._name)
         rate = self._advance_setpoints(position, velocity)
         if self._gains_changed or self._gains_vary:
             is_limited, damping = self._speed_limiters(velocity)
@@ -156,7 +156,7 @@ class JointServos:
         wanted = (self._command - start) / dt
         wanted[self._velocity_joints] = self._command[self._velocity_joints]
         # Nor may the set-point accelerate faster than the drive can: a saturated servo would exceed the velocity.
-        gain = self._max_impulse / np.maximum(self._rigid.inertia(self._name), MIN_DIVISOR)
+        gain = self._max_impulse / np.maximum(self._rigid.joint_inertia(self._name), MIN_DIVISOR)
         slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.max_velocity)
         fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.max_velocity)
         rate = np.clip(wanted, slowest, fastest)
@@ -189,8 +189,8 @@ class JointServos:
         """Give the servos in the physics the gains and efforts that the interfaces ask for."""
         in_effort, in_motor_position = self._in_effort, self._in_motor_position
         damping = np.where(in_motor_position, self._series_damping, self._damping)
-        effort = np.where(in_motor_position, -self._rigid.weight(self._name), 0.0)
-        self._rigid.tune(
+        effort = np.where(in_motor_position, -self._rigid.gravity_effort(self._name), 0.0)
+        self._rigid.set_gains(
             self._name,
             np.where(in_effort, 0.0, self._active_stiffness),
             np.where(is_limited, limiter_damping, np.where(in_effort, 0.0, damping)),

@@ -26,14 +26,14 @@ class RemoteRobot(RobotInstance):
                 f"{self.name}: update has {update.position.size} joints, its description {count}; "
                 "load the same robot on both clients"
             )
-        here, _ = self.rigid.base(self.name)
+        here, _ = self.rigid.base_state(self.name)
         if np.linalg.norm(update.base_q[:3] - here[:3]) > self.TELEPORT_DISTANCE:
             self._teleport(update, here)
-        self.rigid.follow(self.name, update.base_q, update.base_qd, update.position, update.velocity)
+        self.rigid.follow_remote(self.name, update.base_q, update.base_qd, update.position, update.velocity)
 
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
         """Place the copy at the update's state; ``here`` [7]: where its base is."""
         if abs(update.base_q[2] - here[2]) > 1e-3:  # the base joint is planar: another height needs a new body
             self.rigid.remove_robot(self.name)
             self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))
-        self.rigid.place(self.name, update.base_q, update.position)
+        self.rigid.place_robot(self.name, update.base_q, update.position)

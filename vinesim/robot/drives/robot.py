@@ -17,7 +17,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.plants.detachment import Blade
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.body_sensors import BodySensors, elastic_sample
@@ -36,7 +36,7 @@ class Robot(RobotInstance):
 
     def __init__(
         self,
-        rigid: Rigid,
+        rigid: RigidWorld,
         description: RobotDescription,
         name: str = "",
         index: int = 0,
@@ -71,7 +71,7 @@ class Robot(RobotInstance):
         """Give the robot the cutters of its description, to cut plants in ``physics``."""
         self._physics = physics
         for cutter in self.description.cutters:
-            blade = physics.blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
+            blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
             self._cutters.setdefault(cutter.group, []).append(blade)
 
     def remove(self) -> None:
@@ -189,7 +189,7 @@ class Robot(RobotInstance):
         """Pass the set-points of the step that starts at ``time`` [s] to the physics; call it before the step."""
         self._servos.update()
         self._drive_base(time)
-        self._odometry(self.rigid.base(self.name)[0])
+        self._odometry(self.rigid.base_state(self.name)[0])
 
     def _drive_base(self, time: float) -> None:
         """Accelerate the base towards its commanded velocity, or towards standing once the command has lapsed."""
@@ -197,7 +197,7 @@ class Robot(RobotInstance):
         goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
         change = self.rigid.dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
         self._base_velocity += np.clip(goal - self._base_velocity, -change, change)
-        self.rigid.drive_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
+        self.rigid.command_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """State of the robot at ``time`` [s], wrenches, IMUs and series elastic elements included."""
@@ -211,6 +211,6 @@ class Robot(RobotInstance):
 
     def update(self, time: float) -> RobotUpdate:
         """What other clients receive: actual joint states, never commands."""
-        position, velocity, _, _ = self.rigid.read(self.name)
-        base_q, base_qd = self.rigid.base(self.name)
+        position, velocity, _, _ = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)

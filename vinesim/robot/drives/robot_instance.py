@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.odometry import TrackOdometry
 from vinesim.scene.values import Contact, JointSample, RobotSample
@@ -18,7 +18,7 @@ class RobotInstance:
 
     def __init__(
         self,
-        rigid: Rigid,
+        rigid: RigidWorld,
         description: RobotDescription,
         name: str = "",
         index: int = 0,
@@ -51,8 +51,8 @@ class RobotInstance:
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """State of the robot at ``time`` [s]; of ``contacts`` only its own are kept."""
-        position, velocity, effort, contact = self.rigid.read(self.name)
-        base_q, base_qd = self.rigid.base(self.name)
+        position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
         return RobotSample(
             actor=self.name,
             joints=JointSample(time, self.description.joints, position, velocity, effort, contact),

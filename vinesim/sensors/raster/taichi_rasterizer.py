@@ -13,7 +13,6 @@ import contextlib
 import functools
 import io
 import os
-from typing import TYPE_CHECKING
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # standard output belongs to the command
 
@@ -24,10 +23,16 @@ from taichi.math import clamp, cross, dot, length, vec2, vec3, vec4
 
 from vinesim.kernels.raster import camera_raster
 from vinesim.kernels.raster import primitives as shapes
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
-
-if TYPE_CHECKING:
-    from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.raster.primitive_arrays import (
+    BOX,
+    CONE,
+    CYLINDER,
+    ELLIPSOID,
+    LEAF,
+    SPHEROID,
+    TRIANGLE,
+    PosedPrimitives,
+)
 
 FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.NEAR_DEPTH)
 EMPTY, SMOOTH_SIZE, TEXELS = (
@@ -48,7 +53,9 @@ mat3 = ti.types.matrix(3, 3, ti.f32)
 Table = ti.types.ndarray(dtype=vec4, ndim=1)
 Placed = ti.types.struct(a=vec4, b=vec4, c=vec4, d=vec4)
 """A primitive in the optical frame; boxes and ellipsoids keep two axes in b and c, with a half size beside each."""
-Lens = ti.types.struct(eye=vec3, turn=mat3, focal=vec2, centre=vec2, size=vec2, reach=ti.f32, close=ti.f32)
+Lens = ti.types.struct(
+    eye=vec3, rotation=mat3, focal=vec2, centre=vec2, size=vec2, max_depth=ti.f32, near_radius=ti.f32
+)
 Bound = ti.types.struct(box=vec4, rising=vec3, falling=vec3, depth=ti.f32)
 """Box: lowest and highest x, lowest and highest y [pixel]; strips: slope, low, high; no point of it is nearer [m]."""
 EMPTY_BOUNDS, UNBOUNDED_STRIP = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND), vec3(0.0, -UNBOUND, UNBOUND)
@@ -400,12 +407,12 @@ def lens_of(view: ti.template()):
     """The camera out of one array: a struct of vectors costs Taichi a millisecond a launch."""
     return Lens(
         eye=vec3(view[0], view[1], view[2]),
-        turn=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
+        rotation=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
         focal=vec2(view[12], view[13]),
         centre=vec2(view[14], view[15]),
         size=vec2(view[16], view[17]),
-        reach=view[18],
-        close=view[19],
+        max_depth=view[18],
+        near_radius=view[19],
     )
 
 
@@ -483,7 +490,7 @@ class TaichiRasterizer:
         self._pixels: list = []
 
     def rasterize(
-        self, primitives: "Primitives", lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
+        self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
@@ -501,7 +508,7 @@ class TaichiRasterizer:
             _draw_kernel(number, KEY)(*tables, *clusters_of, eye, *_CORES, pixels, self._number)
 
     def _rasterize_on_gpu(
-        self, primitives: "Primitives", lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
+        self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
         """On a GPU: depths, then numbers; what has not moved stays there."""
         if self._of != (primitives, primitives.pose_version):
@@ -543,7 +550,7 @@ def _pinhole_values(lens: camera_raster.Pinhole) -> np.ndarray:
     return np.concatenate([np.array(lens.eye), np.array(lens.rotation).ravel(), others]).astype(np.float32)
 
 
-def _visible_clusters(primitives: "Primitives", lens: camera_raster.Pinhole) -> np.ndarray:
+def _visible_clusters(primitives: PosedPrimitives, lens: camera_raster.Pinhole) -> np.ndarray:
     """Clusters of which a pixel may see something, near ones first [k]."""
     ball = primitives.ball.numpy()
     r = ball[:, 3]

@@ -1,0 +1,123 @@
+"""A client in Python: joins a vineyard as a robot, steps, leaves.
+
+with Client("demo", "vinebot", connect="tcp/127.0.0.1:7447", name="picker") as client:
+    client.robot.command_base(0.3, 0.0, client.time)
+    client.run(2.0)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pathlib
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from vinesim.api.simulation import base_pose
+from vinesim.client.client import Client as RobotClient
+from vinesim.client.tasks.start_poses import start_pose
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.physics.step import Physics
+from vinesim.robot.description import description
+from vinesim.robot.drives import Robot
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene, load_scene
+
+
+class Client:
+    """One robot in a shared vineyard. A context manager; :meth:`close` leaves the world."""
+
+    def __init__(
+        self,
+        scene: Scene | str | pathlib.Path,
+        robot: str | pathlib.Path = "vinebot",
+        *,
+        name: str,
+        connect: str | None = None,
+        pose: Sequence[float] | np.ndarray | None = None,
+        spawn: int = 0,
+        certificates: pathlib.Path | None = None,
+    ) -> None:
+        """Join.
+
+        Args:
+            scene: the same for all clients of a world, seed included.
+            robot: name of one in ``data/robots``, or the path of a URDF file.
+            name: unique name of this actor in the world.
+            connect: endpoint of the server such as ``tcp/127.0.0.1:7447``; alone in a world of its own unless given.
+            pose: (x, y, yaw) in m and rad, or [7] of the base; a start place of the scene unless given.
+            spawn: number of that start place.
+            certificates: folder of this actor's certificate, for a server with TLS.
+
+        Raises:
+            NameTaken: an actor of this name is there. Refused: the server said no. Both name the remedy.
+        """
+        self.scene: Scene = scene if isinstance(scene, Scene) else load_scene(scene)
+        self.model: Model = generate(self.scene)
+        described = description.load(robot)
+        place = start_pose(self.scene, spawn) if pose is None else base_pose(pose)
+        self._stack = contextlib.ExitStack()
+        with contextlib.ExitStack() as stack:
+            bus: Any
+            if connect is None:
+                bus = stack.enter_context(MemoryHub().bus(name))
+            else:
+                from vinesim.net.transport.zenoh_bus import ZenohBus
+
+                bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=certificates))
+            executor = stack.enter_context(ThreadPoolExecutor(1, "spawner"))
+            self._client = RobotClient(self.scene, self.model, described, bus, name=name, pose=place, executor=executor)
+            stack.callback(self._client.leave)
+            self._stack = stack.pop_all()
+
+    @property
+    def robot(self) -> Robot:
+        """The robot that this client moves."""
+        return self._client.robot
+
+    @property
+    def physics(self) -> Physics:
+        """This client's copy of the world."""
+        return self._client.physics
+
+    @property
+    def time(self) -> float:
+        """[s] Simulated since this client joined."""
+        return self._client.physics.time
+
+    @property
+    def remote_actors(self) -> tuple[str, ...]:
+        """Names of the actors of other clients that are in this client's world, sorted."""
+        return tuple(sorted(self._client.remote_actors))
+
+    def actor_pose(self, name: str) -> np.ndarray:
+        """Pose [7] of the base of this client's robot or of a remote one; ``KeyError`` if there is none of that name."""
+        if name != self._client.name and name not in self._client.remote_actors:
+            raise KeyError(f"no actor {name!r}; there are: {', '.join((self._client.name, *self.remote_actors))}")
+        return self._client.physics.rigid.base_state(name)[0]
+
+    def step(self, count: int = 1) -> None:
+        """Advance by ``count`` steps of 10 ms at once: receive, control, step, sense, send. It does not wait."""
+        for _ in range(count):
+            self._client.tick()
+
+    def run(self, seconds: float) -> None:
+        """Step in real time for so long."""
+        begin, dt = time.monotonic(), self._client.physics.dt
+        for number in range(round(seconds / dt)):
+            self.step()
+            time.sleep(max(begin + (number + 1) * dt - time.monotonic(), 0.0))
+
+    def close(self) -> None:
+        """Leave the world; further calls do nothing."""
+        self._stack.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,94 @@
+"""Energy and momentum of plants, from their state alone: for checks, plots and learning."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Energy:
+    """Energy of plants [J]."""
+
+    kinetic: float
+    elastic: float
+    """Of joint springs and of ties to wires; 0 where all are slack."""
+    gravitational: float
+    """Of the height of the centres of mass above z = 0."""
+
+    @property
+    def total(self) -> float:
+        """[J] Sum of the three."""
+        return self.kinetic + self.elastic + self.gravitational
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Momentum:
+    """Momentum of plants, world axes."""
+
+    linear: np.ndarray
+    """[3] kg m/s"""
+    angular: np.ndarray
+    """[3] kg m^2/s about the origin of the world."""
+
+
+def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None = None) -> Energy:
+    """Energy of some trees [k] (all unless given); ``gravity`` [m/s^2]. Poses and velocities must be up to date.
+
+    Kinetic: sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic: k theta^2 / 2 about each joint axis, where
+    theta is the rotation vector of the joint, and k d^2 / 2 of each tie.
+    """
+    model, state = plants.model, plants.state
+    bodies = _moving_bodies(plants, trees)
+    mass, com, velocity, omega, inertia = _motion(plants, bodies)
+    kinetic = 0.5 * float(mass @ (velocity**2).sum(1) + np.einsum("bi,bij,bj->", omega, inertia, omega))
+    turned = frames.log(state.joint_q[bodies].astype(float))
+    elastic = 0.5 * float((plants.joint_stiffness[bodies] * turned**2).sum())
+    ties = np.flatnonzero(np.isin(model.tie_body, bodies))
+    pose = state.body_q[model.tie_body[ties]].astype(float)
+    away = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[ties].astype(float)) - plants.tie_anchor[ties]
+    elastic += 0.5 * float(plants.tie_stiffness[ties] @ (away**2).sum(1))
+    return Energy(kinetic, elastic, gravity * float(mass @ com[:, 2]))
+
+
+def momentum(plants: ArticulationSolver, trees: np.ndarray | None = None) -> Momentum:
+    """Linear and angular momentum of some trees [k] (all unless given). Poses and velocities must be up to date."""
+    mass, com, velocity, omega, inertia = _motion(plants, _moving_bodies(plants, trees))
+    impulse = mass[:, None] * velocity
+    spin = np.cross(com, impulse) + np.einsum("bij,bj->bi", inertia, omega)
+    return Momentum(impulse.sum(0), spin.sum(0))
+
+
+def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.ndarray:
+    """Bodies [k] that move for themselves; fused berry clusters are part of the body of their bunch."""
+    model = plants.model
+    size = np.where(plants.state.tree_fine, model.tree_size, model.tree_core)
+    number = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
+    moving = number < size[model.body_tree]
+    if trees is not None:
+        moving &= np.isin(model.body_tree, trees)
+    return np.flatnonzero(moving)
+
+
+def _motion(plants: ArticulationSolver, bodies: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Mass [k], centre of mass [k, 3], its velocity [k, 3], angular velocity [k, 3], inertia [k, 3, 3]; world axes."""
+    pose, speed = plants.state.body_q[bodies].astype(float), plants.state.body_qd[bodies].astype(float)
+    arm = frames.rotate(pose[:, 3:], plants.body_com[bodies].astype(float))
+    velocity = speed[:, :3] + np.cross(speed[:, 3:], arm)
+    own = np.zeros((len(bodies), 3, 3))
+    for axis in range(3):
+        own[:, axis, axis] = plants.body_inertia[bodies, axis]
+        one, two = (axis + 1) % 3, (axis + 2) % 3
+        own[:, one, two] = own[:, two, one] = plants.body_product[bodies, axis]
+    turn = frames.to_matrix(pose[:, 3:])
+    return (
+        plants.body_mass[bodies].astype(float),
+        pose[:, :3] + arm,
+        velocity,
+        speed[:, 3:],
+        turn @ own @ turn.swapaxes(1, 2),
+    )

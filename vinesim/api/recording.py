@@ -1,0 +1,66 @@
+"""MCAP recordings of a world, read message by message.
+
+for message in Recording("harvest.mcap"):
+    print(message.time, message.actor, message.key, message.data)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+from vinesim.net.recording import mcap_file
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RecordedMessage:
+    """One message of a recording."""
+
+    time: float
+    """[s] since the first message."""
+    actor: str
+    """Name of the client's actor that sent it; empty for the server."""
+    key: str
+    """Key that it was published on."""
+    data: dict[str, Any]
+    """What it says, as JSON values; ``raw`` holds its bytes in base64."""
+
+
+class Recording:
+    """A recording that ``vinesim record`` wrote, open for reading."""
+
+    def __init__(self, path: str | pathlib.Path) -> None:
+        """Read the file; :class:`~vinesim.net.recording.mcap_file.NotARecording` if it is none."""
+        self._tape = mcap_file.read(pathlib.Path(path))
+
+    @property
+    def info(self) -> dict[str, str]:
+        """What the recorder knew: release, protocol, world, scene, seed, digest."""
+        return dict(self._tape.about)
+
+    @property
+    def actors(self) -> list[str]:
+        """Names of all actors that were in the world, sorted."""
+        return self._tape.actors
+
+    @property
+    def duration(self) -> float:
+        """[s] from the first message to the last."""
+        return self._tape.length if self._tape.entries else 0.0
+
+    @property
+    def damage(self) -> str:
+        """Empty, or in one line why the file is shorter than it should be; all messages before that can be read."""
+        return self._tape.damage
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self._tape.entries)
+
+    def __iter__(self) -> Iterator[RecordedMessage]:
+        """All messages in the order of time."""
+        for entry in self._tape.entries:
+            data = mcap_file.said(entry.key, entry.payload)
+            yield RecordedMessage(entry.time - self._tape.start, mcap_file.sender_of(entry.key), entry.key, data)

@@ -1,0 +1,127 @@
+"""Cameras and lidars that look at a simulation: from a pose, or from a frame of a robot.
+
+frame = Camera("d435").render(simulation, look_at((1.0, -1.0, 1.5), (0.0, 0.0, 1.2)))
+scan = Lidar("vlp16").scan(simulation, robot=robot)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vinesim.api.simulation import Simulation, base_pose
+from vinesim.errors import UsageError
+from vinesim.robot.drives import Robot
+from vinesim.scene.values import CameraFrame, CameraInfo, LidarScan
+from vinesim.sensors.camera import camera as rgbd
+from vinesim.sensors.camera.sunlight import DEFAULT_SUN
+from vinesim.sensors.export import dataset, images
+from vinesim.sensors.lidar import lidar
+
+
+class Camera:
+    """An RGB-D camera of a kind in ``data/cameras``, or of a file."""
+
+    def __init__(
+        self,
+        kind: str = "d435",
+        *,
+        size: tuple[int, int] | None = None,
+        quality: str = "full",
+        name: str = "camera",
+        seed: int = 0,
+    ) -> None:
+        """A camera that is not mounted yet.
+
+        Args:
+            kind: name or path of a camera file; :class:`~vinesim.sensors.spec_file.SensorError` if it cannot be used.
+            size: width and height [px] with the same angle of view; the camera's own unless given.
+            quality: ``"fast"``, ``"full"`` or ``"still"``: what a picture may cost. Depth and labels are the same.
+            name: with ``seed`` it decides the noise of the measured depth.
+            seed: see ``name``.
+        """
+        self.spec = rgbd.CameraSpec.load(kind)
+        self.info: CameraInfo = dataset.sized(self.spec, size)
+        """Intrinsics."""
+        self._name, self._quality, self._seed = name, quality, seed
+        self._camera: rgbd.Camera | None = None
+        self._last: Simulation | None = None
+
+    def render(
+        self,
+        simulation: Simulation,
+        pose: Sequence[float] | np.ndarray | None = None,
+        *,
+        robot: Robot | None = None,
+        frame: str | None = None,
+    ) -> CameraFrame:
+        """The picture at the simulation's time: ``rgb``, ``depth`` [m], ``labels``, ``exact_depth`` [m].
+
+        Args:
+            simulation: the world to look at.
+            pose: [7] of the optical frame in the world (z forward, x right, y down), as :func:`look_at` makes it.
+            robot: take the pose of a frame of this robot instead.
+            frame: which one; the frame of the robot's first camera unless given.
+        """
+        if robot is not None and frame is None and robot.description.cameras:
+            frame = robot.description.cameras[0].frame
+        if self._camera is None or self._last is not simulation:
+            sun = DEFAULT_SUN if simulation.scene is None else simulation.scene.sun.direction()
+            self._camera = rgbd.Camera(
+                self.spec, self.info, self._name, sun, self._quality, seed=self._seed, shadow_period=0.0
+            )
+            self._last = simulation
+        return self._camera.render(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+
+
+class Lidar:
+    """A spinning lidar of a kind in ``data/lidars``, or of a file."""
+
+    def __init__(self, kind: str = "vlp16", *, name: str = "lidar", seed: int = 0) -> None:
+        """A lidar that is not mounted yet; ``name`` and ``seed`` decide the noise.
+
+        :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
+        """
+        self.spec = lidar.LidarSpec.load(kind)
+        self._lidar = lidar.Lidar(self.spec, name, seed=seed)
+
+    def scan(
+        self,
+        simulation: Simulation,
+        pose: Sequence[float] | np.ndarray | None = None,
+        *,
+        robot: Robot | None = None,
+        frame: str | None = None,
+    ) -> LidarScan:
+        """One revolution while nothing moves: ``xyz`` [point, 3] m in the lidar's frame, ``intensity``, ``labels``.
+
+        Args:
+            simulation: the world to measure.
+            pose: [7] of the lidar in the world (x forward, z up), or (x, y, yaw) for one that stands on the ground.
+            robot: take the pose of a frame of this robot instead.
+            frame: which one; the frame of the robot's first lidar unless given.
+        """
+        if robot is not None and frame is None and robot.description.lidars:
+            frame = robot.description.lidars[0].frame
+        return self._lidar.scan(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+
+
+def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Pose [7] of the optical frame of a camera at ``eye`` [3] m that points at ``target`` [3] m, upright."""
+    start, end = np.asarray(eye, float), np.asarray(target, float)
+    if start.shape != (3,) or end.shape != (3,) or np.linalg.norm(end - start) < 1e-6:
+        raise UsageError(f"cannot look from {start.tolist()} at {end.tolist()}; give two points [3] m that differ")
+    return images.look_at(start, end)
+
+
+def _sensor_pose(pose: Sequence[float] | np.ndarray | None, robot: Robot | None, frame: str | None) -> np.ndarray:
+    """Pose [7] of a sensor in the world; :class:`UsageError` unless it was given in exactly one way."""
+    if (pose is None) == (robot is None):
+        raise UsageError("the sensor has no place, or two; give either a pose [7] or a robot")
+    if robot is None:
+        assert pose is not None
+        return base_pose(pose)
+    if frame is None:
+        raise UsageError(f"robot {robot.name!r} carries no such sensor; give the frame of one of its links")
+    return robot.frame_pose(frame)

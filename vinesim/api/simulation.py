@@ -1,0 +1,317 @@
+"""One simulation in one object: plants, robots, contacts, energy.
+
+simulation = Simulation(CaneBuilder(tip_mass=0.1, damping_ratio=0.05))
+simulation.step(500)
+print(simulation.tip(), simulation.energy().total)
+"""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+
+from vinesim import frames
+from vinesim.api.energy import Energy, Momentum, energy, momentum
+from vinesim.errors import UsageError
+from vinesim.physics.plants.wind import Wind
+from vinesim.physics.step import Physics
+from vinesim.robot.description import description
+from vinesim.robot.drives import Robot
+from vinesim.scene.builder import TreeBuilder
+from vinesim.scene.cane import CaneBuilder, assemble
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.spec import Scene, load_scene
+from vinesim.scene.state import State
+from vinesim.scene.values import Contact, Parting, Snapshot
+
+if TYPE_CHECKING:
+    from vinesim.sensors.scene.primitives import Primitives
+
+EQUILIBRIUM_RATE = 0.1
+"""[1] A tree starts awake if its first step would turn a body faster than this share of ``sleep_rate``. TUNED."""
+
+Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]
+"""What can be simulated: a model, a scene or the name or path of one, canes."""
+
+
+class Simulation:
+    """A world that moves when :meth:`step` is called; nothing runs in the background.
+
+    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has been at rest for half a
+    second (``parameters.sleep_duration``) and wakes when something touches it; sleeping trees cost nothing.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        dt: float | None = None,
+        parameters: PhysicsParameters | None = None,
+        sleep: bool | None = None,
+        detach: bool = True,
+        device: str = "cpu",
+        threads: int = 1,
+    ) -> None:
+        """Args:
+        source: see :data:`Source`. A scene brings its physics parameters and its wind.
+        dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
+        parameters: all numbers of the physics, in place of those of the scene.
+        sleep: whether trees at rest fall asleep, in place of ``parameters.sleep``.
+        detach: whether bunches detach when they are pulled too hard.
+        device: ``"cpu"`` or ``"cuda"``: where plants are stepped.
+        threads: of the CPU that share the plants.
+        """
+        self.scene: Scene | None = None
+        """The scene that was simulated; None for a model or canes."""
+        if isinstance(source, (str, pathlib.Path)):
+            source = load_scene(source)
+        if isinstance(source, Scene):
+            self.scene = source
+        model = _model_of(source)
+        chosen = parameters or (self.scene.physics if self.scene else PhysicsParameters())
+        changes = {name: value for name, value in (("dt", dt), ("sleep", sleep)) if value is not None}
+        self.parameters: PhysicsParameters = msgspec.structs.replace(chosen, **changes)
+        """All numbers of the physics; they are fixed from the start."""
+        self.physics = Physics(model, parameters=self.parameters, device=device, threads=threads, detachment=detach)
+        """The solver below, for what this class does not offer."""
+        self.robots: dict[str, Robot] = {}
+        """Robots by name; their commands take effect in the next step."""
+        if self.scene is not None and (any(self.scene.wind.mean) or self.scene.wind.gusts > 0.0):
+            wind = self.scene.wind
+            self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=self.scene.seed)
+        self._loads: dict[int, np.ndarray] = {}
+        self._detachments: list[Parting] = []
+        self._primitives: Primitives | None = None
+        self._wake_unbalanced()
+
+    # ------------------------------------------------------------------ time
+
+    def step(self, count: int = 1) -> None:
+        """Advance by ``count`` steps of :attr:`dt`. Wrenches that were applied act in all of them, then end."""
+        self._detachments = []
+        for _ in range(count):
+            for robot in self.robots.values():
+                robot.control(self.physics.time)
+            self.physics.step()
+            self._detachments += self.physics.detachments
+        for body, before in self._loads.items():
+            self.physics.plants.body_load[body] = before
+        self._loads.clear()
+
+    @property
+    def time(self) -> float:
+        """[s] since the start."""
+        return self.physics.time
+
+    @property
+    def dt(self) -> float:
+        """[s] Duration of a step."""
+        return self.physics.dt
+
+    # ------------------------------------------------------------------ state
+
+    @property
+    def model(self) -> Model:
+        """Constants of the plants: masses, springs, topology."""
+        return self.physics.model
+
+    @property
+    def state(self) -> State:
+        """State of the plants at the current time; shapes and units in :class:`~vinesim.scene.state.State`.
+
+        Joint rotations and rates may be written; call :meth:`wake` afterwards.
+        """
+        self.physics.update_kinematics()
+        return self.physics.state
+
+    @property
+    def awake(self) -> np.ndarray:
+        """[k] numbers of the trees that are awake, sorted."""
+        return self.physics.plants.awake.copy()
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Contacts of robots, boxes and people with plants in the last step: position [3] m, force [3] N."""
+        return self.physics.contacts
+
+    @property
+    def detachments(self) -> tuple[Parting, ...]:
+        """Bunches and canes that left their plant in the last call of :meth:`step`."""
+        return tuple(self._detachments)
+
+    def energy(self, tree: int | None = None) -> Energy:
+        """Kinetic, elastic and gravitational energy [J] of the plants, or of one tree."""
+        self.physics.update_kinematics()
+        return energy(self.physics.plants, self.parameters.gravity, self._one(tree))
+
+    def momentum(self, tree: int | None = None) -> Momentum:
+        """Linear momentum [kg m/s] and angular momentum about the world's origin [kg m^2/s] of plants, or of a tree."""
+        self.physics.update_kinematics()
+        return momentum(self.physics.plants, self._one(tree))
+
+    def body_pose(self, body: int) -> np.ndarray:
+        """Pose [7] (m, quaternion xyzw) of a plant's body in the world at the current time."""
+        self._check_body(body)
+        return self.state.body_q[body].astype(float)
+
+    def tip(self, tree: int = 0) -> np.ndarray:
+        """Position [3] m of the tip of a tree's main axis in the world at the current time."""
+        body = self.tip_body(tree)
+        pose = self.body_pose(body)
+        return pose[:3] + frames.rotate(pose[3:], np.array([float(self.model.body_length[body]), 0.0, 0.0]))
+
+    def tip_body(self, tree: int = 0) -> int:
+        """Number of the last body of a tree's main axis: from the root on, always the first piece of cane."""
+        bodies = self.model.bodies_of(self._tree(tree))
+        body = bodies.start
+        while True:
+            above = self.model.body_parent[bodies] == body
+            following = np.flatnonzero(above & (self.model.body_organ[bodies] == int(Organ.CANE)))
+            if len(following) == 0:
+                return body
+            body = bodies.start + int(following[0])
+
+    def snapshot(self) -> Snapshot:
+        """The whole world at the current time, for sensors: a value that never changes."""
+        return self.physics.snapshot()
+
+    # ------------------------------------------------------------------ actions
+
+    def wake(self, tree: int | None = None) -> None:
+        """Let a tree move from the next step on, or all trees; needed after joint rotations were written."""
+        trees = np.arange(len(self.model.tree_first)) if tree is None else np.array([self._tree(tree)])
+        self.physics.wake(trees)
+
+    def apply_wrench(
+        self,
+        body: int,
+        force: Sequence[float] | np.ndarray,
+        torque: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+        at: Sequence[float] | np.ndarray | None = None,
+    ) -> None:
+        """Push a plant's body during the next call of :meth:`step`; several wrenches add up. Its tree wakes.
+
+        Args:
+            body: number in the model.
+            force: [3] N, world axes.
+            torque: [3] N m, world axes.
+            at: [3] m in the world, the point where the force acts; the body's centre of mass unless given.
+        """
+        self._check_body(body)
+        force, torque = _vector("force", force, "N"), _vector("torque", torque, "N m")
+        pose = self.body_pose(body)
+        point = pose[:3] + frames.rotate(pose[3:], self.physics.plants.body_com[body].astype(float))
+        if at is not None:
+            point = _vector("at", at, "m")
+        load = self.physics.plants.body_load
+        self._loads.setdefault(body, load[body].copy())
+        load[body] += np.concatenate([force, torque + np.cross(point - pose[:3], force)]).astype(load.dtype)
+        self.wake(int(self.model.body_tree[body]))
+
+    def cut(self, body: int) -> None:
+        """Cut a cane at the base of a body: what grows on it falls. The cut is the body's joint, not within a segment."""
+        self._check_body(body)
+        self.physics.cut(body)
+
+    def pick(self, bunch: int) -> None:
+        """Detach a bunch from its vine: it falls."""
+        if not 0 <= bunch < len(self.model.bunch_body):
+            raise UsageError(f"bunch {bunch} does not exist; give 0 to {len(self.model.bunch_body) - 1}")
+        self.physics.pick(bunch)
+
+    def add_robot(
+        self,
+        robot: str | pathlib.Path,
+        pose: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+        *,
+        name: str = "",
+    ) -> Robot:
+        """Add a robot by the name of one in ``data/robots`` or the path of a URDF file.
+
+        Args:
+            robot: name or path; :class:`~vinesim.robot.description.description.DescriptionError` if it cannot be used.
+            pose: (x, y, yaw) in m and rad, or [7] position and quaternion of the base.
+            name: unique name of this robot; ``robot_0``, ``robot_1``, ... unless given.
+        """
+        described = description.load(robot)
+        index = len(self.robots)
+        name = name or f"robot_{index}"
+        if name in self.robots:
+            raise UsageError(f"robot {name!r} exists already; give another name")
+        self.robots[name] = added = Robot(self.physics.rigid, described, name, index, base_pose(pose))
+        added.fit_cutters(self.physics)
+        return added
+
+    # ------------------------------------------------------------------ sensors
+
+    def primitives(self) -> Primitives:
+        """What cameras and lidars see, at the current time (built once)."""
+        if self._primitives is None:
+            from vinesim.sensors.scene.primitives import Primitives
+
+            self._primitives = Primitives(self.model)
+        self._primitives.update(self.snapshot())
+        return self._primitives
+
+    # ------------------------------------------------------------------
+
+    def _wake_unbalanced(self) -> None:
+        """Wake the trees that are not in equilibrium: a trial prediction turns one of their bodies."""
+        plants, state = self.physics.plants, self.physics.state
+        asleep = np.flatnonzero(~state.tree_awake)
+        if len(asleep) == 0:
+            return
+        plants.wake(asleep)
+        plants.predict()
+        rate = np.linalg.norm(plants.velocity_free[:, 3:], axis=1)
+        fastest = np.zeros(len(self.model.tree_first))
+        np.maximum.at(fastest, self.model.body_tree, rate)
+        plants.put_to_sleep(asleep[fastest[asleep] <= EQUILIBRIUM_RATE * self.parameters.sleep_rate])
+
+    def _tree(self, tree: int) -> int:
+        if not 0 <= tree < len(self.model.tree_first):
+            raise UsageError(f"tree {tree} does not exist; give 0 to {len(self.model.tree_first) - 1}")
+        return tree
+
+    def _one(self, tree: int | None) -> np.ndarray | None:
+        return None if tree is None else np.array([self._tree(tree)])
+
+    def _check_body(self, body: int) -> None:
+        if not 0 <= body < len(self.model.body_mass):
+            raise UsageError(f"body {body} does not exist; give 0 to {len(self.model.body_mass) - 1}")
+
+
+def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Pose [7] of a robot's base from (x, y, yaw) in m and rad, or from a pose [7]; :class:`UsageError` otherwise."""
+    given = np.asarray(pose, float)
+    if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
+        raise UsageError(f"pose is {given.tolist()}; give (x, y, yaw) in m and rad, or position and quaternion [7]")
+    return given if len(given) == 7 else frames.pose(np.array([given[0], given[1], 0.0]), frames.from_yaw(given[2]))
+
+
+def _model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]) -> Model:
+    if isinstance(source, Model):
+        return source
+    if isinstance(source, Scene):
+        return generate(source)
+    if isinstance(source, (CaneBuilder, TreeBuilder)):
+        return assemble([source])
+    canes = list(source)
+    if not all(isinstance(one, (CaneBuilder, TreeBuilder)) for one in canes):
+        raise UsageError(f"cannot simulate a {type(source).__name__}; give a scene, a model or cane builders")
+    return assemble(canes)
+
+
+def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.ndarray:
+    """Three finite numbers as an array; :class:`UsageError` otherwise."""
+    vector = np.asarray(value, float)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise UsageError(f"{name} is {value}; give three finite numbers [{unit}]")
+    return vector

@@ -1,0 +1,166 @@
+"""Single canes from a few numbers: length, radius, Young's modulus, tip mass, damping ratio, shape.
+
+builder = CaneBuilder(length=1.0, radius=(0.006, 0.003), tip_mass=0.2, damping_ratio=0.05)
+model = builder.build()                       # one cane
+model = assemble([builder, CaneBuilder()])    # several
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from typing import Literal
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene import builder
+from vinesim.scene.builder import RodMaterial, TreeBuilder
+from vinesim.scene.model import Model
+
+_HORIZONTAL = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclasses.dataclass(kw_only=True, eq=False)
+class CaneBuilder:
+    """A cane: a tapered round rod of equal segments, joined by elastic ball joints.
+
+    Raises :class:`ValueError` with the field, its value and the remedy if a number is out of range.
+    """
+
+    length: float = 1.0
+    """[m]"""
+    radius: float | tuple[float, float] = 0.004
+    """[m] Of the rod, or at its base and at its tip."""
+    youngs_modulus: float = 5e9
+    """[Pa] Of bending; the shear modulus is E / 2.6 (Poisson's ratio 0.3)."""
+    density: float = 800.0
+    """[kg/m^3]"""
+    segments: int = 16
+    """Rigid bodies that the cane is cut into."""
+    tip_mass: float = 0.0
+    """[kg] A point mass at the tip."""
+    damping_ratio: float | None = None
+    """[1] Of the first bending mode (see :meth:`first_mode`); sets ``beta`` = 2 ratio / angular frequency."""
+    beta: float | None = None
+    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. 0 unless this or the ratio is given."""
+    pose: np.ndarray | tuple[float, ...] = _HORIZONTAL
+    """[7] m, 1: the base in the world (position, quaternion xyzw); the cane grows along its x axis."""
+    base: Literal["clamped", "pinned"] = "clamped"
+    """``pinned``: the base joint has no spring, so that the cane swings on it as a pendulum."""
+    bends: np.ndarray | None = None
+    """[segments, 3] rad: rotation vector of each segment against the one before it, in the drawn shape. Straight
+    unless given."""
+    shape: Literal["slack", "equilibrium"] = "slack"
+    """What the drawn shape is: where all springs are ``slack`` (released there, the cane sags under its weight), or the
+    ``equilibrium`` under gravity (released there, it stays)."""
+
+    @property
+    def angular_stiffness(self) -> np.ndarray:
+        """[segments] N m/rad: bending stiffness of each joint, base first."""
+        return np.array([body["stiffness"][2] for body in self.tree().bodies])
+
+    @functools.cached_property
+    def _undamped(self) -> TreeBuilder:
+        tree = TreeBuilder(np.asarray(self.pose, float))
+        material = RodMaterial(self.youngs_modulus, self.density)
+        turns = None if self.bends is None else frames.exp(np.asarray(self.bends, float))
+        tree.add_rod(-1, self.length, self._radii, material, self.segments, bends=turns)
+        if self.tip_mass > 0.0:
+            _add_point_mass(tree.bodies[-1], self.tip_mass)
+        if self.base == "pinned":
+            tree.bodies[0]["stiffness"] = np.zeros(3)
+        return tree
+
+    @property
+    def _radii(self) -> tuple[float, float]:
+        return (self.radius, self.radius) if isinstance(self.radius, (int, float)) else tuple(self.radius)
+
+    def first_mode(self) -> float:
+        """Angular frequency [rad/s] of the first bending mode of the straight cane, clamped, without gravity.
+
+        The mode is that of the chain of segments; for many segments it tends to the Euler-Bernoulli beam's,
+        1.8751^2 sqrt(E I / (rho A L^4)) for a cane without taper or tip mass.
+        """
+        self._check()
+        bodies = self._undamped.bodies
+        stiffness = np.array([body["stiffness"][2] for body in bodies])
+        if stiffness[0] == 0.0:
+            raise ValueError("cane: base is 'pinned', so it has no bending mode; give base 'clamped', or beta")
+        joint = np.arange(self.segments) * (self.length / self.segments)
+        com = joint + np.array([body["com"][0] for body in bodies])
+        mass, inertia = np.array([body["mass"] for body in bodies]), np.array([body["inertia"][2] for body in bodies])
+        outer = np.tril(np.ones((self.segments, self.segments)))  # [segment, joint]: the joint lies inside of it
+        way = outer * (com[:, None] - joint)
+        matrix = way.T @ (mass[:, None] * way) + outer.T @ (inertia[:, None] * outer)
+        root = 1.0 / np.sqrt(stiffness)
+        return float(1.0 / np.sqrt(np.linalg.eigvalsh(root[:, None] * matrix * root)[-1]))
+
+    def tree(self) -> TreeBuilder:
+        """The cane as a :class:`~vinesim.scene.builder.TreeBuilder`, to which branches and bunches can be added."""
+        self._check()
+        beta = self.beta or 0.0
+        if self.damping_ratio is not None:
+            beta = 2.0 * self.damping_ratio / self.first_mode()
+        vars(self).pop("_undamped", None)  # fields may have changed since
+        tree = self._undamped
+        del self._undamped
+        for body in tree.bodies:
+            body["damping"], body["beta"] = beta * body["stiffness"], beta
+        if self.shape == "equilibrium":
+            tree.solve_rest_pose()
+        return tree
+
+    def build(self) -> Model:
+        """A model of this cane alone."""
+        return builder.assemble([self.tree()])
+
+    def _check(self) -> None:
+        """:class:`ValueError` naming the first field that is out of range."""
+        vars(self).pop("_undamped", None)
+        numbers = {"length": self.length, "youngs_modulus": self.youngs_modulus, "density": self.density}
+        numbers |= {f"radius[{i}]": value for i, value in enumerate(self._radii)}
+        for name, value in numbers.items():
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"cane: {name} is {value}; give a finite number above 0")
+        for name, value in {"tip_mass": self.tip_mass, "damping_ratio": self.damping_ratio, "beta": self.beta}.items():
+            if value is not None and not (np.isfinite(value) and value >= 0.0):
+                raise ValueError(f"cane: {name} is {value}; give a finite number of 0 or more")
+        if self.segments < 1:
+            raise ValueError(f"cane: segments is {self.segments}; give 1 or more")
+        if len(self._radii) != 2:
+            raise ValueError(f"cane: radius is {self.radius}; give one number, or two for base and tip")
+        if self.damping_ratio is not None and self.beta is not None:
+            raise ValueError(
+                f"cane: damping_ratio {self.damping_ratio} and beta {self.beta} are given; give one of them"
+            )
+        if self.base not in ("clamped", "pinned"):
+            raise ValueError(f"cane: base is {self.base!r}; give 'clamped' or 'pinned'")
+        if self.shape not in ("slack", "equilibrium"):
+            raise ValueError(f"cane: shape is {self.shape!r}; give 'slack' or 'equilibrium'")
+        if self.shape == "equilibrium" and self.base == "pinned":
+            raise ValueError("cane: a base that is 'pinned' carries no moment; give shape 'slack'")
+        if np.shape(self.pose) != (7,):
+            raise ValueError(f"cane: pose has the shape {np.shape(self.pose)}; give position and quaternion [7]")
+        if self.bends is not None and np.shape(self.bends) != (self.segments, 3):
+            raise ValueError(f"cane: bends has the shape {np.shape(self.bends)}; give [{self.segments}, 3]")
+
+
+def _add_point_mass(body: dict, mass: float) -> None:
+    """Add a point mass [kg] at the tip of a segment: mass, centre and moments of inertia of both together."""
+    own, com, tip = body["mass"], body["com"][0], body["length"]
+    together = (own * com + mass * tip) / (own + mass)
+    across = own * (com - together) ** 2 + mass * (tip - together) ** 2
+    body["mass"], body["com"] = own + mass, (together, 0.0, 0.0)
+    body["inertia"] = body["inertia"] + np.array([0.0, across, across])
+
+
+def cane(**fields: object) -> Model:
+    """A model of one cane; the arguments are the fields of :class:`CaneBuilder`."""
+    return CaneBuilder(**fields).build()  # pyright: ignore[reportArgumentType] # checked by the builder
+
+
+def assemble(canes: Iterable[CaneBuilder | TreeBuilder]) -> Model:
+    """One model of several canes; each is a tree, numbered in the order given."""
+    return builder.assemble([one.tree() if isinstance(one, CaneBuilder) else one for one in canes])
