@@ -25,7 +25,7 @@ from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.client.tasks.tasks import RosCommandHandler
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load_description
+from vinesim.robot.description.loader import load_description
 from vinesim.ros.node import Node
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
