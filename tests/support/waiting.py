@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-TIMEOUT = 60.0
-"""Limit of every wait [s]. GUESSED: four times the longest wait seen with three test processes a core."""
+TIMEOUT = 120.0
+"""Limit of every wait [s]. GUESSED: eight times the longest wait seen with three test processes a core."""
 
 POLL_PERIOD = 0.005
 """Time between two evaluations of a condition [s]."""
