@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.net.transport.bus import EVERY, NEWEST, RECENT, MemoryHub, NameTaken, Store, matches
+from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, KEEP_LAST_64, MemoryHub, NameTaken, SampleStore, matches
 
 
 @pytest.mark.parametrize(
@@ -26,24 +26,26 @@ def test_patterns(pattern, key, covers):
     assert matches(pattern, key) is covers
 
 
-@given(st.lists(st.tuples(st.sampled_from([("a", NEWEST), ("b", 3), ("e", EVERY)]), st.integers()), max_size=60))
+@given(
+    st.lists(st.tuples(st.sampled_from([("a", KEEP_LAST_1), ("b", 3), ("e", KEEP_ALL)]), st.integers()), max_size=60)
+)
 def test_a_store_keeps_the_newest_of_each_key_in_order(samples):
-    store = Store()
+    store = SampleStore()
     for number, ((key, depth), _) in enumerate(samples):
         store.put(depth, key, number)
     taken = store.take()
     assert [number for _, number in taken] == sorted(number for _, number in taken)
-    for wanted, depth in (("a", NEWEST), ("b", 3), ("e", EVERY)):
+    for wanted, depth in (("a", KEEP_LAST_1), ("b", 3), ("e", KEEP_ALL)):
         numbers = [n for n, ((key, _), _) in enumerate(samples) if key == wanted]
         assert [number for key, number in taken if key == wanted] == numbers[-depth:]
     assert store.take() == []
 
 
 def test_a_flood_is_bounded_and_counted():
-    store = Store()
-    for number in range(EVERY + 5):
-        store.put(EVERY, "e", number)
-    assert len(store.take()) == EVERY
+    store = SampleStore()
+    for number in range(KEEP_ALL + 5):
+        store.put(KEEP_ALL, "e", number)
+    assert len(store.take()) == KEEP_ALL
     assert store.overflowed == 5
 
 
@@ -72,8 +74,8 @@ def test_a_publisher_needs_an_exact_key():
 def test_reliable_samples_arrive_all_and_in_order_whatever_the_network():
     hub = MemoryHub(delay=0.05, jitter=0.05, loss=0.5, seed=3)
     ada, bob = hub.bus("ada"), hub.bus("bob")
-    bob.subscribe("own/**", EVERY)
-    bob.subscribe("c/**", RECENT)
+    bob.subscribe("own/**", KEEP_ALL)
+    bob.subscribe("c/**", KEEP_LAST_64)
     events, stream = ada.publisher("own/x", reliable=True), ada.publisher("c/x")
     for number in range(60):
         events.put(bytes([number]))
@@ -91,7 +93,7 @@ def test_the_same_seed_is_the_same_network():
     def run() -> list:
         hub = MemoryHub(delay=0.02, jitter=0.02, loss=0.3, seed=11)
         ada, bob = hub.bus("ada"), hub.bus("bob")
-        bob.subscribe("**", EVERY)
+        bob.subscribe("**", KEEP_ALL)
         publisher, heard = ada.publisher("x"), []
         for number in range(100):
             publisher.put(bytes([number]))

@@ -15,7 +15,7 @@ import pytest
 from tests.support.live_server import Served, need_links, wait
 from vinesim.bench.support.fake_client import Stage
 from vinesim.bench.support.network_emulator import Count, Emulator, Line
-from vinesim.scene.ids import Kind, thing
+from vinesim.scene.ids import ObjectKind, object_id
 
 WINDOW = 1.0
 """How long is counted [s]."""
@@ -231,7 +231,7 @@ def test_actors_are_heard_at_60_hz_near_and_at_5_hz_far(world):
     assert 5.0 < heard["cleo"] < 13.0
 
 
-BUNCH, BOX = thing(Kind.BUNCH, 1), thing(Kind.BOX, 1)
+BUNCH, BOX = object_id(ObjectKind.BUNCH, 1), object_id(ObjectKind.BOX, 1)
 
 
 def facts(before: dict, after: dict, way: str) -> int:

@@ -17,12 +17,12 @@ import pytest
 from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import Exchange
+from vinesim.net.replication.exchange import Replicator
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus
-from vinesim.net.transport.bus import EVERY, NameTaken
-from vinesim.net.transport.certificates import new
-from vinesim.net.transport.endpoints import chosen
+from vinesim.net.transport.bus import KEEP_ALL, NameTaken
+from vinesim.net.transport.certificates import create
+from vinesim.net.transport.endpoints import resolve_ports
 from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
@@ -85,7 +85,7 @@ class Wire:
 def test_samples_cross_and_depths_hold(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
         bob.subscribe("c/0/0/*")
-        bob.subscribe("own/0/0/*", EVERY)
+        bob.subscribe("own/0/0/*", KEEP_ALL)
         pose, event = ada.publisher("c/0/0/ada"), ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: pose.matching and event.matching, "bob's subscriptions")
         for number in range(100):
@@ -135,7 +135,7 @@ def test_payload_bytes_are_what_crosses_the_wire(server):
         ZenohBus("ada", connect=wire.endpoint) as ada,
         ZenohBus("bob", connect=server.endpoint) as bob,
     ):
-        bob.subscribe("c/0/0/*", EVERY)
+        bob.subscribe("c/0/0/*", KEEP_ALL)
         publisher = ada.publisher("c/0/0/ada")
         wait(lambda: publisher.matching, "bob's subscription")
         before = wire.up
@@ -219,13 +219,13 @@ def test_questions_find_their_answers(server):
 
 def test_a_huge_sample_is_not_kept(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
-        bob.subscribe("own/0/0/*", EVERY)
+        bob.subscribe("own/0/0/*", KEEP_ALL)
         event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: event.matching, "bob's subscription")
-        event.put(bytes(messages.LARGEST + 1))
-        event.put(bytes(5 * messages.LARGEST))  # the router does not even put this together
+        event.put(bytes(messages.MAX_MESSAGE + 1))
+        event.put(bytes(5 * messages.MAX_MESSAGE))  # the router does not even put this together
         event.put(b"small")
-        wait(lambda: bob.bytes_in == messages.LARGEST + 6, "both samples")
+        wait(lambda: bob.bytes_in == messages.MAX_MESSAGE + 6, "both samples")
         assert bob.drain() == [("own/0/0/ada", b"small")]
         assert bob.lost == 1
 
@@ -250,7 +250,7 @@ class Client:
             trees.append(tree)
         self.model = assemble(trees)
         self.state = State.at_rest(self.model)
-        self.exchange = Exchange(bus, Hello(bus.name, digest=self.model.digest(), joints=1), self.model)
+        self.exchange = Replicator(bus, Hello(bus.name, digest=self.model.digest(), joints=1), self.model)
         self.robot = RobotUpdate(bus.name, 0.0, frames.pose(np.array([x, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
         self.touched: set[int] = set()
         self.robots: dict[str, RobotUpdate] = {}
@@ -354,7 +354,7 @@ class Pump:
 
     def __init__(self, sender: ZenohBus, receiver: ZenohBus) -> None:
         receiver.subscribe(f"a/{sender.name}")
-        receiver.subscribe(f"own/0/0/{sender.name}", EVERY)
+        receiver.subscribe(f"own/0/0/{sender.name}", KEEP_ALL)
         self._pose = sender.publisher(f"a/{sender.name}")
         self._event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
         self._receiver = receiver
@@ -383,8 +383,8 @@ def test_poses_are_datagrams_beside_the_stream_of_events(server):
         ):
             assert [link.partition(" ")[2] for link in ada.links] == ["reliable", "best effort", "reliable"]
             assert len(bob.links) == 1
-            bob.subscribe("a/ada", EVERY)
-            bob.subscribe("own/0/0/ada", EVERY)
+            bob.subscribe("a/ada", KEEP_ALL)
+            bob.subscribe("own/0/0/ada", KEEP_ALL)
             pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
             wait(lambda: pose.matching and event.matching, "bob's subscriptions")
             before = wire.up
@@ -486,8 +486,8 @@ def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
     stream, datagrams = protocols.split()
     secure = stream == "tls"
     for name in ("ada", "bob") if secure else ():
-        new(tmp_path, name)
-    wanted = chosen([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
+        create(tmp_path, name)
+    wanted = resolve_ports([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
     code = (
         "import pathlib, sys\nfrom vinesim.net.server.server import Server\n"
         f"with Server(sys.argv[1:], certificates={f'pathlib.Path({str(tmp_path)!r})' if secure else None}) as server:\n"

@@ -13,7 +13,7 @@ import time
 
 from vinesim.client.recording.recorder import FAMILIES, Recorder, Stand, grid
 from vinesim.errors import UsageError
-from vinesim.net.recording.mcap_file import Recording, free_path
+from vinesim.net.recording.mcap_file import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 POLL = 0.004
@@ -41,7 +41,7 @@ def run(
         name = name or f"recorder-{os.getpid()}"
         bus = stack.enter_context(ZenohBus(name, connect=connect, world=world, certificates=tls, live=False))
         path = free_path(file)
-        recording = stack.enter_context(Recording(path, about))
+        recording = stack.enter_context(RecordingWriter(path, about))
         recorder = Recorder(
             bus, recording, only=families, everything=area is not None, digest=about.get("digest", "")
         )  # fmt: skip
@@ -57,7 +57,7 @@ def run(
                 own = f"{name}-{len(standing) + 1}"
                 recorder.own.add(own)
                 there = stack.enter_context(ZenohBus(own, connect=connect, world=world, certificates=tls))
-                scene_name = recording.about.get("scene", "")
+                scene_name = recording.metadata.get("scene", "")
                 standing.append(Stand(there, stands[len(standing)], scene_name, recorder.digest, now))
             recorder.step()
             for stand in standing:
@@ -89,7 +89,7 @@ def _progress(recorder: Recorder, elapsed: float, alone: bool) -> None:
     """One line that is written over, on a terminal; nothing into a file."""
     if not sys.stderr.isatty():
         return
-    trouble = recorder.bus.trouble
+    trouble = recorder.bus.status_message
     company = ", ".join(sorted(recorder.actors)) or "nobody"
     hint = "  (with fewer than two actors nothing is sent; --area asks for it)" if alone else ""
     line = f"{elapsed:7.1f} s  {recorder.recording.count} messages  {recorder.recording.size / 1e6:.2f} MB  {company}"
