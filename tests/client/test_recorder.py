@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.support.recorded_world import TICK, Light, vineyard
-from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Recorder, Stand, grid
+from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, Recorder, grid
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.recording.mcap_file import Recording, RecordingWriter, read
@@ -28,9 +28,11 @@ class World:
     def __init__(self, path: pathlib.Path | None, apart: float = 2.0, **options) -> None:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
-        server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + self.hub.time))
+        server.declare_queryable(
+            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + self.hub.time)
+        )
         fact = RetainedRecord(object_id(ObjectKind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
-        server.serve("snap/0/0", lambda _: messages.encode_records([fact]))
+        server.declare_queryable("snap/0/0", lambda _: messages.encode_records([fact]))
         self.ada, self.bob = Light(self.hub.bus("ada"), 0.5), Light(self.hub.bus("bob"), 0.5 + apart)
         self.clients = [self.ada, self.bob]
         self.steps = [lambda: None]
@@ -137,7 +139,7 @@ def test_a_recorder_that_asks_for_everything_hears_one_who_is_alone(tmp_path):
     world.bob.bus.close()
     world.clients.remove(world.bob)
     digest = vineyard().digest()
-    stand = Stand(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
+    stand = Observer(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
     world.recorder.own.add("recorder-1")
     world.steps.append(lambda: stand.step(world.hub.time))
     world.run(2.0)

@@ -93,12 +93,12 @@ def test_from_and_to(tape):
     bus = ReplayBus(tape, "viewer", start=start, end=start + 0.5)
     bus.subscribe("a/*/far", KEEP_ALL)
     assert bus.time == pytest.approx(tape.start + start)
-    bus.ask("hello/bob")  # who came before is there
-    assert messages.decode_hello(bus.answers()[0].payload).name == "bob"
+    bus.query("hello/bob")  # who came before is there
+    assert messages.decode_hello(bus.replies()[0].payload).name == "bob"
     for _ in range(100):
         bus.play(TICK)
     assert bus.ended
-    times = [messages.time_of(payload) - tape.start for _, payload in bus.drain()]
+    times = [messages.time_of(payload) - tape.start for _, payload in bus.poll()]
     assert start - 0.1 < min(times) < max(times) < start + 0.5
 
 
@@ -107,20 +107,20 @@ def test_facts_are_answered_as_the_server_would(tape):
     before, told = object_id(ObjectKind.BUNCH, 3), object_id(ObjectKind.BUNCH, 4)
 
     def known() -> set[int]:
-        bus.ask("snap/0/0")
-        return {fact.object for answer in bus.answers() for fact in messages.decode_records(answer.payload)}
+        bus.query("snap/0/0")
+        return {fact.object for answer in bus.replies() for fact in messages.decode_records(answer.payload)}
 
     assert known() == {before}
     while not bus.ended:
         bus.play(TICK)
     assert known() == {before, told}
-    bus.ask("snap/9/9")
-    (empty,) = bus.answers()
+    bus.query("snap/9/9")
+    (empty,) = bus.replies()
     assert (empty.key, messages.decode_records(empty.payload)) == ("snap/9/9", [])
-    bus.ask("snap/*/*")
-    assert {answer.key for answer in bus.answers()} == {"snap/0/0"}
-    bus.ask("snap/nonsense")
-    assert bus.answers() == []
+    bus.query("snap/*/*")
+    assert {answer.key for answer in bus.replies()} == {"snap/0/0"}
+    bus.query("snap/nonsense")
+    assert bus.replies() == []
 
 
 def test_a_name_on_the_tape_is_taken(tape):
@@ -130,8 +130,8 @@ def test_a_name_on_the_tape_is_taken(tape):
 
 def test_the_clock_is_that_of_the_recording(tape):
     bus = ReplayBus(tape, "viewer", start=0.5)
-    bus.ask("clock", messages.encode_time(3.0))
-    assert messages.decode_time(bus.answers()[0].payload) == (3.0, pytest.approx(EPOCH + 0.6, abs=0.2))
+    bus.query("clock", messages.encode_time(3.0))
+    assert messages.decode_time(bus.replies()[0].payload) == (3.0, pytest.approx(EPOCH + 0.6, abs=0.2))
 
 
 class Stage:
@@ -140,7 +140,7 @@ class Stage:
     def __init__(self, tape: Recording, **span: float) -> None:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
-        server.serve(
+        server.declare_queryable(
             "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 5e8 + self.hub.time)
         )  # fmt: skip
         self.kept: list[RetainedRecord] = []
@@ -158,7 +158,7 @@ class Stage:
         self.hub.advance(TICK)
         self.replay.step(self.hub.time)
         self.viewer.tick(self.hub.time)
-        self.kept += [fact for _, payload in self.server.drain() for fact in messages.decode_records(payload)]
+        self.kept += [fact for _, payload in self.server.poll() for fact in messages.decode_records(payload)]
 
 
 def test_on_a_network_it_happens_again(tape):

@@ -117,7 +117,7 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
     path = tmp_path_factory.mktemp("robot") / "run.mcap"
     hub = MemoryHub(delay=0.004)
     clock = hub.bus("server", live=False)
-    clock.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e9 + hub.time))
+    clock.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e9 + hub.time))
     scene = load_scene("demo")
     model = generate(scene)
     start = spawn_pose(scene, 0)

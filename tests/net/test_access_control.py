@@ -181,7 +181,7 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
             event.put(b"event")
             time.sleep(0.01)
             for each in (bob, guest):
-                heard[each.name].update(each.drain())
+                heard[each.name].update(each.poll())
             return all(found == {("a/ada", b"pose"), ("own/0/0/ada", b"event")} for found in heard.values())
 
         wait(both_heard_both, "both samples")
@@ -190,16 +190,16 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
         wait(lambda: says.matching, "the server's ear")
         says.put(messages.encode_records([fact]))
         wait(lambda: server.archive.count() == 1, "the fact to be kept")
-        ada.serve("hello/ada", lambda _: hello("ada"))
-        guest.serve("hello/guest", lambda _: hello("guest"))
+        ada.declare_queryable("hello/ada", lambda _: hello("ada"))
+        guest.declare_queryable("hello/guest", lambda _: hello("guest"))
         answers: dict = {}
 
         def all_answered():
             for key in ("hello/ada", "clock", "snap/0/0"):
-                guest.ask(key, messages.encode_time(1.0))
-            ada.ask("hello/guest")
+                guest.query(key, messages.encode_time(1.0))
+            ada.query("hello/guest")
             time.sleep(0.02)
-            answers.update({answer.key: answer.payload for answer in [*guest.answers(), *ada.answers()]})
+            answers.update({answer.key: answer.payload for answer in [*guest.replies(), *ada.replies()]})
             return len(answers) == 4
 
         wait(all_answered, "four answers")
@@ -215,10 +215,10 @@ def test_nobody_says_that_another_is_there_or_answers_for_him(server, certs):
         own = ada.liveliness().declare_token("vs/1/vineyard/live/ada/1")
         wait(lambda: "ada" in bob.alive(), "ada herself")
         assert "carl" not in bob.alive()
-        bob.ask("hello/carl")
-        bob.ask("clock", messages.encode_time(1.0))
+        bob.query("hello/carl")
+        bob.query("clock", messages.encode_time(1.0))
         answers: list = []
-        wait(lambda: answers.extend(bob.answers()) or answers, "the clock")
+        wait(lambda: answers.extend(bob.replies()) or answers, "the clock")
         assert [answer.key for answer in answers] == ["clock"]
         assert messages.decode_time(answers[0].payload)[0] == 1.0
         for each in (served, clock, forged, own):
@@ -243,7 +243,7 @@ def test_over_quic_poses_are_datagrams_and_events_a_stream(server, certs):
         def arrived():
             pose.put(b"pose")
             time.sleep(0.01)
-            heard.extend(bob.drain())
+            heard.extend(bob.poll())
             return heard
 
         wait(arrived, "a pose")
@@ -278,7 +278,7 @@ def test_linked_servers_know_each_other_and_each_its_own_actors(certs, protocol)
         list(thief.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
         event.put(b"event")
         heard: list = []
-        wait(lambda: heard.extend(bob.drain()) or heard, "the event")
+        wait(lambda: heard.extend(bob.poll()) or heard, "the event")
         assert heard == [("own/0/0/ada", b"event")]
 
 

@@ -59,7 +59,7 @@ def test_without_a_listener_nothing_leaves_and_nothing_is_counted():
     subscription = bob.subscribe("c/0/0/*")
     assert publisher.put(b"12345")
     hub.advance(0.0)
-    assert bob.drain() == [("c/0/0/ada", b"12345")]
+    assert bob.poll() == [("c/0/0/ada", b"12345")]
     assert (ada.bytes_out, bob.bytes_in, ada.bytes_in) == (5, 5, 0)
     subscription.close()
     assert not publisher.put(b"12345")
@@ -82,7 +82,7 @@ def test_reliable_samples_arrive_all_and_in_order_whatever_the_network():
         stream.put(bytes([number]))
         hub.advance(0.001)
     hub.advance(1.0)
-    heard = bob.drain()
+    heard = bob.poll()
     assert [p[0] for k, p in heard if k == "own/x"] == list(range(60))
     unreliable = [p[0] for k, p in heard if k == "c/x"]
     assert 15 < len(unreliable) < 45
@@ -98,7 +98,7 @@ def test_the_same_seed_is_the_same_network():
         for number in range(100):
             publisher.put(bytes([number]))
             hub.advance(0.004)
-            heard.append(bob.drain())
+            heard.append(bob.poll())
         return heard
 
     assert run() == run()
@@ -110,21 +110,21 @@ def test_nothing_arrives_before_its_time():
     bob.subscribe("x")
     ada.publisher("x").put(b"1")
     hub.advance(0.049)
-    assert bob.drain() == []
+    assert bob.poll() == []
     hub.advance(0.002)
-    assert bob.drain() == [("x", b"1")]
+    assert bob.poll() == [("x", b"1")]
 
 
 def test_questions_are_answered_with_their_age():
     hub = MemoryHub(delay=0.01)
     ada, bob = hub.bus("ada"), hub.bus("bob")
-    bob.serve("hello/bob", lambda question: question + b"!")
-    ada.ask("hello/*", b"hi")
-    ada.ask("nobody", b"hi")
+    bob.declare_queryable("hello/bob", lambda question: question + b"!")
+    ada.query("hello/*", b"hi")
+    ada.query("nobody", b"hi")
     hub.advance(0.015)
-    assert ada.answers() == []
+    assert ada.replies() == []
     hub.advance(0.035)
-    (answer,) = ada.answers()
+    (answer,) = ada.replies()
     assert answer[:2] == ("hello/bob", b"hi!")
     assert answer.age == pytest.approx(0.03)
 
@@ -153,12 +153,12 @@ def test_a_hub_that_is_down_says_so_and_comes_back():
     hub.down = True
     assert not publisher.put(b"1")
     assert ada.alive() == {"ada"}
-    assert "down" in ada.trouble
+    assert "down" in ada.status_message
     hub.down = False
     assert publisher.put(b"2")
     hub.advance(0.0)
-    assert bob.drain() == [("x", b"2")]
-    assert ada.trouble == ""
+    assert bob.poll() == [("x", b"2")]
+    assert ada.status_message == ""
 
 
 def test_impossible_networks_are_refused():

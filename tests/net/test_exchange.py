@@ -197,7 +197,9 @@ def test_a_newcomer_of_another_vineyard_or_protocol_is_refused_with_both_values(
 def test_the_protocols_of_both_are_named():
     hub = MemoryHub()
     old = hub.bus("old")
-    old.serve("hello/old", lambda _: messages._pack(messages.HELLO, Hello("old", digest="same", protocol=7)))
+    old.declare_queryable(
+        "hello/old", lambda _: messages._pack(messages.HELLO, Hello("old", digest="same", protocol=7))
+    )
     new = Client(hub, "new", 1.0)
     with pytest.raises(WorldMismatch, match=r"'old' speaks protocol version 7, 'new' version 1"):
         run(hub, [new], 0.2)
@@ -544,7 +546,7 @@ def test_a_stranger_another_tree_and_a_replay_change_nothing():
     eve = hub.bus("eve")
     eve.subscribe("c/**", 100)
     run(hub, [ada, bob], 0.1)
-    (_, recorded), *_ = eve.drain()
+    (_, recorded), *_ = eve.poll()
     bob.bend(0, -0.3)
     run(hub, [ada, bob], 0.1)
     held, heard = ada.state.joint_q.copy(), len(ada.heard)
@@ -567,8 +569,10 @@ def test_a_pose_with_another_number_of_joints_is_malformed():
 def test_the_clock_of_the_server_is_found():
     hub = MemoryHub(delay=0.02, jitter=0.01)
     server = hub.bus("server")
-    server.serve("hello/server", lambda _: messages.encode_hello(Hello("server", "spectator", digest="same")))
-    server.serve("clock", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
+    server.declare_queryable(
+        "hello/server", lambda _: messages.encode_hello(Hello("server", "spectator", digest="same"))
+    )
+    server.declare_queryable("clock", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 1.5)
     assert ada.exchange.offset == pytest.approx(1000.0, abs=0.012)

@@ -12,7 +12,7 @@ import numpy as np
 from tests.support.live_server import Served, wait
 from vinesim.bench import fuzz
 from vinesim.bench.fuzz import EVIL, storm
-from vinesim.bench.support.fake_client import FakeClient, Stage, row
+from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, row
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.codec import messages
@@ -118,7 +118,10 @@ def test_a_client_with_its_physics_lives_through_a_storm():
 
 
 def test_real_sessions_and_the_server_live_through_a_storm():
-    with Served("tcp/127.0.0.1:0") as server, Stage(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
+    with (
+        Served("tcp/127.0.0.1:0") as server,
+        FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada,
+    ):
         model = row()
         with ZenohBus(EVIL, connect=server.endpoint) as bus:
             evil = FakeClient(bus, model, (2.0, 0.0))
@@ -134,12 +137,12 @@ def test_real_sessions_and_the_server_live_through_a_storm():
                 publisher = publishers.get(key) or publishers.setdefault(key, bus.publisher(key, reliable=True))
                 publisher.put(payload)
                 if number % 20 == 0:
-                    bus.ask("clock", payload)
+                    bus.query("clock", payload)
                     time.sleep(0.005)
             wait(lambda: ada.tell()["counters"]["malformed"] > before["malformed"] + 100, "the broken ones to count")
             assert ada.tell()["ticks"] > ticks
         wait(lambda: EVIL in ada.tell()["went"], "the storm to be over")
-        with Stage(server.endpoint, [{"name": "bob", "place": [2.0, 0.0]}]) as bob:
+        with FakeClientProcess(server.endpoint, [{"name": "bob", "place": [2.0, 0.0]}]) as bob:
             wait(lambda: "ada" in bob.tell()["poses"], "another to be let in as ever")
             ada.tell(touch=[3])
             wait(lambda: bob.tell()["owner"].get("3") == "ada", "the stream to go on")
@@ -160,5 +163,5 @@ for say in (b"GET / HTTP/1.1\\r\\n\\r\\n", os.urandom(4000), b"", b"\\xff" * 700
     with Served("tcp/127.0.0.1:0") as server:
         host, port = server.endpoint.removeprefix("tcp/").split(":")
         subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=20)
-        with Stage(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
+        with FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
             assert ada.tell()["trouble"] == ""

@@ -23,7 +23,7 @@ class Pair:
 
     def tick(self, wrenches: dict | None = None) -> dict[str, np.ndarray]:
         now = self.hub.time
-        for key, payload in self.robot_bus.drain():
+        for key, payload in self.robot_bus.poll():
             assert key == "force/anna/eva"
             self.robot.receive(payload, "eva", now)
         self.left += self.person.publish({"anna": wrenches} if wrenches else {}, now, now)
@@ -72,7 +72,7 @@ def test_who_falls_silent_pushes_no_more():
     stale = 0
     for _ in range(30):
         now = pair.hub.time
-        for _, payload in pair.robot_bus.drain():
+        for _, payload in pair.robot_bus.poll():
             pair.robot.receive(payload, "eva", now)
         pair.hub.advance(TICK)
         stale += bool(pair.robot.net_wrenches(now))

@@ -95,7 +95,7 @@ def test_an_exchange_with_a_buffer_shows_a_swinging_robot_late_and_exactly():
     def errors(buffer: float) -> np.ndarray:
         hub = MemoryHub(delay=0.05, jitter=0.04, seed=3)
         server = hub.bus("server")
-        server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+        server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
         model = row(1)
         hello = Hello("bob", digest="puppets", joints=0)
         ada = FakeClient(hub.bus("ada"), model, (1.0, 0.0))

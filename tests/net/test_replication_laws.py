@@ -25,7 +25,9 @@ class Keeper(Server):
 
     def open(self) -> None:
         super().open()
-        self.bus.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.hub.time))
+        self.bus.declare_queryable(
+            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.hub.time)
+        )
 
 
 class World:

@@ -55,7 +55,7 @@ said = st.lists(st.tuples(st.tuples(st.integers(-2, 2), st.just(0)), facts), max
 def test_in_any_order_and_from_disk_the_same_is_told(tmp_path_factory, sayings, random):
     folder = tmp_path_factory.mktemp("kept")
     # an author says one thing under one claim, in one cell
-    once = {(one.claim, one.thing): (cell, one) for cell, one in sayings}
+    once = {(one.claim, one.object): (cell, one) for cell, one in sayings}
     sayings = list(once.values())
     expected = RetainedState()
     for cell, one in sayings:

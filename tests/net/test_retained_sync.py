@@ -41,7 +41,7 @@ def test_a_fact_waits_until_somebody_listens_and_leaves_once():
     ada.publish(THERE, fact(1, 40.0))
     ada.publish(THERE, fact(1, 41.0, authority=2))
     speak(hub, ada)
-    ((_, payload),) = server.drain()
+    ((_, payload),) = server.poll()
     assert [one.pose[0] for one in messages.decode_records(payload)] == [41.0]
 
 
@@ -52,7 +52,7 @@ def test_many_facts_travel_together_in_messages_below_a_datagram():
     for box in range(40):
         ada.publish(HERE, fact(box))
     speak(hub, ada, 10)
-    came = server.drain()
+    came = server.poll()
     assert sum(len(messages.decode_records(payload)) for _, payload in came) == 40
     assert max(len(payload) for _, payload in came) <= messages.MAX_DATAGRAM
     assert len(came) <= 5
@@ -67,21 +67,23 @@ def test_what_i_said_last_is_said_again_when_the_server_was_gone():
     speak(hub, ada)
     # another one has moved box 1 since: that is for it to repeat
     assert ada.merge(HERE, fact(1, 5.0, "bob", 2))
-    server.drain()
+    server.poll()
     hub.down = True
     speak(hub, ada)
     hub.down = False
     speak(hub, ada)
-    ((_, payload),) = server.drain()
+    ((_, payload),) = server.poll()
     assert [one.object for one in messages.decode_records(payload)] == [object_id(ObjectKind.BOX, 0)]
     speak(hub, ada, 100)
-    assert server.drain() == []
+    assert server.poll() == []
 
 
 def test_the_server_is_asked_once_for_each_cell_and_again_only_if_it_is_silent():
     hub, asked = MemoryHub(), []
     ada, server = RetainedSync(hub.bus("ada"), Counters()), hub.bus("server")
-    server.serve("snap/0/0", lambda _: asked.append(hub.time) or messages.encode_records([fact(3, 1.0, "bob")]))
+    server.declare_queryable(
+        "snap/0/0", lambda _: asked.append(hub.time) or messages.encode_records([fact(3, 1.0, "bob")])
+    )
     speak(hub, ada)
     assert len(asked) == 1
     ((key, payload, _),) = ada.bus.replies()

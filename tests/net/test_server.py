@@ -69,10 +69,10 @@ def test_the_roster_follows_who_comes_and_goes():
 
 def test_the_clock_answers_with_the_time_of_day():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
-        ada.ask("clock", b"nonsense")
-        ada.ask("clock", messages.encode_time(12.5))
+        ada.query("clock", b"nonsense")
+        ada.query("clock", messages.encode_time(12.5))
         answers: list = []
-        wait(lambda: answers.extend(ada.answers()) or answers, "the time")
+        wait(lambda: answers.extend(ada.replies()) or answers, "the time")
         asked, told = messages.decode_time(answers[0].payload)
         assert asked == 12.5
         assert abs(told - time.time()) < 10.0
@@ -162,13 +162,13 @@ def test_who_is_in_says_so_again_to_a_server_that_was_started_anew():
         ada.join(hello("ada"))
         endpoint = first.endpoint
         first.close()
-        wait(lambda: ada.trouble, "ada to miss the server")
+        wait(lambda: ada.status_message, "ada to miss the server")
         with Server(endpoint) as second:
             wait(lambda: second._admission.scene_of("vineyard") == SceneId("vsp", "D1"), "ada to say who she is")
-            wait(lambda: not ada.trouble, "ada to be well")
+            wait(lambda: not ada.status_message, "ada to be well")
             second.close()
         with Server(endpoint, plan=SceneId("tendone", "D2")):
-            wait(lambda: "'tendone'" in ada.trouble, "ada to be told that she is in another vineyard now")
+            wait(lambda: "'tendone'" in ada.status_message, "ada to be told that she is in another vineyard now")
 
 
 # ---------------------------------------------------------------- facts
@@ -184,9 +184,9 @@ def snapshot(bus, cell, count):
 
     def complete():
         nonlocal answered
-        bus.ask(f"snap/{cell[0]}/{cell[1]}")
+        bus.query(f"snap/{cell[0]}/{cell[1]}")
         time.sleep(0.02)
-        for answer in bus.answers():
+        for answer in bus.replies():
             answered = True
             assert answer.key == f"snap/{cell[0]}/{cell[1]}"
             found.update({fact.object: fact for fact in messages.decode_records(answer.payload)})
@@ -225,9 +225,9 @@ def test_a_large_snapshot_comes_in_several_answers():
         say(ada, (0, 0), *[box(number) for number in range(1000)])
         say(ada, (0, 0), *[box(number) for number in range(1000, 2000)])
         assert snapshot(ada, (0, 0), 2000) == [box(number) for number in range(2000)]
-        ada.ask("snap/0/0")
+        ada.query("snap/0/0")
         answers: list = []
-        wait(lambda: answers.extend(ada.answers()) or len(answers) > 1, "several answers")
+        wait(lambda: answers.extend(ada.replies()) or len(answers) > 1, "several answers")
         assert max(len(answer.payload) for answer in answers) <= 64_000
 
 
@@ -237,9 +237,9 @@ def test_one_question_for_many_cells_names_each():
         for x in range(3):
             say(ada, (x, 0), box(x))
         snapshot(ada, (2, 0), 1)
-        ada.ask("snap/*/0")
+        ada.query("snap/*/0")
         answers: list = []
-        wait(lambda: answers.extend(ada.answers()) or len(answers) >= 3, "three cells")
+        wait(lambda: answers.extend(ada.replies()) or len(answers) >= 3, "three cells")
         assert sorted(answer.key for answer in answers) == ["snap/0/0", "snap/1/0", "snap/2/0"]
 
 
@@ -259,7 +259,7 @@ def test_what_cannot_be_believed_is_dropped_counted_and_said_once(caplog):
         assert snapshot(ada, (0, 0), 1) == [box()]
         assert len([line for line in caplog.messages if "cannot be believed" in line]) == 1
         for question in ("snap/x/0", "snap/1/1.5"):
-            ada.ask(question)
+            ada.query(question)
         wait(lambda: server.malformed == 9, "two questions that name no cell")
 
 
@@ -327,7 +327,7 @@ def test_a_server_killed_in_full_flight_has_lost_nothing_it_told(tmp_path):
         process.kill()
         process.wait()
         with serving(endpoint, tmp_path):
-            wait(lambda: not ada.trouble, "ada to be back")
+            wait(lambda: not ada.status_message, "ada to be back")
             again = snapshot(ada, (0, 0), 50)
             assert again[:50] == told
             assert again == [box(number) for number in range(len(again))]  # and of the rest the first that came
@@ -354,8 +354,8 @@ def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
             return check
 
         def known():
-            late.ask("snap/0/0")
-            told[:] = [fact for answer in late.answers() for fact in messages.decode_records(answer.payload)] or told
+            late.query("snap/0/0")
+            told[:] = [fact for answer in late.replies() for fact in messages.decode_records(answer.payload)] or told
             return told == [box(number) for number in range(30)]
 
         for number in range(30):
@@ -363,7 +363,7 @@ def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
         wait(ticking(known), "thirty facts")
         first.kill()
         first.wait()
-        wait(ticking(lambda: ada.trouble), "ada to miss the server")
+        wait(ticking(lambda: ada.status_message), "ada to miss the server")
         with serving(endpoint, tmp_path / "another"):  # a folder with nothing in it
             told.clear()
             wait(ticking(known), "the same facts again")
@@ -426,8 +426,8 @@ def test_of_two_linked_servers_one_decides_and_keeps_for_both(protocol):
             with pytest.raises(NameTaken):
                 ZenohBus("ada", connect=relay.endpoint)
             answers: list = []
-            bob.ask("clock", messages.encode_time(1.0))
-            wait(lambda: answers.extend(bob.answers()) or answers, "the time")
+            bob.query("clock", messages.encode_time(1.0))
+            wait(lambda: answers.extend(bob.replies()) or answers, "the time")
             assert (hub.pings, relay.pings) == (1, 0)
 
 
@@ -443,12 +443,15 @@ def test_a_server_that_carries_waits_for_the_one_that_keeps():
     (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
     with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as relay, ZenohBus("ada", connect=relay.endpoint) as ada:
         ada.join(hello("ada"))  # nobody decides yet
-        assert not ada.trouble
+        assert not ada.status_message
         with Server(str(endpoint)) as hub:
             wait(lambda: hub._admission.scene_of("vineyard") == SceneId("vsp", "D1"), "ada to say who she is")
-        wait(lambda: "the server that keeps world 'vineyard' is gone" in ada.trouble, "ada to miss the one that keeps")
+        wait(
+            lambda: "the server that keeps world 'vineyard' is gone" in ada.status_message,
+            "ada to miss the one that keeps",
+        )
         with Server(str(endpoint)) as hub:
-            wait(lambda: not ada.trouble and hub.actors == ["vineyard/ada"], "ada to be well")
+            wait(lambda: not ada.status_message and hub.actors == ["vineyard/ada"], "ada to be well")
 
 
 def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):

@@ -170,13 +170,13 @@ def test_what_was_left_is_replayed_to_a_viewer(story, listen):
             endpoint = replay.stdout.readline().removeprefix("listening on ").strip()
         bus = stack.enter_context(ZenohBus("viewer", connect=endpoint))
         arrived: list[tuple[str, bytes]] = []
-        drain = bus.drain
+        drain = bus.poll
 
         def noted() -> list[tuple[str, bytes]]:
             arrived.extend(new := drain())
             return new
 
-        bus.drain = noted
+        bus.poll = noted
         viewer = Light(bus, 1.5, kind="spectator", joints=0)
         if not listen:
             replay = stack.enter_context(ended(command("replay", str(path), *way)))

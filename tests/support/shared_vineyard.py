@@ -107,13 +107,13 @@ class Server:
         self.bus.subscribe("fact/**", KEEP_ALL)
         for x in self.CELLS:
             for y in self.CELLS:
-                self.bus.serve(f"snap/{x}/{y}", functools.partial(self.tell, (x, y)))
+                self.bus.declare_queryable(f"snap/{x}/{y}", functools.partial(self.tell, (x, y)))
 
     def tell(self, cell: tuple[int, int], _: bytes) -> bytes:
         return messages.encode_records(self.facts.in_cell(cell))
 
     def tick(self) -> None:
-        for key, payload in self.bus.drain():
+        for key, payload in self.bus.poll():
             _, x, y, _ = key.split("/")
             for fact in messages.decode_records(payload):
                 self.facts.merge((int(x), int(y)), fact)

@@ -123,7 +123,7 @@ def play(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.ndarray,
     """A storm against two honest puppets: both, the time of each tick of the first [s], and how many reached it."""
     hub = MemoryHub(delay=0.005, seed=seed)
     server = hub.bus("server")
-    server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+    server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
     model = row()
     ada, bob, evil = (
         FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0), (EVIL, 3.0))

@@ -74,7 +74,7 @@ class Pair:
         self.now = 100.0
         self.hub = MemoryHub(delay=delay, jitter=jitter * delay, loss=loss if delay else 0.0, seed=seed)
         server = self.hub.bus("server")
-        server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now))
+        server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now))
         start = spawn_pose(self.scene, 0)
         self.bunch = find_reachable_bunch(self.model, start)
         self.tree = int(self.model.body_tree[self.model.bunch_body[self.bunch]])
@@ -169,7 +169,7 @@ class Authority:
         pair, physics = self.pair, self.physics
         robot = pair.first.robot
         self._say.put(messages.encode_robot(robot.update(pair.now)))
-        for _, payload in self._bus.drain():
+        for _, payload in self._bus.poll():
             update = messages.decode_robot(payload, "first")
             if self._copy is None:
                 self._copy = RemoteRobot(physics.rigid, robot.description, "first", 1, update.base_q)
@@ -185,7 +185,7 @@ class Authority:
             )  # fmt: skip
             for message in messages.encode_trees(said)[0]:
                 self._answer.put(message)
-        for _, payload in self._screen.drain():
+        for _, payload in self._screen.poll():
             for update in messages.decode_trees(payload).updates("authority"):
                 if update.tree == pair.tree:
                     self.joint_q = update.joint_q

@@ -82,7 +82,9 @@ def traffic() -> Iterator[Measurement]:
     for case, share in (("all over the block", 1.0), ("in a quarter of it", 0.5)):
         hub = MemoryHub(delay=LAN, seed=1)
         server = hub.bus("server")
-        server.serve("clock", lambda asked, hub=hub: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+        server.declare_queryable(
+            "clock", lambda asked, hub=hub: messages.encode_time(messages.decode_time(asked)[0], hub.time)
+        )
         puppets = cast(hub, model, places(model, share))
         for _ in range(round(SETTLE * 100)):
             _tick(hub, puppets)

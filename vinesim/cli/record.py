@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 
-from vinesim.client.recording.recorder import FAMILIES, Recorder, Stand, grid
+from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, grid
 from vinesim.errors import UsageError
 from vinesim.net.recording.mcap_file import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -47,7 +47,7 @@ def run(
         )  # fmt: skip
         other = f" ({file} is there already and stays as it is)" if path != file else ""
         print(f"recording world {world} at {connect} into {path}{other}", file=sys.stderr, flush=True)
-        standing: list[Stand] = []
+        standing: list[Observer] = []
         begun = said = time.monotonic()
         while not stop.wait(POLL):
             now = time.monotonic()
@@ -58,7 +58,7 @@ def run(
                 recorder.own.add(own)
                 there = stack.enter_context(ZenohBus(own, connect=connect, world=world, certificates=tls))
                 scene_name = recording.metadata.get("scene", "")
-                standing.append(Stand(there, stands[len(standing)], scene_name, recorder.digest, now))
+                standing.append(Observer(there, stands[len(standing)], scene_name, recorder.digest, now))
             recorder.step()
             for stand in standing:
                 stand.step(now)

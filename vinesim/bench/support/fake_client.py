@@ -195,7 +195,7 @@ class FakeClient:
             "trouble": self.bus.status_message,
         }
 
-    def obey(self, order: dict[str, Any]) -> None:
+    def apply(self, order: dict[str, Any]) -> None:
         """``touch``, ``swing``, ``grab``, ``pick``, ``carry``: things; ``lay``: {thing: parent} of what is let go.
 
         ``place``: [x, y] m; ``sway``: m.
@@ -238,7 +238,7 @@ def swung(model: Model, tree: int, time: float, sway: float = SWAY) -> tuple[np.
 # ---------------------------------------------------------------- in processes of their own
 
 
-class Stage:
+class FakeClientProcess:
     """Puppets in a process of their own, seen from the one that plays with them. A context manager."""
 
     def __init__(
@@ -290,7 +290,7 @@ class Stage:
         self.close()
 
 
-def play(
+def run(
     connect: str, puppets: list[dict[str, Any]], *, trees: int = 12, apart: float = 1.0, tick: float = TICK,
     skew: float = 0.0,
 ) -> None:  # fmt: skip
@@ -322,7 +322,7 @@ def play(
                 if order is None:
                     return
                 name = order.pop("who") or next(iter(cast))
-                cast[name].obey(order)
+                cast[name].apply(order)
                 answering.append(name)  # after its next tick
             due += tick
             late += time.monotonic() - due > tick
@@ -346,4 +346,4 @@ def _listen(orders: queue.SimpleQueue) -> None:
 
 
 if __name__ == "__main__":
-    play(**json.loads(sys.argv[1]))
+    run(**json.loads(sys.argv[1]))

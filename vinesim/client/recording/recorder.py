@@ -47,7 +47,7 @@ class AreaTooLarge(ValueError):
     """An area that cannot be asked for; the text says what can."""
 
 
-class Timekeeper:
+class NetworkClock:
     """Network time as a listener keeps it: own clock and the offset to the server's."""
 
     def __init__(self, bus: Bus, now: float) -> None:
@@ -107,7 +107,7 @@ class Recorder:
         self.malformed = 0
         """Messages that were recorded, but are none."""
         self._only, self._everything, self._clock = frozenset(only), everything, clock
-        self._keeper = Timekeeper(bus, clock())
+        self._keeper = NetworkClock(bus, clock())
         self._listening = False
         self._live: set[str] = set()
         self._asked: dict[str, float] = {}
@@ -287,7 +287,7 @@ def grid(area: tuple[float, float, float, float]) -> list[tuple[float, float]]:
     ]
 
 
-class Stand:
+class Observer:
     """A spectator without a world of its own: it is only there, so that others send what happens around it."""
 
     def __init__(self, bus: Bus, place: tuple[float, float], scene: str, digest: str, now: float) -> None:
@@ -298,7 +298,7 @@ class Stand:
         bus.declare_queryable(f"hello/{bus.name}", lambda _: hello)
         self._place = frames.pose([*place, 1.6])
         self._pose = bus.publisher(f"a/{bus.name}/far")
-        self._keeper = Timekeeper(bus, now)
+        self._keeper = NetworkClock(bus, now)
         self._due = -math.inf
 
     def step(self, now: float) -> None:

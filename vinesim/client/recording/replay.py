@@ -17,7 +17,7 @@ import bisect
 import logging
 from collections.abc import Callable, Iterable
 
-from vinesim.client.recording.recorder import Timekeeper
+from vinesim.client.recording.recorder import NetworkClock
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.recording.mcap_file import RecordedMessage, Recording, sender_of
@@ -36,7 +36,7 @@ ENOUGH = 4096
 """So many bytes of facts make an answer [B]."""
 
 
-class Cursor:
+class Playhead:
     """A place on a tape, and who was there and what was true when it was played so far."""
 
     def __init__(self, tape: Recording, start: float = 0.0, end: float | None = None) -> None:
@@ -128,7 +128,7 @@ class ReplayBus:
             raise NameTaken(name, str(tape.path))
         self.name = name
         self.bytes_in = 0
-        self._cursor = Cursor(tape, start, end)
+        self._cursor = Playhead(tape, start, end)
         self._begun, self._played = self._cursor.time, 0.0
         self._store = SampleStore()
         self._subscriptions: list[_Subscription] = []
@@ -156,7 +156,7 @@ class ReplayBus:
     # ------------------------------------------------------------ the bus
 
     @property
-    def lost(self) -> int:
+    def dropped(self) -> int:
         return self._store.overflowed
 
     def join(self, greeting: bytes) -> None:
@@ -169,10 +169,10 @@ class ReplayBus:
         self._subscriptions.append(_Subscription(self._subscriptions, pattern, depth))
         return self._subscriptions[-1]
 
-    def drain(self) -> list[tuple[str, bytes]]:
+    def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
 
-    def ask(self, key: str, payload: bytes = b"") -> None:
+    def query(self, key: str, payload: bytes = b"") -> None:
         family, _, rest = key.partition("/")
         if family == "clock":
             asked, _ = messages.decode_time(payload)
@@ -187,11 +187,11 @@ class ReplayBus:
                 for part in _parts(facts.in_cell((x, y))):
                     self._reply(f"snap/{x}/{y}", messages.encode_records(part))
 
-    def answers(self) -> list[Reply]:
+    def replies(self) -> list[Reply]:
         answers, self._answers = self._answers, []
         return answers
 
-    def serve(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         pass
 
     def alive(self) -> frozenset[str]:
@@ -254,11 +254,11 @@ class Replay:
         """``bus`` is not live: it asks for the time and says what no actor says any more; ``live_bus(name)`` opens
         one for an actor; ``now`` is any clock [s], as in :meth:`step`.
         """
-        self.cursor = Cursor(tape, start, end)
+        self.cursor = Playhead(tape, start, end)
         self.sent = 0
         """Messages that somebody heard."""
         self._bus, self._live_bus, self._speed = bus, live_bus, speed
-        self._keeper = Timekeeper(bus, now)
+        self._keeper = NetworkClock(bus, now)
         self._buses: dict[str, Bus] = {}
         self._publishers: dict[str, Publisher] = {}
         self._start = self.cursor.time

@@ -69,7 +69,7 @@ class ObjectSync:
         if trees:
             self.physics.apply_remote_rest([update.tree for update in trees], [update.joint_q for update in trees])
         if lie:
-            bunches = [split_object_id(fact.thing)[1] for fact in lie]
+            bunches = [split_object_id(fact.object)[1] for fact in lie]
             self._changed_trees.update(self._tree_of(bunch) for bunch in bunches)
             self.physics.dormant_bunches.add(
                 bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie])

@@ -87,7 +87,7 @@ _TREE = np.dtype(
 _BODY = np.dtype([("turn", "<i2", 3), ("rate", "i1", 3)])
 _ROOT = np.dtype([("body", "<u2"), ("position", "<f4", 3), ("velocity", "<i2", 3)])
 _THING = np.dtype(
-    [("thing", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
+    [("object", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
      ("position", "<i2", 3), ("turn", "<u4"), ("velocity", "i1", 3), ("spin", "i1", 3)]
 )  # fmt: skip
 _THIRDS = 1023.0 / np.sqrt(2.0)
@@ -583,7 +583,7 @@ def encode_objects(things: ObjectStates, cell: Cell) -> tuple[list[bytes], Objec
     if not (np.isfinite(things.pose).all() and np.isfinite(things.velocity).all()):
         raise MessageError("state of a thing is not finite")
     records = np.empty(len(ids), _THING)
-    for name in ("thing", "ownership", "authority", "flags"):
+    for name in ("object", "ownership", "authority", "flags"):
         records[name] = getattr(things, name)
     records["position"] = np.clip(np.rint((things.pose[:, :3] - _cell_origin(cell)) / POSITION_LSB), -32767, 32767)
     records["turn"] = _pack_quaternion(things.pose[:, 3:])
@@ -605,7 +605,7 @@ def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
     if not 1 <= count <= MAX_TREES or len(payload) != _HEAD.size + count * _THING.itemsize:
         raise MessageError(f"{count} things announced (1 to {MAX_TREES}) in {len(payload)} B")
     records = np.frombuffer(payload, _THING, count, _HEAD.size)
-    ids = records["thing"].astype(np.int64)
+    ids = records["object"].astype(np.int64)
     if (ids[1:] <= ids[:-1]).any() or ids[0] < OBJECT_STRIDE or ids[-1] >= len(ObjectKind) * OBJECT_STRIDE:
         raise MessageError("things that are trees, of no kind, or in an order that does not increase")
     if (records["flags"] > TOUCHED).any():
@@ -620,7 +620,7 @@ def _read_objects(time: float, records: np.ndarray, cell: Cell) -> ObjectStates:
     doubled = np.stack([records["scale"] % 16, records["scale"] // 16], -1).astype(float)
     unit = np.repeat(MIN_VELOCITY_SCALE * 2.0**doubled, 3, axis=1)
     velocity = np.concatenate([records["velocity"], records["spin"]], -1) * unit
-    ids = records["thing"].astype(np.int64)
+    ids = records["object"].astype(np.int64)
     return ObjectStates(time, ids, records["ownership"], records["authority"], records["flags"], pose, velocity)
 
 
@@ -712,15 +712,15 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
     if len(facts) > MAX_RECORDS:
         raise MessageError(f"{len(facts)} facts in one message, at most {MAX_RECORDS}")
     for fact in facts:
-        check_object_id(fact.thing, counts)
+        check_object_id(fact.object, counts)
         if not (0 <= fact.ownership < 1 << 16 and 0 <= fact.authority < 1 << 16 and is_valid_name(fact.author)):
             raise MessageError(f"fact by {fact.author[:60]!r} with claim ({fact.ownership}, {fact.authority})")
         if not all(-MAX_COORDINATE < number < MAX_COORDINATE for number in fact.pose):
-            raise MessageError(f"fact about thing {fact.thing} at {fact.pose}, not finite or too far away")
+            raise MessageError(f"fact about thing {fact.object} at {fact.pose}, not finite or too far away")
         if not 0.95 < math.hypot(*fact.pose[3:]) < 1.05:
-            raise MessageError(f"fact about thing {fact.thing} with orientation {fact.pose[3:]}, no unit quaternion")
+            raise MessageError(f"fact about thing {fact.object} with orientation {fact.pose[3:]}, no unit quaternion")
         if len(fact.parent) > 200 or len(fact.cut) > MAX_BODIES or any(body < 0 for body in fact.cut):
-            raise MessageError(f"fact about thing {fact.thing} with a parent or cuts that cannot be")
+            raise MessageError(f"fact about thing {fact.object} with a parent or cuts that cannot be")
     return facts
 
 

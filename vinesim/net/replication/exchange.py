@@ -85,7 +85,7 @@ class Replicator:
     """One client's share in a world: call :meth:`receive` and :meth:`send` once a tick, from one thread.
 
     ``now`` is any clock of the client that runs in seconds; the offset to the server's clock is kept inside. Trees,
-    boxes and loose bunches are things, numbered by :func:`vinesim.scene.ids.thing`.
+    boxes and loose bunches are things, numbered by :func:`vinesim.scene.ids.object_id`.
     """
 
     def __init__(

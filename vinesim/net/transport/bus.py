@@ -331,11 +331,11 @@ class MemoryBus:
         self._subscriptions: list[MemorySubscription] = []
 
     @property
-    def lost(self) -> int:
+    def dropped(self) -> int:
         return self._store.overflowed
 
     @property
-    def trouble(self) -> str:
+    def status_message(self) -> str:
         return "the hub is down" if self.hub.down else ""
 
     def join(self, greeting: bytes) -> None:
@@ -365,18 +365,18 @@ class MemoryBus:
             self.bytes_in += len(payload)
             self._store.put(max(depths), key, payload)
 
-    def drain(self) -> list[tuple[str, bytes]]:
+    def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
 
-    def ask(self, key: str, payload: bytes = b"") -> None:
+    def query(self, key: str, payload: bytes = b"") -> None:
         if not self.hub.down:
             self.hub.question(self, key, payload)
 
-    def answers(self) -> list[Reply]:
+    def replies(self) -> list[Reply]:
         replied, self.replied = self.replied, []
         return [Reply(key, payload, self.hub.time - at) for key, payload, at in replied]
 
-    def serve(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         self.served[key] = respond
 
     def alive(self) -> frozenset[str]:

@@ -358,11 +358,11 @@ class ZenohBus:
     # ------------------------------------------------------------ the bus
 
     @property
-    def lost(self) -> int:
+    def dropped(self) -> int:
         return self._store.overflowed + self._huge
 
     @property
-    def trouble(self) -> str:
+    def status_message(self) -> str:
         if self._refusal:
             return self._refusal
         for endpoint in sorted(self._gone):
@@ -468,10 +468,10 @@ class ZenohBus:
             self.movable.add(subscription)
         return subscription
 
-    def drain(self) -> list[tuple[str, bytes]]:
+    def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
 
-    def ask(self, key: str, payload: bytes = b"") -> None:
+    def query(self, key: str, payload: bytes = b"") -> None:
         skip = len(self._prefix)
 
         def hear(reply: zenoh.Reply) -> None:
@@ -487,14 +487,14 @@ class ZenohBus:
             )
         )
 
-    def answers(self) -> list[Reply]:
+    def replies(self) -> list[Reply]:
         now, found = time.monotonic(), []
         while self._answers:
             key, payload, arrived = self._answers.popleft()
             found.append(Reply(key, payload, now - arrived))
         return found
 
-    def serve(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         def answer(query: zenoh.Query) -> None:
             with query:
                 asked = query.payload
