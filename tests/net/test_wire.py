@@ -13,9 +13,9 @@ from collections.abc import Iterator
 import pytest
 
 from tests.support.live_server import Served, need_links, wait
-from vinesim.bench.support.fake_client import Stage
-from vinesim.bench.support.network_emulator import Count, Emulator, Line
-from vinesim.scene.ids import Kind, thing
+from vinesim.bench.support.fake_client import FakeClientProcess
+from vinesim.bench.support.network_emulator import Count, Link, NetworkEmulator
+from vinesim.scene.ids import ObjectKind, object_id
 
 WINDOW = 1.0
 """How long is counted [s]."""
@@ -45,12 +45,12 @@ with ZenohBus("ada", connect=sys.argv[1]) as bus:
 class Theatre:
     """A server and three puppets, each at the end of its own line."""
 
-    def __init__(self, net: Emulator) -> None:
+    def __init__(self, net: NetworkEmulator) -> None:
         self.net = net
         self.server = Served("tcp/0.0.0.0:7447", lambda *a, **k: net.start("hub", *a, **k))
         places = {"ada": 1.0, "bob": 2.0, "cleo": 30.0}
         self.stages = {
-            name: Stage(
+            name: FakeClientProcess(
                 f"tcp/{net.hub(name)}:7447",
                 [{"name": name, "place": [x, 0.0], "restless": False}],
                 trees=60,
@@ -103,7 +103,7 @@ class Theatre:
 @pytest.fixture(scope="module")
 def world() -> Iterator[Theatre]:
     need_links()
-    with Emulator({"ada": Line(), "bob": Line(), "cleo": Line()}) as net:
+    with NetworkEmulator({"ada": Link(), "bob": Link(), "cleo": Link()}) as net:
         theatre = Theatre(net)
         try:
             yield theatre
@@ -118,7 +118,7 @@ def apart(a: Count, b: Count) -> int:
 def test_thirty_thousand_puts_that_nobody_wants_cost_what_a_thousand_cost():
     """The first row's zero, where no pose disturbs the count: what an idle connection says in the same time."""
     need_links()
-    with Emulator({"ada": Line()}) as net, Served("tcp/0.0.0.0:7447", lambda *a, **k: net.start("hub", *a, **k)):
+    with NetworkEmulator({"ada": Link()}) as net, Served("tcp/0.0.0.0:7447", lambda *a, **k: net.start("hub", *a, **k)):
         command = [sys.executable, "-c", UNMATCHED, f"tcp/{net.hub('ada')}:7447"]
         ada = net.start("ada", command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert ada.stdin is not None
@@ -231,7 +231,7 @@ def test_actors_are_heard_at_60_hz_near_and_at_5_hz_far(world):
     assert 5.0 < heard["cleo"] < 13.0
 
 
-BUNCH, BOX = thing(Kind.BUNCH, 1), thing(Kind.BOX, 1)
+BUNCH, BOX = object_id(ObjectKind.BUNCH, 1), object_id(ObjectKind.BOX, 1)
 
 
 def facts(before: dict, after: dict, way: str) -> int:
@@ -323,7 +323,7 @@ def test_a_link_that_is_cut_for_five_seconds_heals(world, record_property):
     wait(lambda: bob.tell()["now"] - start > 5.0, "five seconds")
     assert ada.tell()["owner"]["1"] == "ada"
     assert bob.tell()["owner"]["1"] == "bob"
-    world.net.shape("ada", Line())
+    world.net.shape("ada", Link())
     mended = bob.tell()["now"]
     wait(lambda: bob.tell()["came"]["ada"] > mended, "the streams to come again")
     wait(lambda: len({str(s.tell()["claim"].get("1")) for s in (ada, bob)}) == 1, "one claim")

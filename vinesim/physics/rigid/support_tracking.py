@@ -15,7 +15,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.rigid.human_body import wake_body
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.scene.ids import Kind, thing, thing_named
+from vinesim.scene.ids import ObjectKind, object_id, parse_object_name
 
 STILL = 0.005, float(np.radians(1.0))
 """[m] and [rad] What moves and turns less than this in its parent's frame is still."""
@@ -114,7 +114,7 @@ class SupportTracker:
         touched = np.zeros(len(self.object_ids), bool)
         touched[row[np.isin(other, bodies)]] = True
         for hand in self.rigid.human(actor).hands if actor in self.rigid.humans else ():
-            held = None if hand.held is None else thing_named(hand.held[0])
+            held = None if hand.held is None else parse_object_name(hand.held[0])
             if held in self._at:
                 touched[self._at[held]] = True
         on = self._row[other]
@@ -132,7 +132,7 @@ class SupportTracker:
                 found.add((int(self.object_ids[row]), owner[0]))
         for name in self.rigid.humans:
             for hand in self.rigid.human(name).hands:
-                held = None if hand.held is None else thing_named(hand.held[0])
+                held = None if hand.held is None else parse_object_name(hand.held[0])
                 if held in self._at and self._still[self._at[held]] < PATIENCE:
                     found.add((held, name))
         return sorted(found)
@@ -162,7 +162,7 @@ class SupportTracker:
         if parent == GROUND:
             return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
         self._keep_up()
-        box = thing_named(parent)
+        box = parse_object_name(parent)
         if box is not None:
             return self.object_state(box) if box in self._at else None
         body = self._body_named.get(parent)
@@ -305,8 +305,8 @@ class SupportTracker:
             for number, row in self._at.items()
         }
         self._generation = rigid.generation
-        boxes = [thing(Kind.BOX, i) for i in range(len(rigid.model.box_mass))]
-        bunches = [thing(Kind.BUNCH, i) for i in rigid.free_bunches]
+        boxes = [object_id(ObjectKind.BOX, i) for i in range(len(rigid.model.box_mass))]
+        bunches = [object_id(ObjectKind.BUNCH, i) for i in rigid.free_bunches]
         self.object_ids = np.array(sorted(boxes + bunches), np.int64)
         self._at = {number: row for row, number in enumerate(self.object_ids.tolist())}
         self._kind = np.full(m.nbody, _STANDS)
@@ -314,9 +314,9 @@ class SupportTracker:
         self._body = np.zeros(len(self.object_ids), np.int64)
         self._body_named: dict[str, int] = {GROUND: 0}
         for body, (actor, link) in rigid.owners.items():
-            number = thing_named(actor)
+            number = parse_object_name(actor)
             if number is not None:
-                self._kind[body] = _BOX if number >= thing(Kind.BOX, 0) else _BUNCH
+                self._kind[body] = _BOX if number >= object_id(ObjectKind.BOX, 0) else _BUNCH
                 self._row[body] = self._at[number]
                 self._body[self._at[number]] = body
                 self._body_named[actor] = body
@@ -328,7 +328,7 @@ class SupportTracker:
         self._tree = m.body_treeid[self._body]
         self._parent = np.zeros(len(self.object_ids), np.int64)
         self._anchor = self._poses(np.arange(len(self.object_ids)))
-        self._still = np.where(self.object_ids >= thing(Kind.BOX, 0), PATIENCE, 0)
+        self._still = np.where(self.object_ids >= object_id(ObjectKind.BOX, 0), PATIENCE, 0)
         self._calm = self._still.copy()
         self._pairs, self._touched = np.zeros((0, 2), np.int64), None
         self._bands_before = np.tile(STILL, (len(self.object_ids), 1))

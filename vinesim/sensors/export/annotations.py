@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from vinesim.scene.berries import VARIETIES
-from vinesim.scene.ids import Kind, Organ, thing, thing_name
+from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
 
@@ -57,7 +57,7 @@ def bunch_records(
     return [
         {
             "bunch": one.bunch,
-            "name": thing_name(thing(Kind.BUNCH, one.bunch)),
+            "name": object_name(object_id(ObjectKind.BUNCH, one.bunch)),
             "label": one.label,
             "tree": one.tree,
             "variety": VARIETIES[one.variety].name,
