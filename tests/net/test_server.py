@@ -370,7 +370,9 @@ def test_the_scene_is_kept_with_the_facts(tmp_path):
         snapshot(ada, (0, 0), 1)
     assert [path.name for path in tmp_path.iterdir()] == ["vineyard.facts"]
     with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("bob", connect=server.endpoint) as bob:
-        with pytest.raises(JoinRejected, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--state-dir"):
+        with pytest.raises(
+            JoinRejected, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--state-dir"
+        ):
             bob.join(hello("bob", "D2"))
         assert snapshot(bob, (0, 0), 1) == [box()]
 

@@ -29,6 +29,7 @@ from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate
 
+
 @pytest.fixture
 def server() -> Iterator[Server]:
     with Server("tcp/127.0.0.1:0") as running:

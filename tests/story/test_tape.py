@@ -28,7 +28,6 @@ from vinesim.net.transport.certificates import create as new_certificate
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 
-
 def command(*words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "vinesim.cli", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

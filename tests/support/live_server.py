@@ -12,6 +12,7 @@ import pytest
 from tests.support.waiting import wait as wait
 from vinesim.bench.support import network_emulator
 
+
 @functools.cache
 def no_links() -> str:
     return network_emulator.unusable()
