@@ -124,7 +124,7 @@ def test_another_world_does_not_exist(server, certs):
 
 
 def test_nobody_gets_in_without_a_certificate_of_this_authority(server, certs, tmp_path, monkeypatch):
-    monkeypatch.setattr(zenoh_bus, "PATIENCE", 0.7)  # Zenoh tries again for as long as it may
+    monkeypatch.setattr(zenoh_bus, "CONNECT_TIMEOUT", 0.7)  # Zenoh tries again for as long as it may
     address = server.endpoint.partition("/")[2]
     with pytest.raises(ServerUnreachable):
         ZenohBus("ada", connect=f"tcp/{address}")

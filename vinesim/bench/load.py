@@ -54,7 +54,7 @@ with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", 
     def listen():
         while not over.is_set():
             now = time.monotonic()
-            ages.extend(now - struct.unpack_from("d", payload)[0] for _, payload in b.drain())
+            ages.extend(now - struct.unpack_from("d", payload)[0] for _, payload in b.poll())
             time.sleep(0.0005)
 
     over = threading.Event()
