@@ -163,7 +163,7 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
     with bus("ada", server, certs) as ada, bus("bob", server, certs) as bob, bus("guest", server, certs) as guest:
         for each in (ada, bob, guest):
             each.join(hello(each.name))
-        assert server._agreement.plan("vineyard") == SceneId("vsp", "D1")
+        assert server._admission.plan("vineyard") == SceneId("vsp", "D1")
         wait(
             lambda: all(each.alive() == {"ada", "bob", "guest"} for each in (ada, bob, guest)), "all to see each other"
         )

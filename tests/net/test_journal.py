@@ -28,13 +28,13 @@ def fact(index=0, ownership=1, x=0.0, **more):
 
 def add(journal, cell, fact):
     """As the archive does it."""
-    if news := journal.facts.add(cell, fact):
+    if news := journal.state.add(cell, fact):
         journal.append(cell, fact)
     return news
 
 
 def held(journal):
-    return list(journal.facts)
+    return list(journal.state)
 
 
 def fresh(folder, world="w"):

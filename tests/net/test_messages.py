@@ -285,7 +285,7 @@ def test_damaged_messages_raise_nothing_else(data):
         one_message(trees(rng, [3, 4])),
         one_message(cut(trees(rng, [3, 4]), [1, 2], rng)),
         messages.encode_objects(things(rng, 3), (0, 0))[0][0],
-        messages.encode_records([fact(), fact(thing=3)]),
+        messages.encode_records([fact(), fact(object=3)]),
         messages.encode_hello(Hello("a", urdf="<robot/>")),
         messages.encode_claims([(1, Claim(1, 2, "a"), True)]),
         messages.encode_time(1.0, 2.0),
@@ -320,7 +320,7 @@ def test_things_come_back_within_quantisation(seed, count, where, speed):
 @pytest.mark.parametrize("number", [5, 3 * ids.OBJECT_STRIDE])
 def test_a_thing_that_is_none_is_refused(number):
     batch = things(np.random.default_rng(0), 1)
-    (payload,), _ = messages.encode_objects(dataclasses.replace(batch, thing=np.array([number])), (0, 0))
+    (payload,), _ = messages.encode_objects(dataclasses.replace(batch, object=np.array([number])), (0, 0))
     with pytest.raises(MessageError, match="of no kind"):
         messages.decode_objects(payload, (0, 0))
     with pytest.raises(MessageError, match="bunch 17, this vineyard has 17"):
@@ -352,7 +352,7 @@ def fact(**change) -> messages.RetainedRecord:
 
 
 def test_facts_come_back_as_they_were_said():
-    told = [fact(), fact(thing=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
+    told = [fact(), fact(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
     heard = messages.decode_records(messages.encode_records(told))
     assert heard == told
     assert heard[0].claim == Claim(3, 65535, "picker")
