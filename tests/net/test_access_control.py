@@ -11,6 +11,7 @@ import time
 import pytest
 import zenoh
 
+from tests.support.waiting import wait
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.server.admission import SceneId
@@ -22,13 +23,6 @@ from vinesim.net.transport.certificates import create, roles
 from vinesim.net.transport.endpoints import parse
 from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus, close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
-
-
-def wait(condition, what):
-    end = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for: {what}"
-        time.sleep(0.002)
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
+from tests.support.waiting import TIMEOUT
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import WrenchMessage, encode_human, encode_wrenches
 from vinesim.net.recording import mcap_file
@@ -50,7 +51,7 @@ def test_whatever_was_put_in_comes_out_to_the_bit(tmp_path_factory, entries):
 
 def until(condition) -> None:
     """Wait for the thread that writes."""
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)

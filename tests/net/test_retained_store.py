@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import errno
-import time
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.waiting import wait
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.replication.retained import RetainedState
@@ -19,13 +19,6 @@ from vinesim.scene.ids import ObjectKind, object_id
 
 PLAN = SceneId("vsp", "D1")
 PLENTY = Quota(1e9, 1e12)
-
-
-def wait(condition, what):
-    end = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for: {what}"
-        time.sleep(0.002)
 
 
 def fact(index=0, ownership=1, author="ada", cut=()):

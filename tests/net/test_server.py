@@ -13,6 +13,7 @@ import time
 import pytest
 import zenoh
 
+from tests.support.waiting import wait
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello, RetainedRecord, Welcome
 from vinesim.net.counters import Counters
@@ -25,13 +26,6 @@ from vinesim.net.transport.bus import KEEP_ALL, JoinRejected, NameTaken
 from vinesim.net.transport.endpoints import resolve_ports
 from vinesim.net.transport.zenoh_bus import ZenohBus, close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
-
-
-def wait(condition, what: str) -> None:
-    end = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for: {what}"
-        time.sleep(0.002)
 
 
 def test_a_free_port_is_chosen_and_reported():
@@ -85,7 +79,7 @@ def test_run_returns_when_stopped():
         thread.start()
         assert thread.is_alive()
         server.stop()
-        thread.join(timeout=10.0)
+        thread.join(timeout=60.0)
         assert not thread.is_alive()
     server.close()
 
@@ -376,7 +370,9 @@ def test_the_scene_is_kept_with_the_facts(tmp_path):
         snapshot(ada, (0, 0), 1)
     assert [path.name for path in tmp_path.iterdir()] == ["vineyard.facts"]
     with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("bob", connect=server.endpoint) as bob:
-        with pytest.raises(JoinRejected, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--keep"):
+        with pytest.raises(
+            JoinRejected, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--state-dir"
+        ):
             bob.join(hello("bob", "D2"))
         assert snapshot(bob, (0, 0), 1) == [box()]
 
@@ -455,7 +451,9 @@ def test_a_server_that_carries_waits_for_the_one_that_keeps():
 
 
 def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):
-    with pytest.raises(ValueError, match=r"only carries: give --keep, --scene and --max-clients to the one server"):
+    with pytest.raises(
+        ValueError, match=r"only carries: give --state-dir, --scene and --max-clients to the one server"
+    ):
         Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], keep=tmp_path)
 
 

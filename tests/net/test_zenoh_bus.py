@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from tests.support.waiting import TIMEOUT, wait
 from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
@@ -27,16 +28,6 @@ from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate
-
-PATIENCE = 10.0
-
-
-def wait(condition: Callable[[], object], what: str) -> None:
-    """Until it holds; fails in words after ten seconds."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f"waited {PATIENCE} s in vain for: {what}"
-        time.sleep(0.002)
 
 
 @pytest.fixture
@@ -214,7 +205,7 @@ def test_questions_find_their_answers(server):
 
         wait(asked, "bob's answer")
         assert answers[0][:2] == ("hello/bob", b"hi!")
-        assert 0.0 <= answers[0].age < PATIENCE
+        assert 0.0 <= answers[0].age < TIMEOUT
 
 
 def test_a_huge_sample_is_not_kept(server):

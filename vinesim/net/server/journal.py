@@ -68,15 +68,15 @@ class Journal:
             content = path.read_bytes()
         except OSError as error:
             raise JournalError(
-                f"{path}: cannot be read ({error.strerror}): mend that, or give another --keep"
+                f"{path}: cannot be read ({error.strerror}): mend that, or give another --state-dir"
             ) from error
         start = MAGIC + bytes((VERSION,))
         if not content.startswith(MAGIC):
-            raise JournalError(f"{path}: is no journal of facts: move it away, or give another --keep")
+            raise JournalError(f"{path}: is no journal of facts: move it away, or give another --state-dir")
         if not content.startswith(start):
             raise JournalError(
                 f"{path}: journal of version {content[len(MAGIC) : len(start)].hex() or 'none'}, this release reads "
-                f"{VERSION:02x}: use the release that wrote it, or give another --keep"
+                f"{VERSION:02x}: use the release that wrote it, or give another --state-dir"
             )
         head: _Header | None = None
         facts = RetainedState()
@@ -89,7 +89,7 @@ class Journal:
                     if head.protocol != messages.PROTOCOL:
                         raise JournalError(
                             f"{path}: facts of protocol version {head.protocol}, this release speaks "
-                            f"{messages.PROTOCOL}: use the release that wrote them, or give another --keep"
+                            f"{messages.PROTOCOL}: use the release that wrote them, or give another --state-dir"
                         )
                 else:
                     for fact in messages.decode_records(record[_CELL.size :]):
@@ -99,7 +99,7 @@ class Journal:
             why = str(error)
         if head is None:
             raise JournalError(
-                f"{path}: {why}, so nobody knows whose facts these are: move it away, or give another --keep"
+                f"{path}: {why}, so nobody knows whose facts these are: move it away, or give another --state-dir"
             )
         if sound < len(content):
             aside = _free_name(path)
@@ -217,7 +217,7 @@ def _free_name(path: pathlib.Path) -> pathlib.Path:
 
 
 def _cannot_write(path: pathlib.Path, error: OSError) -> JournalError:
-    return JournalError(f"{path}: cannot be written ({error.strerror}): make room or give another --keep")
+    return JournalError(f"{path}: cannot be written ({error.strerror}): make room or give another --state-dir")
 
 
 _encoder = msgspec.msgpack.Encoder()
