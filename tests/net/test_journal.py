@@ -28,7 +28,7 @@ def fact(index=0, ownership=1, x=0.0, **more):
 
 def add(journal, cell, fact):
     """As the archive does it."""
-    if news := journal.state.add(cell, fact):
+    if news := journal.state.merge(cell, fact):
         journal.append(cell, fact)
     return news
 
@@ -159,7 +159,7 @@ def test_an_unwritable_folder_is_one_line(tmp_path):
 
 
 def test_what_holds_no_more_is_left_out_in_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(keep, "SLACK", 10)
+    monkeypatch.setattr(keep, "MAX_OBSOLETE_RECORDS", 10)
     with fresh(tmp_path) as journal:
         for ownership in range(1, 200):
             add(journal, (0, 0), fact(0, ownership))

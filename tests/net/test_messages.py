@@ -345,7 +345,7 @@ def test_trees_come_back_with_what_was_cut_off_them(seed, shapes):
 
 
 def fact(**change) -> messages.RetainedRecord:
-    usual = {"thing": ids.object_id(ids.ObjectKind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
+    usual = {"object": ids.object_id(ids.ObjectKind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
     return messages.RetainedRecord(
         **{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change}
     )
@@ -363,8 +363,8 @@ def test_facts_come_back_as_they_were_said():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"thing": 3 * ids.OBJECT_STRIDE}, "of no kind"),
-        ({"thing": -1}, "of no kind"),
+        ({"object": 3 * ids.OBJECT_STRIDE}, "of no kind"),
+        ({"object": -1}, "of no kind"),
         ({"authority": 65536}, "with claim"),
         ({"author": "a/b"}, "fact by 'a/b'"),
         ({"pose": (np.nan, 0, 0, 0, 0, 0, 1.0)}, "not finite"),

@@ -27,7 +27,7 @@ def fact(index=0, ownership=1, author="ada", cut=()):
 
 
 def hear(kept, fact, cell=(0, 0), world="w"):
-    kept.hear(f"{world}/fact/{cell[0]}/{cell[1]}/{fact.author}", messages.encode_records([fact]))
+    kept.submit(f"{world}/fact/{cell[0]}/{cell[1]}/{fact.author}", messages.encode_records([fact]))
 
 
 def told(kept, world="w"):
@@ -74,7 +74,7 @@ def test_a_cell_with_nothing_is_answered_with_nothing():
 
 
 def test_answers_are_cut_to_what_may_be_sent(monkeypatch):
-    monkeypatch.setattr(retained_store, "ANSWER", 500)
+    monkeypatch.setattr(retained_store, "MAX_REPLY", 500)
     kept = RetainedStore(quota=PLENTY)
     kept.open("w", PLAN)
     for index in range(100):
@@ -86,7 +86,7 @@ def test_answers_are_cut_to_what_may_be_sent(monkeypatch):
 
 
 def test_there_is_an_end_to_what_is_kept(monkeypatch):
-    monkeypatch.setattr(retained_store, "MOST", 3)
+    monkeypatch.setattr(retained_store, "MAX_OBJECTS", 3)
     kept = RetainedStore(quota=PLENTY)
     kept.open("w", PLAN)
     for index in range(5):
@@ -108,7 +108,7 @@ def test_a_quota_fills_again_with_time(monkeypatch):
 
 
 def test_when_the_disk_is_full_nothing_is_forgotten_and_when_it_is_not_all_is_written(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(retained_store, "RECOVER", 0.05)
+    monkeypatch.setattr(retained_store, "RETRY_PERIOD", 0.05)
     kept = RetainedStore(tmp_path, PLENTY)
     kept.open("w", PLAN)
     hear(kept, fact(0))
@@ -146,7 +146,7 @@ def test_a_key_that_names_no_cell_is_malformed(key):
 
 
 def test_a_flood_is_dropped_not_hoarded(monkeypatch):
-    monkeypatch.setattr(retained_store, "SHELF", 10)
+    monkeypatch.setattr(retained_store, "MAX_QUEUED", 10)
     kept = RetainedStore(quota=PLENTY)
     kept.open("w", PLAN)
     with kept._lock:  # while the archive cannot go on

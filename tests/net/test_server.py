@@ -277,7 +277,7 @@ def test_who_says_too_much_is_cut_off_and_nobody_else(caplog):
 
 
 def test_facts_wait_until_somebody_is_let_into_their_world(monkeypatch):
-    monkeypatch.setattr(retained_store, "EARLY", 2)
+    monkeypatch.setattr(retained_store, "MAX_EARLY", 2)
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         for number in range(3):
             say(ada, (0, 0), box(number))
@@ -394,7 +394,7 @@ def meet(one, other):
         def arrived(pose=pose, receiver=receiver, heard=heard):
             pose.put(b"pose")
             time.sleep(0.002)
-            heard.update(receiver.drain())
+            heard.update(receiver.poll())
             return len(heard) == 2
 
         wait(arrived, "a pose and an event")

@@ -428,7 +428,7 @@ class DatagramWire:
 
 
 def test_when_datagrams_pass_no_more_poses_take_the_stream(caplog, monkeypatch):
-    monkeypatch.setattr(zenoh_bus, "SILENT", 1.0)
+    monkeypatch.setattr(zenoh_bus, "SILENCE_TIMEOUT", 1.0)
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, Wire(server.endpoint) as wire:
         port = int(wire.endpoint.rpartition(":")[2])
         datagrams = DatagramWire(port, server.endpoints[1].port)

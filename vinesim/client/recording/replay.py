@@ -120,7 +120,7 @@ class ReplayBus:
     """A member of a world that happened already; see :class:`vinesim.net.transport.bus.Bus`. What it says nobody hears."""
 
     bytes_out = 0
-    trouble = ""
+    status_message = ""
 
     def __init__(self, tape: Recording, name: str = "viewer", *, start: float = 0.0, end: float | None = None) -> None:
         """``start``, ``end`` [s] after the first message; :class:`NameTaken` if somebody on the tape has the name."""
