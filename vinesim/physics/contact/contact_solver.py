@@ -20,7 +20,6 @@ from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE, RigidGeoms
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene.model import Model
 from vinesim.scene.values import Contact
 
@@ -615,7 +614,7 @@ class ContactSolver:
         )  # fmt: skip
         self._coupling = bind_launch(
             kernels.couple,
-            [dt, k, c, FRICTION, g_friction, g_dof, g_root, d_parent, *ints("hits"),
+            [dt, k, c, self.rigid.parameters.friction, g_friction, g_dof, g_root, d_parent, *ints("hits"),
              *flat[1:], *ints("contact_shape", "contact_body", "other_body"), body_q,
              body_qd_free, *doubles("dof_free"), cdof, com, *ints("known_count"), *known],
             [*ints("other"), *doubles("gap", "friction"), *vectors("point"), axes,
