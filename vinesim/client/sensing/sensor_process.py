@@ -20,7 +20,7 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.sensing.latest_value import LatestValue, poller
 from vinesim.client.sensing.sensor_worker import SensorConfig, StepSnapshot, run_sensor_worker
-from vinesim.client.tasks.tasks import RosCommandHandler
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.robot import Robot
 from vinesim.ros import ros_setup
