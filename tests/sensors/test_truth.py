@@ -9,12 +9,12 @@ from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.values import CameraFrame, CameraInfo, Link
+from vinesim.scene.values import CameraFrame, CameraInfo, RigidVisual
 from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitive_batches import SPHEROID
+from vinesim.sensors.raster.primitive_arrays import SPHEROID
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.truth import truth
 
@@ -259,7 +259,7 @@ def test_a_picked_bunch_keeps_its_number(grove) -> None:
     bunch = 22
     pose = _before(model, rest, bunch)
     before = _of(truth.bunch_truths(primitives, rest, truth.render_buffers(primitives, NEAR, pose)), bunch)
-    link = Link(f"bunch/{bunch}", Organ.BUNCH, bunch, ())
+    link = RigidVisual(f"bunch/{bunch}", Organ.BUNCH, bunch, ())
     lying = rest_snapshot(model, (link,), rest.body_q[model.bunch_body[[bunch]]])
     lying.bunch_attached[bunch] = False
     loose = Primitives(model, grass=2.0)
@@ -311,7 +311,7 @@ def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
     hub = body_q[model.tree_first[tree], :3].astype(float)
     body_q[bodies, :3] = hub + frames.rotate(turn, body_q[bodies, :3] - hub)
     body_q[bodies, 3:] = frames.multiply(turn, body_q[bodies, 3:])
-    primitives.update(dataclasses.replace(view, body_q=body_q, moved=np.array([tree])))
+    primitives.update(dataclasses.replace(view, body_q=body_q, moved_trees=np.array([tree])))
     shift, _ = truth.optical_flow(one, truth.render_buffers(primitives, NEAR, pose))
     carried = np.append(np.isin(one.carrier_poses[:, :3], view.body_q[bodies, :3]).all(1), [False, False])[
         one.primitive

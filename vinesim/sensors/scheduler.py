@@ -23,7 +23,7 @@ from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.sensing import lidar_echoes, stereo_depth
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, LidarScan, View
+from vinesim.scene.values import CameraFrame, LidarScan, Snapshot
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
@@ -95,7 +95,7 @@ class SensorScheduler:
         self._scans = {m.name: SpinningScan(m.sensor, m.rate) for m in sensors if isinstance(m.sensor, Lidar)}
         self._pending_poses: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in self._scans}
         self._condition = threading.Condition()
-        self._latest: tuple[View, Mapping[str, np.ndarray]] | None = None
+        self._latest: tuple[Snapshot, Mapping[str, np.ndarray]] | None = None
         self._moved_trees: list[np.ndarray] = []
         self._stopping = False
         self._thread: threading.Thread | None = None
@@ -131,17 +131,17 @@ class SensorScheduler:
             if kind is None:  # a failure of the body comes first
                 raise
 
-    def submit(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
+    def submit(self, snapshot: Snapshot, poses: Mapping[str, np.ndarray]) -> None:
         """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
         self._raise()
         with self._condition:
-            self._latest = (view, poses)
+            self._latest = (snapshot, poses)
             for name in self._pending_poses.keys() & poses.keys():
-                self._pending_poses[name].append((view.time, poses[name]))
+                self._pending_poses[name].append((snapshot.time, poses[name]))
                 if len(self._pending_poses[name]) > _MAX_PENDING_POSES:
                     del self._pending_poses[name][: _MAX_PENDING_POSES // 2]
-            if len(view.moved):
-                self._moved_trees.append(view.moved)
+            if len(snapshot.moved_trees):
+                self._moved_trees.append(snapshot.moved_trees)
                 if len(self._moved_trees) > 256:
                     self._moved_trees = [np.unique(np.concatenate(self._moved_trees))]
             self._condition.notify()
@@ -161,22 +161,22 @@ class SensorScheduler:
                     self._condition.wait_for(lambda: self._stopping or self._latest is not None)
                     if self._stopping:
                         return
-                    (view, poses), self._latest = self._latest, None
+                    (snapshot, poses), self._latest = self._latest, None
                     moved += self._moved_trees
                     self._moved_trees = []
                     for name, poses_by_time in self._pending_poses.items():
                         for time, pose in poses_by_time:
                             self._scans[name].pose_history.add(time, pose)
                         poses_by_time.clear()
-                due = [m for m in self.sensors if self._is_due(m, view.time, poses)]
+                due = [m for m in self.sensors if self._is_due(m, snapshot.time, poses)]
                 if not due:
                     continue
-                self.primitives.update(view, np.concatenate(moved) if moved else np.zeros(0, np.int64))
+                self.primitives.update(snapshot, np.concatenate(moved) if moved else np.zeros(0, np.int64))
                 moved = []
                 for sensor in due:
                     if self._stopping:
                         return
-                    for result in self._results(sensor, view.time, poses[sensor.name]):
+                    for result in self._results(sensor, snapshot.time, poses[sensor.name]):
                         sensor.deliver(result)
                         self.frames[sensor.name] += 1
         except BaseException as failure:  # surfaced by the next see() or stop()

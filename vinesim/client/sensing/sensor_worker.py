@@ -20,10 +20,11 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.sensing.latest_value import LatestValue, poller
 from vinesim.robot.description.description import RobotDescription
+from vinesim.ros.names import ros_name
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, LidarScan, Link, RobotSample, View
+from vinesim.scene.values import CameraFrame, LidarScan, RigidVisual, RobotSample, Snapshot
 from vinesim.sensors.camera.sunlight import SunPath
 
 log = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ class StepSnapshot:
     body_q: np.ndarray | None
     trees: np.ndarray | None
     attached: np.ndarray
-    links: tuple[Link, ...] | None
+    links: tuple[RigidVisual, ...] | None
     link_q: np.ndarray | None
     poses: dict[str, np.ndarray] | None
     frame_score: float
@@ -99,7 +100,7 @@ class SensorWorker:
     def __init__(self, setup: SensorConfig, pipe: Connection, stack: contextlib.ExitStack) -> None:
         self.setup, self.pipe = setup, pipe
         self._state = State.at_rest(setup.model)
-        self._links: tuple[Link, ...] = ()
+        self._links: tuple[RigidVisual, ...] = ()
         self._kept: CameraFrame | None = None
         self._greatest = -1.0
         self._worth = 0.0
@@ -120,7 +121,7 @@ class SensorWorker:
         fixed = [(p, c, q) for (p, c), q in zip(description.fixed_frames, description.fixed_poses, strict=True)]
         node = stack.enter_context(
             Node(
-                setup.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=setup.namespace,
+                ros_name(setup.name), description.urdf, namespace=setup.namespace,
                 static_transforms=fixed, cameras=[m.name for m in description.cameras],
                 lidars=[m.name for m in description.lidars], base=description.base,
                 clock=setup.clock,
@@ -182,7 +183,7 @@ class SensorWorker:
             self._links = letter.links
         if letter.link_q is not None and len(letter.link_q) == len(self._links):
             self._state.bunch_attached[:] = np.unpackbits(letter.attached, count=len(self._bunch_names))
-            view = View(
+            view = Snapshot(
                 letter.time, letter.tick, self._state.body_q.copy(), self._state.bunch_attached.copy(), self._links,
                 letter.link_q, letter.trees,
             )  # fmt: skip

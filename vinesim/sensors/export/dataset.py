@@ -23,11 +23,11 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
-from vinesim.scene.values import CameraInfo, View
+from vinesim.scene.values import CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
-from vinesim.sensors.scene.plant_primitives import Ripeness
+from vinesim.sensors.scene.bunch_primitives import Ripeness
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.spec_file import SensorError
@@ -78,7 +78,7 @@ class SnapshotSource(Protocol):
         """All that decides what happens, as JSON."""
         ...
 
-    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
+    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
         """What there is, near which point [2] m of the ground to look, and a record of it; None if nothing happens.
 
         It follows from the model and the random numbers alone. ``actors`` of the record are what
@@ -130,7 +130,7 @@ class VineyardRenderer:
         self.model = generate(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
-        self.still: View = rest_snapshot(self.model)
+        self.still: Snapshot = rest_snapshot(self.model)
         self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
         self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer)
         self.primitives.update(self.still)
@@ -142,9 +142,9 @@ class VineyardRenderer:
         """Write everything about one image; its record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _random_sun(rng)
-        view, near, happens = self._pose_scene(image)
-        seen = self._choose_view(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
-        truths = truth.bunch_truths(self.primitives, view, seen, self.caster)
+        snapshot, near, happens = self._pose_scene(image)
+        seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
+        truths = truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image)
         frame = camera.render(self.primitives, seen.pose)
         bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)
@@ -180,7 +180,7 @@ class VineyardRenderer:
         with _atomic_file(_record_path(folder, image)) as part:
             formats.write_json(part, record)
 
-    def _pose_scene(self, image: int) -> tuple[View, np.ndarray | None, dict[str, Any]]:
+    def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
         """What there is in an image, drawn; whatever was there in the image before leaves no trace."""
         every = np.arange(len(self.model.tree_first))
         self.primitives.update(self.still, every)
@@ -192,7 +192,7 @@ class VineyardRenderer:
         return happens
 
     def _choose_view(
-        self, rng: np.random.Generator, view: View, near: np.ndarray | None, actors: list[tuple[float, float]]
+        self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
     ) -> truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 
@@ -200,15 +200,15 @@ class VineyardRenderer:
         place for that is soon found.
         """
         model = self.model
-        hanging = np.flatnonzero(view.bunch_attached)
+        hanging = np.flatnonzero(snapshot.bunch_attached)
         if near is not None:
-            away = np.linalg.norm(view.body_q[model.bunch_body[hanging], :2] - near, axis=1)
+            away = np.linalg.norm(snapshot.body_q[model.bunch_body[hanging], :2] - near, axis=1)
             hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
         if not len(hanging):
             raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
         for attempt in range(_MAX_TRIES):
             bunch = int(hanging[rng.integers(len(hanging))])
-            pose = view.body_q[model.bunch_body[bunch]].astype(float)
+            pose = snapshot.body_q[model.bunch_body[bunch]].astype(float)
             middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
             height, away, around = (
                 rng.uniform(*CAMERA_HEIGHT),
