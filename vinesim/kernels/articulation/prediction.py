@@ -195,20 +195,22 @@ def add_to_parent(
     turning: wp.vec3,
     metric: wp.mat33,
     lever: wp.vec3,
+    J: wp.mat33,
+    H: wp.mat33,
+    M: wp.mat33,
+    bias: wp.spatial_vector,
     DJ: wp.mat33,
     DH: wp.mat33,
+    Du: wp.vec3,
     scratch_out: Scratch,
 ):
     """Add what is left of a subtree's inertia and bias, its joint eliminated, to its parent."""
-    bias = scratch_out.bias[k]
-    H = scratch_out.H[k]
-    Du = scratch_out.Du[k]
     J_left = metric * DJ  # = J - J D J without the cancellation; the same for H
     H_left = metric * DH
-    M_left = scratch_out.M[k] - wp.transpose(H) * DH
+    M_left = M - wp.transpose(H) * DH
     centripetal = wp.cross(turning, wp.cross(turning, lever))
     force = wp.spatial_top(bias) + wp.transpose(H) * Du + M_left * centripetal
-    moment = wp.spatial_bottom(bias) + scratch_out.J[k] * Du + H_left * centripetal + wp.cross(lever, force)
+    moment = wp.spatial_bottom(bias) + J * Du + H_left * centripetal + wp.cross(lever, force)
     tension = scratch_out.tension[k]
     scratch_out.tension[parent] = scratch_out.tension[parent] + tension
     M_arm = wp.transpose(cross_rows(M_left, lever))
@@ -262,6 +264,7 @@ def eliminate_joints(
         bias = scratch_out.bias[k]
         J = scratch_out.J[k]
         H = scratch_out.H[k]
+        M = scratch_out.M[k]
         # the metric acts on the rate as the joint frame sees it, hence turning x omega = turning x (joint rate)
         omega = wp.spatial_bottom(bodies.body_qd[k])
         u = metric * wp.cross(turning, omega) - frame * spring - wp.spatial_bottom(bias)
@@ -276,10 +279,13 @@ def eliminate_joints(
         factors_out.D[k] = D
         factors_out.DJ[k] = DJ
         factors_out.DH[k] = DH
-        scratch_out.Du[k] = D * u
+        Du = D * u
+        scratch_out.Du[k] = Du
         if parent >= 0:
             lever = factors_out.lever[k]
-            add_to_parent(k, parent, ahead, reach, turning, metric, lever, DJ, DH, scratch_out)
+            add_to_parent(
+                k, parent, ahead, reach, turning, metric, lever, J, H, M, bias, DJ, DH, Du, scratch_out
+            )
             if conservative:
                 moment = spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * reach)
                 centripetal = wp.cross(turning, wp.cross(turning, lever))
@@ -287,7 +293,7 @@ def eliminate_joints(
         else:
             factors_out.root_inverse_mass[k] = wp.mat33()
             if model.body_root[k] >= 0:
-                factors_out.root_inverse_mass[k] = wp.inverse(scratch_out.M[k] - wp.transpose(H) * DH)
+                factors_out.root_inverse_mass[k] = wp.inverse(M - wp.transpose(H) * DH)
 
 
 @wp.func
