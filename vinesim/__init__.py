@@ -54,7 +54,7 @@ _MODULES = {
     "PhysicsParameters": "scene.physics_parameters",
     "RecordedMessage": "api.recording",
     "Recording": "api.recording",
-    "Robot": "robot.drives",
+    "Robot": "robot.drives.robot",
     "Scene": "scene.spec",
     "Server": "net.server.server",
     "Simulation": "api.simulation",
