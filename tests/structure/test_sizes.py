@@ -15,13 +15,7 @@ MAX_FUNCTION_LINES = 80
 """Without the docstring."""
 
 KNOWN = {
-    "cli/robot_client.py": 1,
-<<<<<<< HEAD
-    "kernels/raster/camera_raster.py": 3,
-=======
-    "kernels/articulation/dynamics.py": 4,
     "kernels/raster/camera_raster_plants.py": 2,
->>>>>>> main
     "kernels/raster/lidar_raster.py": 1,
     "kernels/raster/pose_clusters.py": 1,
     "kernels/sensing/lidar_echoes.py": 1,
@@ -33,7 +27,6 @@ KNOWN = {
     "net/replication/exchange.py": 1,
     "net/transport/zenoh_bus.py": 1,
     "physics/rigid/rigid_world.py": 1,
-    "robot/description/description.py": 1,
     "scene/generation/vineyard.py": 1,
 }
 """Offences per file that are still to be removed; the numbers only fall."""
