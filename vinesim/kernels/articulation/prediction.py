@@ -283,9 +283,7 @@ def eliminate_joints(
         scratch_out.Du[k] = Du
         if parent >= 0:
             lever = factors_out.lever[k]
-            add_to_parent(
-                k, parent, ahead, reach, turning, metric, lever, J, H, M, bias, DJ, DH, Du, scratch_out
-            )
+            add_to_parent(k, parent, ahead, reach, turning, metric, lever, J, H, M, bias, DJ, DH, Du, scratch_out)
             if conservative:
                 moment = spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * reach)
                 centripetal = wp.cross(turning, wp.cross(turning, lever))
