@@ -71,11 +71,8 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
     """Times of single steps and of their stages, by the code that they belong to."""
     physics = Physics(model)
     for i in range(count):
-        pose = (
-            frames.pose([*ROBOT_POSITION, 0.0], frames.from_yaw(0.5 * np.pi))
-            if i == 0
-            else frames.pose([4.0 * i, -6.0, 0.0])
-        )
+        position = [4.0 * i, -6.0, 0.0] if i else [*ROBOT_POSITION, 0.0]
+        pose = frames.pose(np.array(position), frames.from_yaw(0.0 if i else 0.5 * np.pi))
         home = robot.home if i else raised
         physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
         physics.rigid.command_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))

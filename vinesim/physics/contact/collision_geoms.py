@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -87,8 +88,9 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
 
 def concatenate(first: RigidGeoms, second: RigidGeoms) -> RigidGeoms:
     """The geoms of one list, then those of another."""
-    both = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in dataclasses.fields(RigidGeoms)}
-    return RigidGeoms(**{k: a + b if isinstance(a, tuple) else np.concatenate([a, b]) for k, (a, b) in both.items()})
+    names = [field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link")]
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+    return RigidGeoms(actor=first.actor + second.actor, link=first.link + second.link, **arrays)
 
 
 def persistent_names(geoms: RigidGeoms) -> list[tuple[str, str, int]]:
