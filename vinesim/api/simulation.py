@@ -19,7 +19,7 @@ from vinesim.api.energy import Energy, Momentum, energy, momentum
 from vinesim.errors import UsageError
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
-from vinesim.robot.description import description
+from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import TreeBuilder
 from vinesim.scene.cane import CaneBuilder, assemble
@@ -240,7 +240,7 @@ class Simulation:
             pose: (x, y, yaw) in m and rad, or [7] position and quaternion of the base.
             name: unique name of this robot; ``robot_0``, ``robot_1``, ... unless given.
         """
-        described = description.load(robot)
+        described = load_description(robot)
         index = len(self.robots)
         name = name or f"robot_{index}"
         if name in self.robots:
