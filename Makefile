@@ -1,27 +1,33 @@
-# The README's two commands. Each does all of its own set-up in .venv (see tools/setup).
+# The README's two commands are `make demo` and `make test`. Each does its own set-up in .venv (see tools/setup).
 PYTHON ?= python3
 SECONDS = 20
 SEED = 7
 OUT = out
+JOBS = 2
+PYTEST = .venv/bin/python -m pytest -n $(JOBS) --dist loadgroup
 
-.PHONY: demo test validation setup lint clean
+.PHONY: demo test check lint validation setup clean
 demo:
 	@PYTHON=$(PYTHON) tools/setup run
 	@.venv/bin/vinesim demo --seconds $(SECONDS) --seed $(SEED) --out $(OUT) $(ARGS)
 
-test: lint
-	@.venv/bin/python -m pytest
+test: lint # lint, types and all tests
+	@$(PYTEST)
 
-validation: # figures and pictures of docs/validation.md, by the tests' own code
-	@PYTHON=$(PYTHON) tools/setup test
-	@PYTHONPATH=tests:tests/laws .venv/bin/python tests/laws/plots.py
+check: lint # lint, types, structure and the fast tests
+	@$(PYTEST) -m "not slow"
 
-lint:
-	@PYTHON=$(PYTHON) tools/setup test
+lint: setup
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/lint-imports
 	@.venv/bin/basedpyright --level error
+
+setup:
+	@PYTHON=$(PYTHON) tools/setup test
+
+validation: setup # figures and pictures of docs/validation.md, by the tests' own code
+	@.venv/bin/python -m tests.laws.plots
 
 clean:
 	rm -rf .venv out

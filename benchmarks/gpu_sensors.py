@@ -26,7 +26,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import Link, Shape, View
+from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import MAX_DEPTH, Camera, CameraSpec, pinhole
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
@@ -42,14 +42,16 @@ VIEWS = {
 STAND = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
 
 
-def things() -> Link:
+def things() -> RigidVisual:
     """One solid of each kind, side by side."""
     shapes = [("box", 0.2, 0.1, 0.3), ("cylinder", 0.08, 0.2), ("capsule", 0.07, 0.2), ("ellipsoid", 0.1, 0.05, 0.2)]
     at = frames.pose(np.array([[0.3 * i, 0.0, 0.0] for i in range(len(shapes))]))
-    return Link("things", Organ.ROBOT, 0, tuple(Shape(k, tuple(s), q) for (k, *s), q in zip(shapes, at, strict=True)))
+    return RigidVisual(
+        "things", Organ.ROBOT, 0, tuple(Shape(k, tuple(s), q) for (k, *s), q in zip(shapes, at, strict=True))
+    )
 
 
-def world(model: Model, device: str) -> tuple[Primitives, View]:
+def world(model: Model, device: str) -> tuple[Primitives, Snapshot]:
     """The vineyard with some solids in it."""
     primitives = Primitives(model, device=device)
     view = rest_snapshot(model, (things(),), np.array([[1.6, 0.6, 1.2, *frames.from_yaw(0.5)]]))

@@ -36,7 +36,7 @@ def test_a_row_rests_as_it_is_drawn() -> None:
     for _ in range(100):
         physics.step()
     drawn = model.forward_kinematics(model.joint_settled)
-    np.testing.assert_allclose(physics.view().body_q[:, :3], drawn[:, :3], atol=1e-4)
+    np.testing.assert_allclose(physics.snapshot().body_q[:, :3], drawn[:, :3], atol=1e-4)
     np.testing.assert_allclose(
         drawn[model.bunch_body, :3] - [0, 0, 0.085], [scenes.bunch_center(0), scenes.bunch_center(1)], atol=1e-6
     )

@@ -34,14 +34,14 @@ def filled() -> Physics:
 def test_bunches_fill_a_crate(filled: Physics) -> None:
     """As heavy as asked for, from the nearest vines, at rest, above the bottom and most of them within the walls."""
     model, rigid = filled.model, filled.rigid
-    picked = np.array(rigid.loose)
+    picked = np.array(rigid.free_bunches)
     assert not filled.state.bunch_attached[picked].any()
     assert filled.state.bunch_attached.sum() == len(model.bunch_body) - len(picked)
     inside = np.array(CRATE.size) - [2 * CRATE_WALL, 2 * CRATE_WALL, CRATE_WALL]
     wanted = CRATE.fill * HEAP_DENSITY * np.prod(inside)
     heavy = bunch_masses(model)
     assert wanted - heavy.max() < heavy[picked].sum() <= wanted
-    crate = rigid.link_q()[[link.name for link in rigid.links()].index(f"box/{len(model.box_size) - 1}")]
+    crate = rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{len(model.box_size) - 1}")]
     assert crate[:3] == pytest.approx(CRATE.pose[:3], abs=0.01)
     within = 0
     for bunch in picked:
@@ -55,7 +55,7 @@ def test_bunches_fill_a_crate(filled: Physics) -> None:
 def test_the_same_twice(filled: Physics) -> None:
     again = SceneComposer(crates=(CRATE,))
     physics = Physics(again.with_crates(sensor_scenes.demo()))
-    assert np.array_equal(again.populate(physics).link_q, filled.view().link_q)
+    assert np.array_equal(again.populate(physics).visual_q, filled.snapshot().visual_q)
 
 
 def test_crates_come_after_those_of_the_scene_and_change_no_plant() -> None:
@@ -76,7 +76,7 @@ def test_whoever_is_told_of_has_the_label_of_the_links() -> None:
         (PersonPlacement(3.0, 1.2, 0.5, "wave", 1.6),),
         (CratePlacement(4.0, 1.3),),
     )
-    links = stage.compose(model).links
+    links = stage.compose(model).visuals
     told = {one["label"]: one for one in stage.actor_records(model)}
     drawn = {label(link.organ, link.index) for link in links}
     assert drawn - {label(Organ.BOX, k) for k in range(len(model.box_size))} == set(told)

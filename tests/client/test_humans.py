@@ -10,13 +10,13 @@ import pytest
 from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from vinesim import frames
-from vinesim.avatar.scripted_human import Legs, Walker
+from vinesim.avatar.scripted_human import Legs, ScriptedHuman
 from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, start_pose
 from vinesim.net.codec import human as poses
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.physics.rigid.human_body import PARTS, standing
+from vinesim.physics.rigid.human_body import BODY_PARTS, standing_pose
 from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
@@ -67,8 +67,8 @@ class World:
 
 def parts_of(client: Client, name: str) -> np.ndarray:
     """[part, 7] as sensors see them."""
-    links = [link.name for link in client.physics.rigid.links()]
-    return client.physics.rigid.link_q()[[links.index(f"{name}/{part}") for part in PARTS]]
+    links = [link.name for link in client.physics.rigid.visuals()]
+    return client.physics.rigid.visual_q()[[links.index(f"{name}/{part}") for part in BODY_PARTS]]
 
 
 # ---------------------------------------------------------------------- seen
@@ -85,28 +85,28 @@ def test_people_and_robots_meet_and_part(vinebot):
     assert set(eva.remote_actors) == {"anna", "ida"}
     assert set(ida.remote_actors) == {"anna", "eva"}
     for client in world.clients:
-        assert len(client.physics.rigid.people) == 2
-        assert client.physics.rigid.person("eva").spec.height == pytest.approx(1.6)
-        assert client.physics.rigid.person("ida").spec.height == pytest.approx(1.9)
+        assert len(client.physics.rigid.humans) == 2
+        assert client.physics.rigid.human("eva").spec.height == pytest.approx(1.6)
+        assert client.physics.rigid.human("ida").spec.height == pytest.approx(1.9)
     for name in ("eva", "ida"):
         np.testing.assert_allclose(parts_of(anna, name), parts_of(world.clients[1 + (name == "ida")], name), atol=2e-3)
     ida.replicator.bus.close()
     world.clients.remove(ida)
     world.run(0.2)
     assert set(anna.remote_actors) == {"eva"}
-    assert anna.physics.rigid.people == ("eva",)
+    assert anna.physics.rigid.humans == ("eva",)
 
 
 def test_who_stands_still_is_the_same_everywhere_to_the_bit():
     """F89: what copies hold is what crossed the network, and nothing makes it up anew."""
     world = World()
-    pose = poses.quantised(standing(SIDE, 1.8))
+    pose = poses.quantised(standing_pose(SIDE, 1.8))
     world.join("eva", None, SIDE, lambda _: pose, height=1.8)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(4.0)
     seen, here = parts_of(ida, "eva"), parts_of(world.clients[0], "eva")
     np.testing.assert_allclose(seen, here, atol=1e-12)
-    turned = ida.physics.rigid.person("eva").hand("left")
+    turned = ida.physics.rigid.human("eva").hand("left")
     np.testing.assert_allclose(ida.physics.hand("eva", turned.side).pose, pose.left, atol=1e-9)
 
 
@@ -114,7 +114,7 @@ def test_a_walker_is_seen_walking():
     """F89: hips, feet and hands at 1.1 m/s, over a network of 50 ms: the trunk is 2 cm wrong at most; a foot that lands
     is wrong for the 50 ms in which it was believed to go on."""
     world = World(delay=0.05)
-    walker = Walker(frames.pose(np.zeros(3)))
+    walker = ScriptedHuman(frames.pose(np.zeros(3)))
     eva = world.join("eva", None, walker.root, walker)
     ida = world.join("ida", None, frames.pose(np.array([2.0, 3.0, 0.0])))
     world.run(1.0)
@@ -125,7 +125,7 @@ def test_a_walker_is_seen_walking():
         wrong.append(np.linalg.norm(parts_of(ida, "eva")[:, :3] - parts_of(eva, "eva")[:, :3], axis=1))
     wrong = np.array(wrong)
     assert walker.pose.head[0] > 3.0
-    trunk = [PARTS.index(part) for part in ("head", "chest", "hips")]
+    trunk = [BODY_PARTS.index(part) for part in ("head", "chest", "hips")]
     assert wrong[50:, trunk].max() < 0.02
     assert np.median(wrong[50:]) < 0.01
     assert wrong[50:].max() < 0.2
@@ -134,19 +134,19 @@ def test_a_walker_is_seen_walking():
 def test_legs_that_each_client_makes_up_differ():
     """F89: from head and hands alone another client, who came a little later, makes up other legs; told, they agree."""
     world = World()
-    walker = Walker(frames.pose(np.zeros(3)))
+    walker = ScriptedHuman(frames.pose(np.zeros(3)))
     eva = world.join("eva", None, walker.root, walker)
     ida = world.join("ida", None, frames.pose(np.array([2.0, 3.0, 0.0])))
     world.run(0.5)
     walker.do(walker.walk((2.0, 0.0)))
     world.run(0.4)
-    seen = ida.physics.rigid.person("eva").parts
-    guess = Legs(standing(frames.pose(np.array([seen[0, 0] - 0.09, seen[0, 1], 0.0]))))
-    feet = [PARTS.index("left_foot"), PARTS.index("right_foot")]
+    seen = ida.physics.rigid.human("eva").part_poses
+    guess = Legs(standing_pose(frames.pose(np.array([seen[0, 0] - 0.09, seen[0, 1], 0.0]))))
+    feet = [BODY_PARTS.index("left_foot"), BODY_PARTS.index("right_foot")]
     guessed = []
     for _ in range(250):
         world.run(DT)
-        head = ida.physics.rigid.person("eva").parts[PARTS.index("head")]
+        head = ida.physics.rigid.human("eva").part_poses[BODY_PARTS.index("head")]
         guessed.append(guess.under(head)[1:, :3] - parts_of(eva, "eva")[feet, :3])
     apart = np.linalg.norm(guessed, axis=-1)
     assert apart.max() > 0.2, "in mid-stride"
@@ -158,7 +158,7 @@ def test_legs_that_each_client_makes_up_differ():
 def test_fingers_are_seen():
     """F47, as far as the network goes."""
     world = World()
-    pose = dataclasses.replace(standing(SIDE), right_fingers=(0.2, 0.0, 1.0, 1.0, 1.0))
+    pose = dataclasses.replace(standing_pose(SIDE), right_fingers=(0.2, 0.0, 1.0, 1.0, 1.0))
     world.join("eva", None, SIDE, lambda _: pose)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(0.5)
@@ -168,7 +168,7 @@ def test_fingers_are_seen():
 
 def test_who_is_set_down_elsewhere_is_there_at_once():
     world = World()
-    here, there = standing(SIDE), standing(frames.pose(np.array([6.0, 1.2, 0.0])))
+    here, there = standing_pose(SIDE), standing_pose(frames.pose(np.array([6.0, 1.2, 0.0])))
     place = [here]
     world.join("eva", None, SIDE, lambda _: place[0])
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
@@ -176,7 +176,7 @@ def test_who_is_set_down_elsewhere_is_there_at_once():
     place[0] = there
     for _ in range(12):
         world.run(DT)
-        x = parts_of(ida, "eva")[PARTS.index("hips"), 0]
+        x = parts_of(ida, "eva")[BODY_PARTS.index("hips"), 0]
         assert abs(x - here.hips[0]) < 1e-3 or abs(x - there.hips[0]) < 1e-3, "never in between"
     assert x == pytest.approx(there.hips[0], abs=1e-3)
 
@@ -188,7 +188,7 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.from_yaw(2.0)))
     bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.from_yaw(1.0)))
     world.run(0.8)
-    view = anna.physics.view()
+    view = anna.physics.snapshot()
     primitives = Primitives(world.model, grass=0.0)
     primitives.update(view)
     eye = np.array([0.0, 0.0, 1.3])
@@ -200,8 +200,8 @@ def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
     measured = Camera(d435, d435.info("optical", 0.5)).render(primitives, clear)
     seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
     for organ, name, at in (
-        (Organ.HUMAN, "eva", eva.physics.rigid.stands("eva")),
-        (Organ.ROBOT, "bert", bert.physics.rigid.stands("bert")),
+        (Organ.HUMAN, "eva", eva.physics.rigid.actor_position("eva")),
+        (Organ.ROBOT, "bert", bert.physics.rigid.actor_position("bert")),
     ):
         mine = label(organ, label_index(name))
         points = eye + scan.xyz[scan.labels == mine].astype(float)
@@ -229,14 +229,14 @@ class Shove:
 
     def __init__(self, vinebot: RobotDescription, delay: float) -> None:
         self.world = World(delay)
-        self.stand = standing(SIDE)
+        self.stand = standing_pose(SIDE)
         self.at = np.array([0.2, 0.75, 0.885])
         self.closed = False
         self.robot = self.world.join("anna", vinebot, frames.pose(np.zeros(3)))
         self.human = self.world.join("eva", None, SIDE, self.pose)
         self.arm = [i for i, joint in enumerate(vinebot.joints) if joint.startswith("arm_left")]
         self.world.run(0.6 + 6 * delay)
-        self.rest = self.robot.physics.rigid.read("anna")[2].copy()
+        self.rest = self.robot.physics.rigid.joint_measurements("anna")[2].copy()
 
     def pose(self, time: float) -> HumanPose:
         right = np.concatenate([self.at, self.stand.right[3:]])
@@ -255,7 +255,7 @@ class Shove:
         return self.human.physics.hand("eva", "right").force
 
     def felt(self) -> np.ndarray:
-        borne = self.robot.physics.rigid._robots["anna"].afar.values()
+        borne = self.robot.physics.rigid.robot("anna").remote_wrenches.values()
         return sum((wrench[:3] for wrench in borne), np.zeros(3))
 
     def forces_said(self) -> int:
@@ -277,10 +277,10 @@ def test_a_push_on_the_copy_is_felt_by_the_robot(vinebot, delay):
 
     # the efforts of the real robot hold against the wrench; nothing of it is counted twice
     rigid = shove.robot.physics.rigid
-    _, _, effort, contact = rigid.read("anna")
+    _, _, effort, contact = rigid.joint_measurements("anna")
     expected = np.zeros(len(contact))
-    for link, wrench in rigid._robots["anna"].afar.items():
-        at = rigid.data.xipos[rigid.world.body(f"anna/{link}").id]
+    for link, wrench in rigid.robot("anna").remote_wrenches.items():
+        at = rigid.mj_data.xipos[rigid.mj_model.body(f"anna/{link}").id]
         expected += rigid.jacobian("anna", link, at).T @ wrench
     np.testing.assert_allclose(contact, expected, atol=1e-3)
     assert np.abs(expected).max() > 3.0
@@ -294,7 +294,7 @@ def test_a_push_on_the_copy_is_felt_by_the_robot(vinebot, delay):
     said = shove.forces_said()
     shove.world.run(0.5)
     assert shove.forces_said() == said
-    np.testing.assert_allclose(rigid.read("anna")[2], shove.rest, atol=0.1)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[2], shove.rest, atol=0.1)
 
 
 def test_a_hand_that_pulls_at_an_arm_is_seen_there_and_felt(vinebot):
@@ -303,7 +303,7 @@ def test_a_hand_that_pulls_at_an_arm_is_seen_there_and_felt(vinebot):
     shove.move(0.55, 0.5)
     shove.closed = True
     shove.move(0.55, 0.2)
-    assert shove.human.physics.hand("eva", "right").holds[0] == "anna"
+    assert shove.human.physics.hand("eva", "right").held[0] == "anna"
     shove.move(0.85, 1.0)
     rows = shove.move(0.85, 1.0)[-20:]
     assert rows[:, 0].mean() > 20.0, "towards the person"
@@ -337,7 +337,7 @@ def test_an_arm_that_comes_to_a_hand_feels_it(vinebot):
         robot.command_position([home + swing], joint)
         shove.world.run(DT)
     shove.world.run(1.0)
-    efforts = shove.robot.physics.rigid.read("anna")[3][shove.arm]
+    efforts = shove.robot.physics.rigid.joint_measurements("anna")[3][shove.arm]
     assert shove.felt()[1] < -3.0, "the hand pushes back"
     np.testing.assert_allclose(shove.felt(), shove.given(), atol=0.05 * np.abs(shove.given()).max())
     assert np.abs(efforts).max() > 1.0
@@ -355,7 +355,7 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     bunch = find_reachable_bunch(world.model, stand)
     body = int(world.model.bunch_body[bunch])
     centre = bunch_centres(world.model)[bunch]
-    walker = Walker(frames.pose(np.array([*standing_place(centre, stand), 0.0]), stand[3:]))
+    walker = ScriptedHuman(frames.pose(np.array([*standing_place(centre, stand), 0.0]), stand[3:]))
     eva = world.join("eva", None, walker.root, walker)
     aside = frames.compose(stand, frames.pose(np.array([-1.5, 1.0, 0.0])))
     anna = world.join("anna", vinebot, aside)
@@ -367,18 +367,18 @@ def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
     )  # fmt: skip
     for _ in range(400):
         world.run(DT)
-        if eva.physics.hand("eva", "right").holds is not None:
+        if eva.physics.hand("eva", "right").held is not None:
             break
-    assert eva.physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    assert eva.physics.hand("eva", "right").held == ("plants", f"body/{body}")
     world.run(1.6)
     for client in world.clients:
-        client.physics.refresh()
+        client.physics.update_kinematics()
     poses_now = [client.physics.state.body_q[body].astype(float) for client in world.clients]
     here, there = (pose[:3] + frames.rotate(pose[3:], middle) for pose in poses_now)
     assert np.linalg.norm(here - centre) > 0.05
     assert np.linalg.norm(there - here) < 0.02
     assert anna.replicator.owner(int(world.model.body_tree[body])) == "eva"
-    assert anna.physics.hand("eva", "right").holds is None
+    assert anna.physics.hand("eva", "right").held is None
     np.testing.assert_allclose(
         anna.physics.hand("eva", "right").pose[:3], eva.physics.hand("eva", "right").pose[:3], atol=0.01
     )

@@ -30,7 +30,7 @@ def test_the_same_numbers_give_the_same_life_and_others_another() -> None:
         happens = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
         assert happens is not None
         view, near, told = happens
-        seen.append((view.link_q.tobytes(), view.body_q.tobytes(), near.tobytes(), str(told)))
+        seen.append((view.visual_q.tobytes(), view.body_q.tobytes(), near.tobytes(), str(told)))
     assert seen[0] == seen[1] != seen[2]
 
 

@@ -73,26 +73,28 @@ def test_no_tick_waits_and_then_it_stands_where_it_is_by_now(vinebot):
     assert guest is not None
     assert guest.name == "guest"
     assert "guest" not in arrivals
-    position, velocity, *_ = physics.rigid.read("guest")
+    position, velocity, *_ = physics.rigid.joint_measurements("guest")
     np.testing.assert_allclose(position, standing(vinebot, 0.5).position, atol=1e-12)
     assert not velocity.any()
-    assert physics.rigid.base("guest")[0][0] == pytest.approx(0.5)
+    assert physics.rigid.base_state("guest")[0][0] == pytest.approx(0.5)
 
 
 def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_came_at_once(vinebot):
     def run(prepared: bool) -> bytes:
         physics = world(vinebot)
         physics.rigid.command("host", vinebot.home + 0.2)
-        draft = physics.rigid.prepare(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
+        draft = (
+            physics.rigid.compile_with(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0]))) if prepared else None
+        )
         for _ in range(20):
             physics.step()
         if draft is None:
             physics.rigid.add_robot(vinebot.to_spec("guest", 7, frames.pose([1.0, 0.0, 0.0])))
         else:
-            assert physics.rigid.admit(draft)
+            assert physics.rigid.adopt(draft)
         for _ in range(20):
             physics.step()
-        return physics.rigid.data.qpos.tobytes() + physics.rigid.data.qvel.tobytes()
+        return physics.rigid.mj_data.qpos.tobytes() + physics.rigid.mj_data.qvel.tobytes()
 
     assert run(True) == run(False)
 

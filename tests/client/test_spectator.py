@@ -138,7 +138,7 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
         assert spectator.replicator.counters.environment.bytes_out == 0
         assert picker.remote_actors == {}  # a spectator has no body
         head = picker.robot.description.joints.index("head_1_joint")
-        assert spectator.physics.rigid.read("picker")[0][head] == pytest.approx(0.5, abs=0.05)
+        assert spectator.physics.rigid.joint_measurements("picker")[0][head] == pytest.approx(0.5, abs=0.05)
     return path
 
 

@@ -9,7 +9,7 @@ from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.tasks import LookAt, RosCommandHandler, UnknownTask, plan_task
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import load_description as load_robot
 from vinesim.robot.drives import Robot
 from vinesim.robot.tasks.pick import PickBunch
@@ -41,7 +41,7 @@ def test_a_client_picks():
     while not script.is_done and script.phase != "tuck":
         client.tick()
     assert not script.reason
-    assert client.physics.rigid.loose == (script.plan.bunch,)
+    assert client.physics.rigid.free_bunches == (script.plan.bunch,)
     # the bunch is in its hand, and its trouble is its own: the client goes on
     assert script.report()["phases_s"]["cut"] < 0.1
 
@@ -53,7 +53,7 @@ def test_a_client_exchanges():
         client.tick()
     assert not script.reason
     assert script.phase == "to the empty box"
-    assert len(client.physics.rigid.loose) == script.report()["bunches"] == 6
+    assert len(client.physics.rigid.free_bunches) == script.report()["bunches"] == 6
 
 
 def test_an_unknown_job_is_told():
@@ -73,7 +73,7 @@ class Asked:
     """A robot alone in the world, and a queue of commands for it."""
 
     def __init__(self) -> None:
-        self.robot = Robot(Rigid(assemble([])), load_robot("vinebot"), "anna")
+        self.robot = Robot(RigidWorld(assemble([])), load_robot("vinebot"), "anna")
         self.queue: list[Command] = []
         self.obey = RosCommandHandler(self.robot, self._take)
         self.time = 0.0
@@ -88,10 +88,10 @@ class Asked:
         for _ in range(round(100 * seconds)):
             self.obey(self.time)
             self.robot.control(self.time)
-            self.robot.rigid.prep()
-            self.robot.rigid.finish()
+            self.robot.rigid.predict()
+            self.robot.rigid.integrate()
             self.time += 0.01
-        return self.robot.rigid.read("anna")[0][self.at]
+        return self.robot.rigid.joint_measurements("anna")[0][self.at]
 
 
 def way(*positions: tuple[float, float], joints: tuple[str, ...] = JOINTS, seconds: float = 1.0) -> JointTrajectory:

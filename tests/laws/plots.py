@@ -155,10 +155,10 @@ def grasped() -> Table:
         target, pull = grasp(0.01 * tick)
         for rigid in (ours.rigid, oracle.rigid):
             rigid.command("grip", target)
-            rigid.push("grip", "hand", np.array([0.0, 0.0, pull]))
+            rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, pull]))
         ours.step()
         oracle.step()
-        place[:, tick] = [test_contact.middle_of(q) for q in (ours.view().body_q[body], oracle.body_pose(body))]
+        place[:, tick] = [test_contact.middle_of(q) for q in (ours.snapshot().body_q[body], oracle.body_pose(body))]
         force[:, tick] = abs(test_contact.force_on(ours, "left")[1]), abs(oracle.contact_force_on("left")[1])
     time = 0.01 * np.arange(800)
     figure, (way, press) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")

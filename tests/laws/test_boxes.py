@@ -39,7 +39,7 @@ def pile(count: int) -> Physics:
 
 
 def poses(physics: Physics) -> np.ndarray:
-    return np.array([physics.rigid.data.joint(f"box/{i}").qpos for i in range(len(physics.model.box_mass))])
+    return np.array([physics.rigid.mj_data.joint(f"box/{i}").qpos for i in range(len(physics.model.box_mass))])
 
 
 def test_four_boxes_stand_on_one_another_and_fall_asleep():
@@ -54,8 +54,8 @@ def test_four_boxes_stand_on_one_another_and_fall_asleep():
     np.testing.assert_allclose(moved[:, 2], 0.3 * np.arange(4), atol=2e-3)
     tilt = 2.0 * np.linalg.norm(moved[:, 4:6], axis=1)
     assert tilt.max() < 2e-3
-    trees = physics.rigid.world.body_treeid[[physics.rigid.world.body(f"box/{i}").id for i in range(4)]]
-    assert (physics.rigid.data.tree_asleep[trees] >= 0).all()
+    trees = physics.rigid.mj_model.body_treeid[[physics.rigid.mj_model.body(f"box/{i}").id for i in range(4)]]
+    assert (physics.rigid.mj_data.tree_asleep[trees] >= 0).all()
 
 
 @pytest.mark.parametrize("share", [0.95, 1.05])
@@ -66,7 +66,7 @@ def test_what_starts_a_box_is_mu_times_what_rests_on_its_sole(which, share):
     for _ in range(150):
         physics.step()
     start = poses(physics)
-    data, body = physics.rigid.data, physics.rigid.world.body(f"box/{which}").id
+    data, body = physics.rigid.mj_data, physics.rigid.mj_model.body(f"box/{which}").id
     force = share * FRICTION * WEIGHT * sum(MASSES[which:2])
     data.xfrc_applied[body, 0] = force
     data.xfrc_applied[body, 4] = -force * (data.xipos[body, 2] - start[which, 2])  # acts at its sole: does not tip it
@@ -86,7 +86,7 @@ def test_a_box_of_bunches_is_lifted_driven_and_set_down_with_all_that_is_in_it()
     masses = [0.4, 0.5, 0.6]
     trees = [cane((0.0, 9.0 + i, 2.0), bunch=mass) for i, mass in enumerate(masses)]
     physics = Physics(
-        assemble(trees, box_pose=[[0.0, 0.0, 0.06, 0, 0, 0, 1]], box_size=[SIZE], box_mass=[2.0]), picking=False
+        assemble(trees, box_pose=[[0.0, 0.0, 0.06, 0, 0, 0, 1]], box_size=[SIZE], box_mass=[2.0]), detachment=False
     )
     fork = robot("fork", [0.0, 0.0, 0.03], "0 0 1", "0.5 0.3 0.06", 10.0, (2e4, 2e3, 1000.0))
     physics.add_robot(fork)
@@ -100,13 +100,13 @@ def test_a_box_of_bunches_is_lifted_driven_and_set_down_with_all_that_is_in_it()
     for tick in range(800):
         lift = 0.4 * np.clip(tick / 200.0, 0.0, 1.0) * (1.0 if tick < 600 else max(0.0, 1.0 - (tick - 600) / 150.0))
         rigid.command("fork", np.array([lift]))
-        rigid.drive_base("fork", (0.5 * float(np.interp(tick, [200, 250, 400, 450], [0, 1, 1, 0])), 0.0, 0.0))
+        rigid.command_base("fork", (0.5 * float(np.interp(tick, [200, 250, 400, 450], [0, 1, 1, 0])), 0.0, 0.0))
         physics.step()
         if tick == 590:
-            contact = rigid.read("fork")[3][0]
+            contact = rigid.joint_measurements("fork")[3][0]
             assert contact == pytest.approx(-WEIGHT * (2.0 + sum(masses)), rel=0.01)
-            assert rigid.data.joint("box/0").qpos[2] == pytest.approx(0.46, abs=5e-3)
-    box = rigid.data.joint("box/0").qpos
+            assert rigid.mj_data.joint("box/0").qpos[2] == pytest.approx(0.46, abs=5e-3)
+    box = rigid.mj_data.joint("box/0").qpos
     assert box[0] == pytest.approx(1.0, abs=0.03)
     for bunch, mass in enumerate(masses):
         middle = rigid.bunch_pose(bunch)
@@ -114,8 +114,8 @@ def test_a_box_of_bunches_is_lifted_driven_and_set_down_with_all_that_is_in_it()
         inside = frames.rotate(frames.conjugate(frames.from_wxyz(box[3:])), middle - box[:3])
         assert (np.abs(inside[:2]) < [0.3, 0.2]).all()
         assert 0.0 < inside[2] < 0.35
-        body = rigid.world.body(f"loose/{rigid._slot[bunch]}").id
-        assert rigid.world.body_mass[body] == pytest.approx(mass, rel=1e-6)
+        body = rigid.mj_model.body(f"loose/{rigid._bunch_slot[bunch]}").id
+        assert rigid.mj_model.body_mass[body] == pytest.approx(mass, rel=1e-6)
 
 
 # ---------------------------------------------------------------------- momentum of pairs
@@ -129,7 +129,7 @@ def airborne() -> Physics:
     trees = [cane((20.0 * i, 30.0, HIGH), bunch=0.5) for i in range(2)]
     trees += [cane((20.0 * i, 60.0, HIGH), radius=0.006) for i in range(2)]
     at = [frames.pose([5.0 * i, -30.0, HIGH]) for i in range(2)]
-    physics = Physics(assemble(trees, box_pose=at, box_size=[SIZE] * 2, box_mass=[2.0, 1.0]), picking=False)
+    physics = Physics(assemble(trees, box_pose=at, box_size=[SIZE] * 2, box_mass=[2.0, 1.0]), detachment=False)
     for i in range(2):
         physics.add_robot(robot(f"ram{i}", [10.0 * i, -60.0, HIGH], "1 0 0", "0.2 0.3 0.2", 3.0, (0.0, 0.0, 1000.0)))
     for bunch in range(2):
@@ -140,14 +140,14 @@ def airborne() -> Physics:
 def momentum(physics: Physics) -> np.ndarray:
     """Of all that moves freely [3] kg m/s; of a ram, along its way."""
     rigid, model = physics.rigid, physics.model
-    rigid.refresh()
-    total, J = np.zeros(3), np.zeros((3, rigid.world.nv))
-    names = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._slot.values())]
+    rigid.update_kinematics()
+    total, J = np.zeros(3), np.zeros((3, rigid.mj_model.nv))
+    names = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._bunch_slot.values())]
     for name in (*names, "ram0/tool", "ram1/tool"):
-        body = rigid.world.body(name).id
-        mujoco.mj_jacBodyCom(rigid.world, rigid.data, J, None, body)
-        total += rigid.world.body_mass[body] * (J @ rigid.data.qvel)
-    physics.refresh()
+        body = rigid.mj_model.body(name).id
+        mujoco.mj_jacBodyCom(rigid.mj_model, rigid.mj_data, J, None, body)
+        total += rigid.mj_model.body_mass[body] * (J @ rigid.mj_data.qvel)
+    physics.update_kinematics()
     q, v = physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
     free = model.body_tree >= 2
     velocity = v[:, :3] + np.cross(v[:, 3:], frames.rotate(q[:, 3:], model.body_com.astype(float)))
@@ -159,14 +159,14 @@ def hurl(physics: Physics, kind: str, index: int, x: float, speed: float) -> Non
     rigid = physics.rigid
     at = np.array([x, 0.02 * index, HIGH - 0.01 * index])
     if kind == "box":
-        joint = rigid.data.joint(f"box/{index}")
+        joint = rigid.mj_data.joint(f"box/{index}")
         joint.qpos[:] = [*(at - [0.0, 0.0, 0.15]), 1, 0, 0, 0]
         joint.qvel[0] = speed
     elif kind == "bunch":
         rigid.place_bunch(index, frames.pose(at - [0.085, 0, 0]), np.array([speed, 0, 0, 0, 0, 0]))
     else:
-        rigid.place(f"ram{index}", frames.pose([*at[:2], HIGH]), np.zeros(1))
-        rigid.data.qvel[rigid._robots[f"ram{index}"].v] = speed
+        rigid.place_robot(f"ram{index}", frames.pose([*at[:2], HIGH]), np.zeros(1))
+        rigid.mj_data.qvel[rigid.robot(f"ram{index}").v] = speed
 
 
 PAIRS = [
@@ -181,13 +181,13 @@ def test_what_one_loses_the_other_gains(one, other):
     adds up to in free flight is of the order of the step."""
     physics = airborne()
     rigid = physics.rigid
-    rigid.world.opt.gravity[:] = 0.0
+    rigid.mj_model.opt.gravity[:] = 0.0
     hurl(physics, one, 0, -0.5, 1.5)
     hurl(physics, other, 1, 0.5, -1.0)
     start, exchanged = momentum(physics), np.zeros(2)
     for _ in range(60):
         physics.step()
-        given = rigid.data.qacc - rigid.data.qacc_smooth  # by contacts, at the poses of the tick's start
+        given = rigid.mj_data.qacc - rigid.mj_data.qacc_smooth  # by contacts, at the poses of the tick's start
         pair = np.array([along(physics, *thing, given) for thing in ((one, 0), (other, 1))]) * physics.dt
         assert abs(pair.sum()) <= 1e-4 * np.abs(pair).max() + 1e-5
         exchanged += pair
@@ -199,10 +199,10 @@ def test_what_one_loses_the_other_gains(one, other):
 def along(physics: Physics, kind: str, index: int, rates: np.ndarray) -> float:
     """Mass times the rate of a thing's centre of mass along x, at the poses that MuJoCo has now."""
     rigid = physics.rigid
-    name = {"box": f"box/{index}", "bunch": f"loose/{rigid._slot[index]}", "ram": f"ram{index}/tool"}[kind]
-    body, J = rigid.world.body(name).id, np.zeros((3, rigid.world.nv))
-    mujoco.mj_jacBodyCom(rigid.world, rigid.data, J, None, body)
-    return float(rigid.world.body_mass[body] * (J @ rates)[0])
+    name = {"box": f"box/{index}", "bunch": f"loose/{rigid._bunch_slot[index]}", "ram": f"ram{index}/tool"}[kind]
+    body, J = rigid.mj_model.body(name).id, np.zeros((3, rigid.mj_model.nv))
+    mujoco.mj_jacBodyCom(rigid.mj_model, rigid.mj_data, J, None, body)
+    return float(rigid.mj_model.body_mass[body] * (J @ rates)[0])
 
 
 @pytest.mark.parametrize("other", ["box", "bunch", "ram"])
@@ -214,10 +214,10 @@ def test_a_cut_cane_takes_what_the_other_loses(other):
     rigid = physics.rigid
     middle = np.array([0.5, 60.0, HIGH])
     if other == "ram":
-        rigid.place("ram0", frames.pose([middle[0], 59.8, HIGH], frames.from_yaw(0.5 * np.pi)), np.zeros(1))
-        rigid.data.qvel[rigid._robots["ram0"].v] = 1.0
+        rigid.place_robot("ram0", frames.pose([middle[0], 59.8, HIGH], frames.from_yaw(0.5 * np.pi)), np.zeros(1))
+        rigid.mj_data.qvel[rigid.robot("ram0").v] = 1.0
     elif other == "box":
-        joint = rigid.data.joint("box/0")
+        joint = rigid.mj_data.joint("box/0")
         joint.qpos[:] = [middle[0], 59.7, HIGH - 0.15, 1, 0, 0, 0]
         joint.qvel[1] = 1.0
     else:

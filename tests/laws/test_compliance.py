@@ -12,7 +12,7 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import assemble
@@ -57,7 +57,7 @@ class Stand:
     """A robot, and a clock."""
 
     def __init__(self, description: RobotDescription, **scene: np.ndarray) -> None:
-        self.rigid = Rigid(assemble([], **scene), parameters=PhysicsParameters(dt=DT))
+        self.rigid = RigidWorld(assemble([], **scene), parameters=PhysicsParameters(dt=DT))
         self.robot = Robot(self.rigid, description, "anna")
         self.time = 0.0
 
@@ -66,20 +66,20 @@ class Stand:
         rows = []
         for _ in range(round(seconds / DT)):
             self.robot.control(self.time)
-            self.rigid.prep()
-            self.rigid.finish()
+            self.rigid.predict()
+            self.rigid.integrate()
             self.time += DT
-            rows.append(self.rigid.read("anna")[0].copy())
+            rows.append(self.rigid.joint_measurements("anna")[0].copy())
         return np.array(rows)
 
     def push(self, link: str, force: np.ndarray) -> None:
         """A steady force at a link's centre of mass."""
-        self.rigid.push("anna", link, np.asarray(force, float))
+        self.rigid.apply_wrench("anna", link, np.asarray(force, float))
 
     def lever(self, link: str) -> np.ndarray:
         """[3, joint] Jacobian of a link's centre of mass, by differences of the description's own kinematics."""
         robot, step = self.robot, 1e-6
-        position = self.rigid.read("anna")[0].copy()
+        position = self.rigid.joint_measurements("anna")[0].copy()
         centre = next(
             np.array(found.find("inertial/origin").get("xyz").split(), float)
             for found in ElementTree.fromstring(robot.description.urdf).iterfind("link")
@@ -94,13 +94,13 @@ class Stand:
                 pose = robot.description.link_poses(moved)[link]
                 there.append(pose[:3] + frames.rotate(pose[3:], centre))
             columns.append((there[1] - there[0]) / (2.0 * step))
-        base = self.rigid.base("anna")[0]
+        base = self.rigid.base_state("anna")[0]
         return frames.to_matrix(base[3:])[:3, :3] @ np.array(columns).T
 
 
 def weight_beyond(stand: Stand, joint: str) -> float:
     """Moment [N m] of the weight of all that a joint carries, about its axis: how much its drive must give."""
-    description, position = stand.robot.description, stand.rigid.read("anna")[0]
+    description, position = stand.robot.description, stand.rigid.joint_measurements("anna")[0]
     i = description.joints.index(joint)
     height = []
     for sign in (-1.0, 1.0):
@@ -152,7 +152,7 @@ def test_log_decrement_is_that_of_the_damping_asked_for(gate: RobotDescription, 
     damping = 2.0 * zeta * np.sqrt(stiffness * inertia)
     stand = Stand(gate)
     stand.robot.command_impedance([stiffness], [damping])
-    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
+    stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
     swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, 0]
     found, wanted = decrement(swing), expected(stiffness, damping, inertia)
     assert found[0] == pytest.approx(wanted[0], rel=0.02)
@@ -162,7 +162,7 @@ def test_log_decrement_is_that_of_the_damping_asked_for(gate: RobotDescription, 
 def test_an_undamped_joint_swings_on(gate: RobotDescription) -> None:
     stand = Stand(gate)
     stand.robot.command_impedance([60.0], [0.0])
-    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
+    stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
     swing = np.abs(stand.run(60.0)[:, 0])
     assert swing[-500:].max() == pytest.approx(0.3, rel=0.01)
 
@@ -193,7 +193,7 @@ def test_against_a_pole_it_presses_as_its_stiffness_says(gate: RobotDescription,
     moments = []
     for _ in range(100):
         angle = stand.run(DT)[-1, 0]
-        moments.append(stand.rigid.read("anna")[3][0])
+        moments.append(stand.rigid.joint_measurements("anna")[3][0])
     touching = np.arctan2(0.3, 0.9) - np.arcsin(0.08 / np.hypot(0.3, 0.9))
     assert angle == pytest.approx(touching, abs=0.005)
     assert -moments[-1] == pytest.approx(stiffness * (0.6 - angle), rel=0.005)
@@ -231,7 +231,7 @@ def test_a_joint_of_an_arm_swings_as_asked(
     stand.robot.command_impedance([stiffness], [total - friction], [name])
     i, start = stand.robot.joint_indices([name])[0], vinebot.home.copy()
     start[i] += 0.05
-    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), start)
+    stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), start)
     swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, i] - vinebot.home[i]
     found, wanted = decrement(swing), expected(stiffness, total, inertia)
     assert found[0] == pytest.approx(wanted[0], rel=0.02)
@@ -274,7 +274,7 @@ def inertia_about(description: RobotDescription, joint: str) -> float:
 def test_a_locked_motor_lets_the_gate_swing_on_its_spring(gate: RobotDescription) -> None:
     stand, inertia = Stand(gate), GATE_INERTIA + ROTOR
     stand.robot.command_motor_position([0.0])
-    stand.rigid.place("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.2]))
+    stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.2]))
     swing = stand.run(3.0)[:, 0]
     found, wanted = decrement(swing), expected(150.0, 3.0, inertia)
     assert found[0] == pytest.approx(wanted[0], rel=0.02)
@@ -295,7 +295,7 @@ def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: RobotD
     load = np.array([weight_beyond(stand, name) for name in ARM]) - pushed[joints]
     assert np.abs(load).max() > 10.0
     np.testing.assert_allclose(elements.torque[joints], load, rtol=0.02, atol=0.02)
-    position = stand.rigid.read("anna")[0][joints]
+    position = stand.rigid.joint_measurements("anna")[0][joints]
     springs = np.array([d.series_stiffness or d.stiffness for d in vinebot.drives])[joints]
     np.testing.assert_allclose(springs * (motor - position), load, rtol=0.02, atol=0.02)
     np.testing.assert_allclose(elements.motor[joints], motor, atol=1e-4)
@@ -308,11 +308,11 @@ def test_motor_command_is_followed_by_the_link(gate: RobotDescription) -> None:
     stand.robot.command_motor_position([0.4])
     stand.run(12.0)
     elements = stand.robot.sample(stand.time).elements
-    assert stand.rigid.read("anna")[0][0] == pytest.approx(0.4, abs=1e-3)
+    assert stand.rigid.joint_measurements("anna")[0][0] == pytest.approx(0.4, abs=1e-3)
     assert elements.motor[0] == pytest.approx(0.4, abs=1e-3)
     stand.push("leaf", np.array([0.0, 20.0, 0.0]))  # turned away by 0.4 rad: its lever is 0.5 cos
     stand.run(12.0)
-    elements, angle = stand.robot.sample(stand.time).elements, stand.rigid.read("anna")[0][0]
+    elements, angle = stand.robot.sample(stand.time).elements, stand.rigid.joint_measurements("anna")[0][0]
     assert elements.torque[0] == pytest.approx(-20.0 * 0.5 * np.cos(angle), rel=0.02)
     assert angle - 0.4 == pytest.approx(20.0 * 0.5 * np.cos(angle) / 150.0, rel=0.02)
 
@@ -325,7 +325,7 @@ def test_effort_is_weight_less_j_transposed_f(vinebot: RobotDescription) -> None
     force = np.array([-20.0, 30.0, 25.0])
     stand.push("arm_left_7_link", force)
     stand.run(3.0)
-    effort = stand.rigid.read("anna")[2]
+    effort = stand.rigid.joint_measurements("anna")[2]
     moment = stand.lever("arm_left_7_link").T @ force
     for name in ("torso_lift_joint", *ARM):
         i = stand.robot.joint_indices([name])[0]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import RemoteRobot, Robot, RobotInstance
 from vinesim.scene.builder import assemble
@@ -34,15 +34,15 @@ def ram(name: str, effort: float) -> RobotSpec:
     return RobotSpec(name, 0 if left else 1, RAM, "base_footprint", pose, drives, np.array([-0.05]), (1e5, 1e5))
 
 
-def step(rigid: Rigid, ticks: int = 1) -> None:
+def step(rigid: RigidWorld, ticks: int = 1) -> None:
     for _ in range(ticks):
-        rigid.prep()
-        rigid.finish()
+        rigid.predict()
+        rigid.integrate()
 
 
-def meeting(rigid: Rigid) -> float:
+def meeting(rigid: RigidWorld) -> float:
     """Where the heads touch, along the left ram's way [m]; 0 is the middle."""
-    left, right = rigid.read("left")[0][0], rigid.read("right")[0][0]
+    left, right = rigid.joint_measurements("left")[0][0], rigid.joint_measurements("right")[0][0]
     assert left + right == pytest.approx(0.0, abs=2e-3), "the heads touch"
     return 0.5 * (left - right)
 
@@ -54,7 +54,7 @@ FORCES = [(20.0, 80.0), (40.0, 80.0), (70.0, 80.0), (80.0, 70.0), (80.0, 40.0), 
 def test_of_two_that_fight_the_stronger_wins(left, right):
     """F23. Both servos want more than they can give; the weaker gives all it has, and the stronger one's spring
     stands against that: it stays short of its goal by (the weaker one's limit) / K."""
-    rigid = Rigid(assemble([]))
+    rigid = RigidWorld(assemble([]))
     for name, effort in (("left", left), ("right", right)):
         rigid.add_robot(ram(name, effort))
         rigid.command(name, np.array([BEYOND]))
@@ -62,7 +62,7 @@ def test_of_two_that_fight_the_stronger_wins(left, right):
     expected = np.sign(left - right) * (BEYOND - min(left, right) / STIFFNESS)
     assert meeting(rigid) == pytest.approx(expected, abs=1e-3)
     for name in ("left", "right"):
-        contact = rigid.read(name)[3][0]
+        contact = rigid.joint_measurements(name)[3][0]
         assert -contact == pytest.approx(min(left, right), rel=0.02)
 
 
@@ -71,7 +71,7 @@ def test_of_two_that_fight_the_stronger_wins(left, right):
 def test_across_the_network_the_stronger_wins_too(left, right, delay):
     """Each client moves its own ram and has a copy of the other, ``delay`` ticks old. In both worlds the same one wins,
     and the worlds differ by the spring that carries the force: limit / K."""
-    worlds = {"left": Rigid(assemble([])), "right": Rigid(assemble([]))}
+    worlds = {"left": RigidWorld(assemble([])), "right": RigidWorld(assemble([]))}
     post: dict[str, deque] = {name: deque() for name in worlds}
     for rigid in worlds.values():
         rigid.add_robot(ram("left", left))
@@ -81,10 +81,12 @@ def test_across_the_network_the_stronger_wins_too(left, right, delay):
     seen = []
     for tick in range(1200):
         for own in worlds:
-            post[own].append((*worlds[own].base(own), *(x.copy() for x in worlds[own].read(own)[:2])))
+            post[own].append(
+                (*worlds[own].base_state(own), *(x.copy() for x in worlds[own].joint_measurements(own)[:2]))
+            )
         for own, other in (("left", "right"), ("right", "left")):
             if tick >= delay:
-                worlds[own].follow(other, *post[other].popleft())
+                worlds[own].follow_remote(other, *post[other].popleft())
             step(worlds[own])
         if tick >= 1000:
             seen.append([meeting(rigid) for rigid in worlds.values()])
@@ -105,7 +107,7 @@ def vinebot() -> RobotDescription:
 @pytest.mark.parametrize("latency", [0, 2, 5, 10, 20])
 def test_a_copy_lags_by_speed_times_latency_and_no_more(vinebot, latency):
     """F81, F85: springs and dampers pull to position and velocity, so the copy itself adds no lag worth the name."""
-    here, there = Rigid(assemble([])), Rigid(assemble([]))
+    here, there = RigidWorld(assemble([])), RigidWorld(assemble([]))
     robot, copy = Robot(here, vinebot, "anna"), RemoteRobot(there, vinebot, "anna")
     arm = robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint"])
     post, rows = deque(), []
@@ -119,9 +121,9 @@ def test_a_copy_lags_by_speed_times_latency_and_no_more(vinebot, latency):
         if tick >= latency:
             copy.follow(post.popleft())
         step(there)
-        off = np.abs(there.read("anna")[0] - here.read("anna")[0])[arm].max()
-        base = np.linalg.norm(there.base("anna")[0][:2] - here.base("anna")[0][:2])
-        rows.append((off, base, np.abs(here.read("anna")[1])[arm].max()))
+        off = np.abs(there.joint_measurements("anna")[0] - here.joint_measurements("anna")[0])[arm].max()
+        base = np.linalg.norm(there.base_state("anna")[0][:2] - here.base_state("anna")[0][:2])
+        rows.append((off, base, np.abs(here.joint_measurements("anna")[1])[arm].max()))
     off, base, speed = np.max(rows[100:], axis=0)
     assert speed > 0.5
     assert off < speed * 0.01 * latency + 1e-3
@@ -134,7 +136,7 @@ def told(copy: RobotInstance, position: np.ndarray) -> RobotUpdate:
 
 def test_a_copy_answers_a_step_in_a_tenth_of_a_second_without_overshoot(vinebot):
     """F85."""
-    rigid = Rigid(assemble([]))
+    rigid = RigidWorld(assemble([]))
     copy = RemoteRobot(rigid, vinebot, "anna")
     elbow = vinebot.joints.index("arm_left_4_joint")
     goal = vinebot.home.copy()
@@ -143,7 +145,7 @@ def test_a_copy_answers_a_step_in_a_tenth_of_a_second_without_overshoot(vinebot)
     for _ in range(100):
         copy.follow(told(copy, goal))
         step(rigid)
-        way.append((vinebot.home[elbow] - rigid.read("anna")[0][elbow]) / 0.1)
+        way.append((vinebot.home[elbow] - rigid.joint_measurements("anna")[0][elbow]) / 0.1)
     assert np.argmax(np.array(way) > 0.95) <= 12
     assert max(way) < 1.02
     assert way[-1] == pytest.approx(1.0, abs=1e-3)
@@ -151,37 +153,37 @@ def test_a_copy_answers_a_step_in_a_tenth_of_a_second_without_overshoot(vinebot)
 
 def test_a_copy_that_is_pushed_gives_way_as_its_springs_say_and_comes_back(vinebot):
     """F86: deflection = J^T F / K of a push of 60 N on the wrist; a second after its end nothing is left of it."""
-    rigid = Rigid(assemble([]))
+    rigid = RigidWorld(assemble([]))
     copy = RemoteRobot(rigid, vinebot, "anna")
     step(rigid, 20)
-    rigid.push("anna", "arm_left_7_link", np.array([0.0, 0.0, -60.0]))
+    rigid.apply_wrench("anna", "arm_left_7_link", np.array([0.0, 0.0, -60.0]))
     for _ in range(200):
         copy.follow(told(copy, vinebot.home))
         step(rigid)
-    deflection = rigid.read("anna")[0] - vinebot.home
-    body = rigid.world.body("anna/arm_left_7_link").id
-    load_ = rigid.jacobian("anna", "arm_left_7_link", rigid.data.xipos[body])[2] * -60.0
+    deflection = rigid.joint_measurements("anna")[0] - vinebot.home
+    body = rigid.mj_model.body("anna/arm_left_7_link").id
+    load_ = rigid.jacobian("anna", "arm_left_7_link", rigid.mj_data.xipos[body])[2] * -60.0
     expected = load_ / np.array([drive.stiffness for drive in vinebot.drives])
     assert np.abs(deflection).max() > 5e-3
     np.testing.assert_allclose(deflection, expected, atol=0.02 * np.abs(expected).max())
-    rigid.push("anna", "arm_left_7_link", np.zeros(3))
+    rigid.apply_wrench("anna", "arm_left_7_link", np.zeros(3))
     for _ in range(100):
         copy.follow(told(copy, vinebot.home))
         step(rigid)
-    assert np.abs(rigid.read("anna")[0] - vinebot.home).max() < 1e-6
+    assert np.abs(rigid.joint_measurements("anna")[0] - vinebot.home).max() < 1e-6
 
 
 def test_what_is_sent_is_what_is_measured_and_only_the_owner_commands(vinebot):
     """F82, F84: an arm that is held back is sent where it is, not where it was told to go."""
-    rigid = Rigid(assemble([]))
+    rigid = RigidWorld(assemble([]))
     robot = Robot(rigid, vinebot, "anna")
     robot.command_position(vinebot.home + 0.2)
-    rigid.push("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
+    rigid.apply_wrench("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
     for tick in range(40):
         robot.control(0.01 * tick)
         step(rigid)
     update = robot.update(0.4)
-    position, velocity, _, _ = rigid.read("anna")
+    position, velocity, _, _ = rigid.joint_measurements("anna")
     np.testing.assert_array_equal(update.position, position)
     np.testing.assert_array_equal(update.velocity, velocity)
     assert np.abs(update.position - robot.setpoint).max() > 0.03

@@ -23,11 +23,11 @@ def digest(physics: Physics, h: hashlib._Hash) -> None:
     state = physics.state
     for name in state.array_fields():
         h.update(np.ascontiguousarray(getattr(state, name)).tobytes())
-    h.update(physics.rigid.data.qpos.tobytes() + physics.rigid.data.qvel.tobytes())
+    h.update(physics.rigid.mj_data.qpos.tobytes() + physics.rigid.mj_data.qvel.tobytes())
     for contact in physics.contacts:
         h.update(repr((contact.actor, contact.link, contact.body)).encode())
         h.update(contact.force.tobytes() + contact.position.tobytes())
-    h.update(physics.plants.awake.tobytes() + repr([(p.body, p.cause) for p in physics.partings]).encode())
+    h.update(physics.plants.awake.tobytes() + repr([(p.body, p.cause) for p in physics.detachments]).encode())
 
 
 def a_day() -> tuple[str, dict[str, int]]:
@@ -38,7 +38,7 @@ def a_day() -> tuple[str, dict[str, int]]:
     robots = [scenes.bar("bar", 0, 2), scenes.gripper("hand", scenes.bunch_center(2))]
     for robot in robots:
         physics.add_robot(robot)
-    physics.sleep.patience = 20
+    physics.sleep_monitor.patience = 20
     for tick in range(300):
         slowly = min(1.0, tick / 60)
         physics.rigid.command("bar", np.array([0.06 * slowly if tick < 150 else 0.0]))
@@ -53,10 +53,10 @@ def a_day() -> tuple[str, dict[str, int]]:
         before = physics.plants.awake
         physics.step()
         seen["contacts"] += len(physics.contacts)
-        seen["partings"] += len(physics.partings)
+        seen["partings"] += len(physics.detachments)
         seen["woken"] += len(np.setdiff1d(physics.plants.awake, before))
         seen["rested"] += len(np.setdiff1d(before, physics.plants.awake))
-        seen["stopped"] = int(physics.guard.count.sum())
+        seen["stopped"] = int(physics.fault_guard.count.sum())
         digest(physics, h)
     return h.hexdigest(), seen
 

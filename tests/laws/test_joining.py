@@ -29,7 +29,7 @@ def busy(*first: RobotSpec) -> Physics:
     """
     trees = [cane((0.0, 0.0, 2.0), bunch=0.5), *(cane((0.0, 5.0 + i, 2.0), bunch=0.4) for i in range(4))]
     model = assemble(trees, **BOXES)
-    physics = Physics(model, picking=False)
+    physics = Physics(model, detachment=False)
     pose = model.forward_kinematics(model.joint_settled)[model.bunch_body[0]]
     for spec in first:
         physics.add_robot(spec)
@@ -51,7 +51,7 @@ def command(physics: Physics, tick: int) -> None:
 
 def numbers(physics: Physics) -> dict[str, bytes]:
     """Every number that the next tick starts from, by the name of what it belongs to."""
-    world, data, touching = physics.rigid.world, physics.rigid.data, physics.contact_solver
+    world, data, touching = physics.rigid.mj_model, physics.rigid.mj_data, physics.contact_solver
     found = {"plants": physics.state.joint_q.tobytes() + physics.state.joint_qd.tobytes()}
     for i in range(world.njnt):
         joint = world.joint(i)
@@ -64,8 +64,8 @@ def numbers(physics: Physics) -> dict[str, bytes]:
     n = int(touching._known_count[0])
     found["memory"] = touching._known_push[:n].tobytes() + touching._known_anchor[:n].tobytes()
     found["contacts"] = b"".join(c.force.tobytes() for c in physics.contacts)
-    parked = {f"loose/{slot}" for slot in range(physics.rigid._waiting)} - {
-        f"loose/{slot}" for slot in physics.rigid._slot.values()
+    parked = {f"loose/{slot}" for slot in range(physics.rigid._pool_size)} - {
+        f"loose/{slot}" for slot in physics.rigid._bunch_slot.values()
     }
     return {k: v for k, v in found.items() if k not in parked and not k.startswith("newcomer")}
 
@@ -126,28 +126,28 @@ def test_what_sleeps_goes_on_sleeping_and_wakes_with_what_it_leans_on():
     for _ in range(900):
         physics.step()
     rigid = physics.rigid
-    lie = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._slot.values())]
+    lie = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._bunch_slot.values())]
 
     def sleeping() -> list[bool]:
-        trees = [rigid.world.body_treeid[rigid.world.body(name).id] for name in lie]
-        return (rigid.data.tree_asleep[trees] >= 0).tolist()
+        trees = [rigid.mj_model.body_treeid[rigid.mj_model.body(name).id] for name in lie]
+        return (rigid.mj_data.tree_asleep[trees] >= 0).tolist()
 
     assert all(sleeping())
-    before = [rigid.data.joint(name).qpos.copy() for name in lie]
+    before = [rigid.mj_data.joint(name).qpos.copy() for name in lie]
     physics.add_robot(bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0))
     assert all(sleeping())
     for _ in range(50):
         physics.step()
     assert all(sleeping())
     for name, pose in zip(lie, before, strict=True):
-        np.testing.assert_array_equal(rigid.data.joint(name).qpos, pose)
-    deepest = min(rigid.loose, key=lambda bunch: rigid.bunch_pose(bunch)[2])
-    gone = lie.index(f"loose/{rigid._slot[deepest]}")
+        np.testing.assert_array_equal(rigid.mj_data.joint(name).qpos, pose)
+    deepest = min(rigid.free_bunches, key=lambda bunch: rigid.bunch_pose(bunch)[2])
+    gone = lie.index(f"loose/{rigid._bunch_slot[deepest]}")
     physics.rigid.remove_bunch(deepest)
     del lie[gone]
     assert not any(sleeping()), "all leaned on each other"
     physics.step()
-    assert np.isfinite(rigid.data.qpos).all()
+    assert np.isfinite(rigid.mj_data.qpos).all()
 
 
 def test_a_dozen_robots_join():

@@ -38,7 +38,7 @@ def dropped(into_crate: bool) -> Physics:
 
 def on_the_ground(physics: Physics) -> tuple[float, float]:
     """Vertical force [N] of all contacts with the ground, and the deepest contact [m] of any two things."""
-    world, data = physics.rigid.world, physics.rigid.data
+    world, data = physics.rigid.mj_model, physics.rigid.mj_data
     force, wrench, deepest = 0.0, np.zeros(6), 0.0
     for c in range(data.ncon):
         contact = data.contact[c]
@@ -51,7 +51,7 @@ def on_the_ground(physics: Physics) -> tuple[float, float]:
 
 def watch_awake(physics: Physics, ticks: int = 100) -> tuple[float, float]:
     """Keep everything awake for a second: mean force on the ground and deepest contact."""
-    physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    physics.rigid.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     seen = []
     for _ in range(ticks):
         physics.step()
@@ -63,14 +63,14 @@ def watch_awake(physics: Physics, ticks: int = 100) -> tuple[float, float]:
 def settle(physics: Physics, ticks: int = 300) -> None:
     for _ in range(ticks):
         physics.step()
-    asleep = physics.rigid.data.tree_asleep
+    asleep = physics.rigid.mj_data.tree_asleep
     assert (asleep >= 0).all()  # every bunch, and the crate
 
 
 def test_ten_bunches_lie_in_the_crate_and_weigh_what_they_weigh():
     physics = dropped(into_crate=True)
     settle(physics)
-    crate = physics.rigid.data.joint("box/0").qpos
+    crate = physics.rigid.mj_data.joint("box/0").qpos
     for bunch in range(10):
         pose = physics.rigid.bunch_pose(bunch)
         middle = pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
@@ -102,7 +102,7 @@ def test_a_full_crate_is_pushed_by_mu_m_g(share, moves):
     """F34: the push that starts a laden crate is the friction coefficient times the weight of all that is in it."""
     physics = dropped(into_crate=True)
     settle(physics)
-    box, data = physics.rigid.world.body("box/0").id, physics.rigid.data
+    box, data = physics.rigid.mj_model.body("box/0").id, physics.rigid.mj_data
     start = data.joint("box/0").qpos[:3].copy()
     data.xfrc_applied[box, 0] = -share * FRICTION * GRAVITY[2] * (MASSES.sum() + CRATE)
     # at the height of the ground, so that it does not tip the crate
@@ -127,17 +127,17 @@ def test_nothing_leaves_faster_than_it_came(seed):
     fastest = 0.0
     for _ in range(250):
         physics.step()
-        speeds = [np.linalg.norm(rigid.data.joint(f"loose/{slot}").qvel[:3]) for slot in rigid._slot.values()]
+        speeds = [np.linalg.norm(rigid.mj_data.joint(f"loose/{slot}").qvel[:3]) for slot in rigid._bunch_slot.values()]
         fastest = max(fastest, *speeds)
     fall = np.sqrt(2.0 * 9.81 * 1.85)
     assert 0.8 * fall < fastest < 1.25 * fall
     # and none is pushed through the bottom, which would lift the crate
-    assert rigid.data.joint("box/0").qpos[2] == pytest.approx(0.0, abs=2e-3)
+    assert rigid.mj_data.joint("box/0").qpos[2] == pytest.approx(0.0, abs=2e-3)
 
 
 def test_twice_the_same_bits():
     ends = []
     for _ in range(2):
         physics = dropped(into_crate=True)
-        ends.append(physics.rigid.data.qpos.tobytes() + physics.rigid.data.qvel.tobytes())
+        ends.append(physics.rigid.mj_data.qpos.tobytes() + physics.rigid.mj_data.qvel.tobytes())
     assert ends[0] == ends[1]

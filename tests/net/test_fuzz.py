@@ -111,7 +111,7 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     state = client.physics.state
     assert np.isfinite(state.joint_q).all()
     assert np.isfinite(state.joint_qd).all()
-    base, _ = client.physics.rigid.base("ada")
+    base, _ = client.physics.rigid.base_state("ada")
     assert np.linalg.norm(base[:3] - pose[:3]) < 0.5
     assert client.replicator.counters.malformed > 100
     assert client.replicator.actors == {}

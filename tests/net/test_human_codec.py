@@ -22,7 +22,7 @@ from vinesim.net.codec.human import (
     quantised,
 )  # fmt: skip
 from vinesim.net.codec.messages import MessageError
-from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.human_body import standing_pose
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))
@@ -30,7 +30,7 @@ HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))
 
 def somebody(seed: int = 0) -> HumanUpdate:
     rng = np.random.default_rng(seed)
-    pose = standing(HERE, 1.8)
+    pose = standing_pose(HERE, 1.8)
     points = pose.points
     points[1:, :3] += rng.uniform(-0.5, 0.5, (6, 3))
     points[1:, 3:] = frames.normalize(rng.normal(size=(6, 4)))

@@ -21,7 +21,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.human import Push, encode_human, encode_push
 from vinesim.net.recording import mcap_file
 from vinesim.net.recording.mcap_file import NotARecording, Recording, RecordingStopped, free_path, read
-from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.human_body import standing_pose
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 
@@ -83,7 +83,7 @@ def test_what_a_message_says():
     assert told["pose"]["position"]["x"] == 13.0
     assert messages.time_of(messages.encode_facts([fact])) is None
 
-    person = standing(pose, 1.8)
+    person = standing_pose(pose, 1.8)
     said = mcap_file.said("a/eva", encode_human(HumanUpdate("eva", 5.0, person, np.zeros((7, 6)))))
     assert said["points"].keys() == set(POINT_NAMES)
     assert list(said["points"]["head"]["position"].values()) == pytest.approx(person.head[:3], abs=2e-4)

@@ -656,6 +656,7 @@ def test_devices_that_are_not_there_are_refused_in_words() -> None:
         assert refused.value.exit_code == 3
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(wp.get_cuda_device_count() == 0, reason="needs an NVIDIA GPU; benchmarks/gpu.py holds one to this")
 def test_a_gpu_agrees_with_the_cpu() -> None:
     cpu, near = eventful()

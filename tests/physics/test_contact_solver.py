@@ -13,7 +13,7 @@ from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper,
 from vinesim import frames
 from vinesim.kernels.contact import solver
 from vinesim.physics.contact.contact_solver import ContactSolver, plant_capsules
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
@@ -229,8 +229,8 @@ def test_only_what_is_reached_wakes_and_it_moves_in_the_same_tick():
     physics.step()
     assert len(physics.plants.awake) == 0
     physics.add_robot(bar((0.7, -0.06, 0.95)))
-    drive = physics.rigid._robots["bar"].v
-    physics.rigid.data.qvel[drive] = 3.0
+    drive = physics.rigid.robot("bar").v
+    physics.rigid.mj_data.qvel[drive] = 3.0
     before = physics.state.joint_q.copy()
     reached = None
     for _ in range(3):
@@ -246,14 +246,14 @@ def test_only_what_is_reached_wakes_and_it_moves_in_the_same_tick():
     assert not moved[model.tree_size[0] :].any()
     deepest = min(c.distance for c in physics.contacts)
     assert deepest > 0.0  # seen before it was there: nothing was late
-    _, _, _, contact_effort = physics.rigid.read("bar")
+    _, _, _, contact_effort = physics.rigid.joint_measurements("bar")
     assert contact_effort[0] == pytest.approx(sum(c.force[1] for c in physics.contacts), rel=1e-6)
 
 
 def test_fast_bar_wakes_every_cane_before_it_overlaps_one():
     physics = Physics(assemble([cane((0.0, 0.3 * i, 1.0), radius=0.005) for i in range(6)]))
     physics.add_robot(bar((0.7, -0.2, 0.95), damping=2000.0))
-    physics.rigid.data.qvel[physics.rigid._robots["bar"].v] = 5.0
+    physics.rigid.mj_data.qvel[physics.rigid.robot("bar").v] = 5.0
     physics.rigid.command("bar", np.zeros(1), np.array([5.0]))
     first = {}
     for _ in range(40):
@@ -278,7 +278,7 @@ def test_a_box_that_lies_wakes_nobody_but_one_that_is_pushed_does():
     for _ in range(20):
         physics.step()
     assert len(physics.plants.awake) == 0
-    physics.rigid.data.joint("box/0").qvel[1] = 1.0
+    physics.rigid.mj_data.joint("box/0").qvel[1] = 1.0
     touched = set()
     for _ in range(30):
         physics.step()
@@ -292,7 +292,7 @@ def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
     physics.contact_solver = ContactSolver(model, physics.plants, physics.rigid, capacity=2)
     physics.add_robot(gripper(middle))
     stages = (
-        physics.rigid.prep,
+        physics.rigid.predict,
         physics.contact_solver.wake_near_trees,
         physics.plants.predict,
         physics.contact_solver.solve,
@@ -334,7 +334,7 @@ def test_a_robot_that_joins_does_not_shake_a_grasp():
             if join and tick == 250:
                 physics.remove_robot("bar")
             physics.step()
-        runs.append(physics.view().body_q[body])
+        runs.append(physics.snapshot().body_q[body])
     np.testing.assert_allclose(runs[0], runs[1], atol=1e-6)
 
 
@@ -378,41 +378,41 @@ def test_views_own_what_they_show_and_share_it_while_all_sleep():
     model, _, middle = bunch_scene()
     physics = Physics(model)
     physics.step()
-    first = physics.view()
+    first = physics.snapshot()
     physics.step()
-    assert physics.view().body_q is first.body_q
+    assert physics.snapshot().body_q is first.body_q
     physics.plants.wake(0)
     physics.state.joint_qd[5, 1] = 1.0
     physics.step()
-    second = physics.view()
+    second = physics.snapshot()
     kept = second.body_q.copy()
-    assert second.moved.tolist() == [0]
+    assert second.moved_trees.tolist() == [0]
     assert (second.body_q != first.body_q).any()
     np.testing.assert_allclose(second.body_q, model.forward_kinematics(physics.state.joint_q), atol=1e-5)
     physics.step()
-    physics.view()
+    physics.snapshot()
     assert (second.body_q == kept).all()
     physics.add_robot(gripper(middle))
-    assert len(physics.view().links) == len(physics.view().link_q) == 2
-    assert physics.view().links is physics.view().links
+    assert len(physics.snapshot().visuals) == len(physics.snapshot().visual_q) == 2
+    assert physics.snapshot().visuals is physics.snapshot().visuals
 
 
 def test_rigid_groups_join_what_a_constraint_couples():
-    rigid = Rigid(rows_of_canes(1))
+    rigid = RigidWorld(rows_of_canes(1))
     rigid.add_robot(bar((0.0, 0.0, 0.5), "a"))
     rigid.add_robot(bar((0.0, 0.055, 0.5), "b"))
-    rigid.prep()
-    world = rigid.world
-    a, b = (int(rigid.group[world.body_treeid[world.geom_bodyid[g]]]) for g in rigid.geoms.id)
-    assert rigid.data.ncon > 0
+    rigid.predict()
+    world = rigid.mj_model
+    a, b = (int(rigid.islands[world.body_treeid[world.geom_bodyid[g]]]) for g in rigid.geoms.id)
+    assert rigid.mj_data.ncon > 0
     assert a == b
 
 
 def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "wind", "holding", "rigid", "contacts", "detail", "plants", "contacts", "plants", "rigid", "guard", "parting",
-        "holding", "sleep",
+        "wind", "grasps", "rigid", "contacts", "detail", "plants", "contacts", "plants", "rigid", "faults", "detachment",
+        "grasps", "sleep",
     ]  # fmt: skip
     physics.plants.wake(1)
     physics.state.joint_qd[physics.model.bodies_of(1).start, 1] = 0.5
@@ -482,7 +482,7 @@ def test_a_swinging_cane_stops_at_a_pole():
         for _ in range(40):
             physics.step()
             met |= {(c.actor, c.link) for c in physics.contacts}
-            furthest[standing] = max(furthest[standing], float(physics.view().body_q[12, 1]))
+            furthest[standing] = max(furthest[standing], float(physics.snapshot().body_q[12, 1]))
         assert met == ({("world", "fixed/0")} if standing else set())
     assert furthest[False] > 0.12
     assert furthest[True] < 0.08
@@ -532,7 +532,7 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
         physics.rigid.command("bar", np.zeros(1), np.array([0.1]))
         seen = set()
         stages = (
-            physics.rigid.prep,
+            physics.rigid.predict,
             physics.contact_solver.wake_near_trees,
             physics.plants.predict,
             physics.contact_solver.solve,
@@ -564,15 +564,15 @@ def scene_by_chance(seed: int, **options) -> tuple[Physics, list[str]]:
         )
         for i in range(4)
     ]  # fmt: skip
-    physics = Physics(assemble(trees), picking=False)
+    physics = Physics(assemble(trees), detachment=False)
     if options:
         ContactSolver.__init__(physics.contact_solver, physics.model, physics.plants, physics.rigid, **options)
     physics.add_robot(bar((rng.uniform(0.3, 0.9), -0.2, 1.0), damping=float(rng.choice([0.0, 300.0]))))
     physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
     speed = rng.uniform(0.3, 3.0)
     physics.rigid.command("bar", np.zeros(1), np.array([speed]))
-    physics.rigid.data.qvel[physics.rigid._robots["bar"].v] = speed
-    physics.rigid.push("probe", "rod", np.array([0.0, 0.0, -rng.uniform(2.0, 30.0)]))
+    physics.rigid.mj_data.qvel[physics.rigid.robot("bar").v] = speed
+    physics.rigid.apply_wrench("probe", "rod", np.array([0.0, 0.0, -rng.uniform(2.0, 30.0)]))
     return physics, ["bar", "probe"]
 
 
@@ -598,7 +598,7 @@ def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed)
             touching.wrenches[:, :3].sum(0), -sum((c.force for c in outside), np.zeros(3)), atol=1e-9
         )
         for name in robots:
-            base = rigid._robots[name].base_v[:2]
+            base = rigid.robot(name).base_v[:2]
             on_robot = sum((c.force for c in outside if c.actor == name), np.zeros(3))
             np.testing.assert_allclose(touching.rigid_force[base], on_robot[:2], atol=1e-9)
     assume(pressed > 0)
@@ -634,7 +634,7 @@ def test_waking_is_never_late(seed):
     for tick in range(120):
         if tick % 20 == 0:
             speed = float(rng.uniform(-5.0, 5.0))
-            physics.rigid.drive_base("bar", (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), rng.uniform(-2.0, 2.0)))
+            physics.rigid.command_base("bar", (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), rng.uniform(-2.0, 2.0)))
         physics.rigid.command("bar", np.zeros(1), np.array([speed]))
         asleep = ~physics.state.tree_awake.copy()
         physics.step()
@@ -660,7 +660,7 @@ def test_the_ten_thousand_and_first_contact_is_counted_and_the_deepest_stay():
             physics.add_robot(bar((0.1 + 0.05 * i, 0.034, 1.0), f"bar{i}"))
         physics.plants.wake(np.arange(460))
         for stage in (
-            physics.rigid.prep,
+            physics.rigid.predict,
             physics.contact_solver.wake_near_trees,
             physics.plants.predict,
             physics.contact_solver.solve,

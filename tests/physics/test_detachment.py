@@ -16,7 +16,7 @@ from vinesim.scene.values import Parting
 
 def momentum(physics: Physics, name: str) -> np.ndarray:
     """Linear momentum [3] of one free body of the rigid world, kg m/s."""
-    world, data = physics.rigid.world, physics.rigid.data
+    world, data = physics.rigid.mj_model, physics.rigid.mj_data
     mujoco.mj_fwdPosition(world, data)
     mujoco.mj_comVel(world, data)
     velocity, body = np.zeros(6), data.body(name).id
@@ -40,15 +40,15 @@ def test_a_cut_bunch_keeps_its_momentum_and_falls():
     physics.pick(0)
     np.testing.assert_allclose(momentum(physics, "loose/0"), before, atol=1e-6)
     assert np.linalg.norm(before) > 0.01
-    view = physics.view()
+    view = physics.snapshot()
     assert not view.bunch_attached[0]
-    assert [(link.name, link.organ, link.index) for link in view.links] == [("bunch/0", Organ.BUNCH, 0)]
-    np.testing.assert_allclose(view.link_q[0], view.body_q[body], atol=1e-5)
-    height = view.link_q[0, 2]
+    assert [(link.name, link.organ, link.index) for link in view.visuals] == [("bunch/0", Organ.BUNCH, 0)]
+    np.testing.assert_allclose(view.visual_q[0], view.body_q[body], atol=1e-5)
+    height = view.visual_q[0, 2]
     for _ in range(300):
         physics.step()
-    assert physics.view().link_q[0, 2] < height - 1.0
-    assert physics.view().link_q[0, 2] > 0.0
+    assert physics.snapshot().visual_q[0, 2] < height - 1.0
+    assert physics.snapshot().visual_q[0, 2] > 0.0
     with pytest.raises(ValueError, match="picked already"):
         physics.pick(0)
 
@@ -57,12 +57,12 @@ def test_the_vine_springs_up_without_its_bunch():
     model, body, _ = bunch_scene()
     physics = Physics(model)
     tip = body - 3
-    low = physics.view().body_q[tip, 2]
+    low = physics.snapshot().body_q[tip, 2]
     physics.pick(0)
     for _ in range(1500):
         physics.step()
-    assert physics.view().body_q[tip, 2] > low + 0.05
-    assert np.isfinite(physics.view().body_q).all()
+    assert physics.snapshot().body_q[tip, 2] > low + 0.05
+    assert np.isfinite(physics.snapshot().body_q).all()
 
 
 def detached_in_the_grasp() -> tuple[Physics, np.ndarray, np.ndarray, np.ndarray, float]:
@@ -73,14 +73,14 @@ def detached_in_the_grasp() -> tuple[Physics, np.ndarray, np.ndarray, np.ndarray
     for tick in range(290):
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         physics.step()
-    squeeze = physics.rigid.read("grip")[3][2:].copy()
+    squeeze = physics.rigid.joint_measurements("grip")[3][2:].copy()
     start = physics.rigid.link_pose("grip", "hand")[2]
     physics.pick(0)
     seen = []
     for _ in range(200):
         physics.step()
         hand = physics.rigid.link_pose("grip", "hand")[:3]
-        seen.append([*(physics.rigid.bunch_pose(0)[:3] - hand), *physics.rigid.read("grip")[3][2:]])
+        seen.append([*(physics.rigid.bunch_pose(0)[:3] - hand), *physics.rigid.joint_measurements("grip")[3][2:]])
     return physics, np.array(seen)[:, :3], np.array(seen)[:, 3:], squeeze, start
 
 
@@ -89,13 +89,13 @@ def test_a_bunch_cut_in_the_grasp_stays_in_it():
     assert np.abs(fingers / squeeze - 1.0).max() < 0.015  # in every tick of 2 s
     assert np.abs(place - place[0]).max() < 5e-5
     # the lift now carries the bunch's weight, which its peduncle no longer does
-    assert physics.rigid.read("grip")[3][1] == pytest.approx(-0.5 * 9.81, rel=0.02)
+    assert physics.rigid.joint_measurements("grip")[3][1] == pytest.approx(-0.5 * 9.81, rel=0.02)
     assert start == pytest.approx(physics.rigid.link_pose("grip", "hand")[2], abs=3e-3)
     assert not physics.plants.state.bunch_attached[0]
 
 
 def test_twice_the_same_bits():
-    data = [detached_in_the_grasp()[0].rigid.data for _ in range(2)]
+    data = [detached_in_the_grasp()[0].rigid.mj_data for _ in range(2)]
     assert data[0].qpos.tobytes() + data[0].qvel.tobytes() == data[1].qpos.tobytes() + data[1].qvel.tobytes()
 
 
@@ -114,9 +114,9 @@ def pulled(pull: float, bend: float, ticks: int = 400) -> tuple[Physics, tuple[P
         physics.rigid.command("grip", target)
         physics.step()
         wrenches.append(physics.plants.joint_wrench(model.bunch_body)[0])
-        if physics.partings:
+        if physics.detachments:
             break
-    return physics, physics.partings, np.array(wrenches)
+    return physics, physics.detachments, np.array(wrenches)
 
 
 def test_a_peduncle_parts_when_it_is_pulled_harder_than_it_holds():
@@ -130,7 +130,7 @@ def test_a_peduncle_parts_when_it_is_pulled_harder_than_it_holds():
     assert (parting.tick, parting.body) == (physics.tick, physics.model.bunch_body[0])
     assert np.linalg.norm(parting.force) > 12.0
     assert parting.force[2] > 10.0  # what the vine held on with, upwards
-    assert physics.rigid.loose == (0,)
+    assert physics.rigid.free_bunches == (0,)
 
 
 def test_a_peduncle_breaks_when_it_is_bent_further_than_it_gives():
@@ -144,20 +144,20 @@ def test_a_peduncle_breaks_when_it_is_bent_further_than_it_gives():
 def test_nothing_parts_without_strain():
     physics, partings, _ = pulled(1e5, 1e5, 200)
     assert partings == ()
-    assert physics.rigid.loose == ()
+    assert physics.rigid.free_bunches == ()
 
 
 def test_a_command_is_told_with_the_weight_the_stalk_carried():
     model, body, _ = bunch_scene()
     physics = Physics(model)
     physics.pick(0)
-    assert physics.partings == ()
+    assert physics.detachments == ()
     physics.step()
-    (parting,) = physics.partings
+    (parting,) = physics.detachments
     assert (parting.tree, parting.body, parting.bunch, parting.cause, parting.actor) == (0, body, 0, "command", "")
     np.testing.assert_allclose(parting.force, [0.0, 0.0, 0.5 * 9.81], atol=1e-4)
     physics.step()
-    assert physics.partings == ()
+    assert physics.detachments == ()
     with pytest.raises(ValueError, match="no bunch 7"):
         physics.pick(7)
 
@@ -165,35 +165,35 @@ def test_a_command_is_told_with_the_weight_the_stalk_carried():
 def test_a_blade_that_closes_on_the_stalk_takes_the_bunch():
     model, body, _ = bunch_scene()
     physics = Physics(model)
-    stalk = physics.view().body_q[body - 1, :3]
+    stalk = physics.snapshot().body_q[body - 1, :3]
     physics.add_robot(bar(stalk + np.array([0.0, -0.5, -0.2])))
-    mouth = physics.blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.18])), np.array([0.03, 0.03, 0.002]))
+    mouth = physics.add_blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.18])), np.array([0.03, 0.03, 0.002]))
     physics.step()
-    assert physics.partings == ()
+    assert physics.detachments == ()
     mouth.close()
     physics.step()
-    (parting,) = physics.partings
+    (parting,) = physics.detachments
     assert (parting.bunch, parting.body, parting.cause, parting.actor) == (0, body, "blade", "bar")
     assert parting.force[2] == pytest.approx(0.5 * 9.81, rel=0.05)
     mouth.close()  # on the stub of the stalk: nothing is left to cut
     physics.step()
-    assert physics.partings == ()
+    assert physics.detachments == ()
     with pytest.raises(ValueError, match="no link 'hand'"):
-        physics.blade("bar", "hand", mouth.pose, mouth.half)
+        physics.add_blade("bar", "hand", mouth.pose, mouth.half)
     physics.remove_robot("bar")
-    assert physics.parting.blades == []
+    assert physics.detachment_monitor.blades == []
 
 
 def test_a_blade_beside_the_stalk_cuts_nothing():
     model, body, _ = bunch_scene()
     physics = Physics(model)
-    stalk = physics.view().body_q[body - 1, :3]
+    stalk = physics.snapshot().body_q[body - 1, :3]
     physics.add_robot(bar(stalk + np.array([0.0, -0.5, -0.2])))
     for offset in ([0.05, 0.5, 0.18], [0.0, 0.54, 0.18], [0.0, 0.5, 0.12]):
-        mouth = physics.blade("bar", "bar", frames.pose(np.array(offset)), np.array([0.03, 0.03, 0.002]))
+        mouth = physics.add_blade("bar", "bar", frames.pose(np.array(offset)), np.array([0.03, 0.03, 0.002]))
         mouth.close()
         physics.step()
-        assert physics.partings == (), offset
+        assert physics.detachments == (), offset
 
 
 def test_a_bunch_dropped_over_a_crate_ends_in_it():
@@ -206,11 +206,11 @@ def test_a_bunch_dropped_over_a_crate_ends_in_it():
     physics.pick(0)
     for _ in range(400):
         physics.step()
-    links = {link.name: pose for link, pose in zip(physics.rigid.links(), physics.rigid.link_q(), strict=True)}
+    links = {link.name: pose for link, pose in zip(physics.rigid.visuals(), physics.rigid.visual_q(), strict=True)}
     bunch, crate = links["bunch/0"], links["box/0"]
     assert 0.0 < bunch[2] - crate[2] < 0.25
     assert np.abs(bunch[:2] - crate[:2]).max() < 0.3
-    assert np.abs(physics.rigid.data.qvel).max() < 0.1
+    assert np.abs(physics.rigid.mj_data.qvel).max() < 0.1
 
 
 def laden(clusters: bool = True, side: bool = True) -> TreeBuilder:
@@ -231,22 +231,22 @@ def test_a_cut_cane_falls_and_takes_its_bunch_along(fine):
     physics = Physics(model)
     if fine:
         physics.plants.wake(0)
-        physics.watch(model.forward_kinematics(model.joint_settled)[model.bunch_body, :3], 0.1)
+        physics.set_detail_focus(model.forward_kinematics(model.joint_settled)[model.bunch_body, :3], 0.1)
     for _ in range(5):
         physics.step()
     assert physics.state.tree_fine[0] == fine
     below = [6, 7, 8, 9, *range(13, 16), *range(int(model.bunch_cluster[1]), len(model.body_mass))]
     moving = below if fine else below[:7]
-    before = physics.view().body_q.copy()
+    before = physics.snapshot().body_q.copy()
     weight = 9.81 * physics.plants.body_mass[moving].sum()
     physics.cut(6)
     for _ in range(20):
         physics.step()
-        if physics.partings:
-            (parting,) = physics.partings
+        if physics.detachments:
+            (parting,) = physics.detachments
     assert (parting.body, parting.bunch, parting.cause) == (6, -1, "command")
     assert parting.force[2] == pytest.approx(weight, rel=0.01)
-    fallen = (before - physics.view().body_q)[:, 2]
+    fallen = (before - physics.snapshot().body_q)[:, 2]
     assert fallen[moving].mean() == pytest.approx(0.5 * 9.81 * 0.2**2, rel=0.1)
     assert fallen[:5].max() < 1e-4  # and the rest springs up
     assert physics.state.bunch_attached.all()
@@ -260,12 +260,12 @@ def test_a_blade_cuts_the_piece_next_to_the_root_and_only_that():
     """The mouth spans a joint of two pieces: one cut, which takes the further one along."""
     model = assemble([laden()])
     physics = Physics(model)
-    joint = physics.view().body_q[7, :3]
+    joint = physics.snapshot().body_q[7, :3]
     physics.add_robot(bar(joint + np.array([0.0, -0.5, -0.2])))
-    mouth = physics.blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.2])), np.array([0.03, 0.03, 0.03]))
+    mouth = physics.add_blade("bar", "bar", frames.pose(np.array([0.0, 0.5, 0.2])), np.array([0.03, 0.03, 0.03]))
     mouth.close()
     physics.step()
-    (parting,) = physics.partings
+    (parting,) = physics.detachments
     assert (parting.body, parting.bunch, parting.cause, parting.actor) == (6, -1, "blade", "bar")
     assert physics.state.body_cut.tolist() == [body == 6 for body in range(len(model.body_mass))]
 
@@ -275,9 +275,9 @@ def test_a_stalk_that_is_cut_by_command_lets_its_bunch_go():
     physics = Physics(model)
     physics.cut(10)
     physics.step()
-    (parting,) = physics.partings
+    (parting,) = physics.detachments
     assert (parting.body, parting.bunch) == (12, 0)
-    assert physics.rigid.loose == (0,)
+    assert physics.rigid.free_bunches == (0,)
 
 
 def test_a_fine_bunch_is_picked_as_the_compound_that_it_is():
@@ -286,20 +286,20 @@ def test_a_fine_bunch_is_picked_as_the_compound_that_it_is():
     physics = Physics(model)
     parts = np.arange(model.bunch_cluster[0], model.bunch_cluster[0] + model.bunch_clusters[0])
     everything = np.append(parts, model.bunch_body[0])
-    physics.watch(model.forward_kinematics(model.joint_settled)[model.bunch_body, :3], 0.2)
+    physics.set_detail_focus(model.forward_kinematics(model.joint_settled)[model.bunch_body, :3], 0.2)
     physics.plants.wake(0)
     physics.step()
     physics.state.joint_qd[parts[0], 1] = 2.0
     for _ in range(10):
         physics.step()
     assert physics.state.tree_fine[0]
-    q, qd = physics.view().body_q[everything].astype(float), physics.state.body_qd[everything].astype(float)
+    q, qd = physics.snapshot().body_q[everything].astype(float), physics.state.body_qd[everything].astype(float)
     com = frames.rotate(q[:, 3:], physics.plants.body_com[everything].astype(float))
     mass = physics.plants.body_mass[everything].astype(float)
     middle = mass @ (q[:, :3] + com) / mass.sum()
     before = mass @ (qd[:, :3] + np.cross(qd[:, 3:], com))
     physics.pick(0)
-    world, data = physics.rigid.world, physics.rigid.data
+    world, data = physics.rigid.mj_model, physics.rigid.mj_data
     after = momentum(physics, "loose/0")
     body = world.body("loose/0").id
     assert world.body_mass[body] == pytest.approx(0.5, rel=1e-6)
@@ -307,10 +307,10 @@ def test_a_fine_bunch_is_picked_as_the_compound_that_it_is():
     assert np.linalg.norm(before) > 0.02
     # the clusters stop against their head within no time, and the stalk, which is still there then, feels it
     np.testing.assert_allclose(after, before, atol=0.05 * np.linalg.norm(before))
-    shapes = physics.rigid.links()[0].shapes
+    shapes = physics.rigid.visuals()[0].shapes
     assert len(shapes) == model.bunch_clusters[0]
     for shape, part in zip(shapes, parts, strict=True):
-        at = frames.compose(physics.rigid.link_q()[0], shape.pose)[:3]
+        at = frames.compose(physics.rigid.visual_q()[0], shape.pose)[:3]
         pose = physics.state.body_q[part].astype(float)
         half = np.array([0.5 * model.body_length[part], 0.0, 0.0])
         np.testing.assert_allclose(at, pose[:3] + frames.rotate(pose[3:], half), atol=1e-5)
@@ -328,12 +328,12 @@ def test_a_fine_bunch_cut_in_the_grasp_stays_in_it():
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         physics.step()
     assert physics.state.tree_fine[0]
-    squeeze = physics.rigid.read("grip")[3][2:].copy()
+    squeeze = physics.rigid.joint_measurements("grip")[3][2:].copy()
     physics.pick(0)
     fingers, place = [], []
     for _ in range(200):
         physics.step()
-        fingers.append(physics.rigid.read("grip")[3][2:].copy())
+        fingers.append(physics.rigid.joint_measurements("grip")[3][2:].copy())
         place.append(physics.rigid.bunch_pose(0)[:3] - physics.rigid.link_pose("grip", "hand")[:3])
 
     assert np.abs(np.array(fingers) / squeeze - 1.0).max() < 0.015

@@ -50,7 +50,7 @@ def move(physics: Physics, spec: HumanSpec, *way: float, ticks: int, wait: int =
 
 
 def middle_of(physics: Physics, body: int) -> np.ndarray:
-    pose = physics.view().body_q[body].astype(float)
+    pose = physics.snapshot().body_q[body].astype(float)
     return pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
 
 
@@ -84,7 +84,7 @@ def test_a_body_that_walks_takes_canes_along():
         furthest = max(furthest, *(-contact.distance for contact in physics.contacts), 0.0)
     front = -0.6 + 0.014 * 59
     tips = model.bodies_of(0).stop - 1, model.bodies_of(1).stop - 1
-    assert all(physics.view().body_q[tip, 1] > front for tip in tips)
+    assert all(physics.snapshot().body_q[tip, 1] > front for tip in tips)
     assert furthest < 0.01
     assert {contact.link for contact in physics.contacts} <= {"chest", "left_hand", "right_hand", "hips"}
 
@@ -141,7 +141,7 @@ def test_a_bunch_is_held_and_follows():
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
     move(physics, near, 0.0, -0.3, 0.0, ticks=150, wait=550, closed=True)
     hand = physics.hand("eva", "right")
-    assert hand.holds == ("plants", f"body/{body}")
+    assert hand.held == ("plants", f"body/{body}")
     assert middle_of(physics, body)[1] < middle[1] - 0.05
     offset = hand.controller[:3] - hand.pose[:3]
     assert np.linalg.norm(offset) > 0.02
@@ -155,7 +155,7 @@ def test_a_bunch_is_held_and_follows():
     physics.move_human("eva", put(spec.pose))
     for _ in range(600):
         physics.step()
-    assert physics.hand("eva", "right").holds is None
+    assert physics.hand("eva", "right").held is None
     assert abs(middle_of(physics, body)[1] - middle[1]) < 0.02
     assert physics.contacts == ()
 
@@ -168,17 +168,17 @@ def test_a_bunch_pulled_off_stays_in_the_hand_and_weighs_there_what_it_weighed_o
     for share in np.append(np.linspace(0.0, 1.0, 200), np.ones(600)):
         physics.move_human("eva", led(near, 0.0, -0.3 * share, -0.6 * share, closed=True))
         physics.step()
-        parted += physics.partings
+        parted += physics.detachments
     assert [(parting.bunch, parting.cause, parting.actor) for parting in parted] == [(0, "pull", "eva")]
     hand = physics.hand("eva", "right")
-    assert hand.holds == ("bunch/0", "bunch")
+    assert hand.held == ("bunch/0", "bunch")
     assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=5e-4)
     assert hand.force[2] == pytest.approx(0.8 * 9.81, rel=5e-3)
     assert physics.rigid.bunch_pose(0)[2] > 0.5
     physics.move_human("eva", led(near, 0.0, -0.3, -0.6))
     for _ in range(150):
         physics.step()
-    assert physics.hand("eva", "right").holds is None
+    assert physics.hand("eva", "right").held is None
     assert physics.rigid.bunch_pose(0)[2] < 0.2
 
 
@@ -201,7 +201,7 @@ def test_what_lies_on_the_ground_is_picked_up():
         physics.move_human("eva", put(spec.pose, above + np.array([0.0, 0.0, rise]), right_closed=True))
         physics.step()
     hand = physics.hand("eva", "right")
-    assert hand.holds == ("bunch/0", "bunch")
+    assert hand.held == ("bunch/0", "bunch")
     assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=5e-4)
     assert physics.rigid.bunch_pose(0)[2] > lies[2] + 0.2
 
@@ -210,11 +210,11 @@ def test_shears_leave_a_bunch_in_the_hand_that_holds_it():
     physics, spec, body, _ = before_a_bunch(0.8)
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
     move(physics, near, 0.0, 0.0, 0.0, ticks=50, closed=True)
-    assert physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    assert physics.hand("eva", "right").held == ("plants", f"body/{body}")
     physics.pick(0)
     move(physics, near, 0.0, 0.0, 0.0, ticks=400, closed=True)
     hand = physics.hand("eva", "right")
-    assert hand.holds == ("bunch/0", "bunch")
+    assert hand.held == ("bunch/0", "bunch")
     assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=1e-3)
     assert not physics.plants.tie_stiffness.any()
 
@@ -229,7 +229,7 @@ def test_a_robot_joins_while_a_hand_holds_a_plant():
     for _ in range(20):
         physics.step()
     hand = physics.hand("eva", "right")
-    assert hand.holds == ("plants", f"body/{body}")
+    assert hand.held == ("plants", f"body/{body}")
     assert np.linalg.norm(hand.force - before.force) < 0.3
 
 
@@ -241,10 +241,10 @@ def test_a_cane_is_held_too():
     near = move(physics, spec, 0.0, 0.09, 0.0, ticks=60, wait=30)
     move(physics, near, 0.0, -0.2, 0.1, ticks=100, wait=500, closed=True)
     hand = physics.hand("eva", "right")
-    assert hand.holds[0] == "plants"
+    assert hand.held[0] == "plants"
     np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], atol=0.02)
     assert np.linalg.norm(hand.force) > 1.0
-    assert physics.view().body_q[12, 1] < -0.05
+    assert physics.snapshot().body_q[12, 1] < -0.05
 
 
 def test_two_hands_share_a_box():
@@ -268,10 +268,10 @@ def test_two_hands_share_a_box():
     for rise in np.append(np.linspace(0.0, 0.8, 200), np.full(1200, 0.8)):
         hold(0.1, 0.15 + rise, closed=True)
     left, right = physics.hand("eva", "left"), physics.hand("eva", "right")
-    assert left.holds == right.holds == ("box/0", "box")
+    assert left.held == right.held == ("box/0", "box")
     for hand in (left, right):
         assert hand.controller[2] - hand.pose[2] == pytest.approx(0.4905, rel=0.02)
-    assert physics.rigid.data.body("box/0").xpos[2] == pytest.approx(0.8 - 0.4905, abs=0.02)
+    assert physics.rigid.mj_data.body("box/0").xpos[2] == pytest.approx(0.8 - 0.4905, abs=0.02)
 
 
 def test_a_robot_is_led_by_the_hand():
@@ -289,14 +289,14 @@ def test_a_robot_is_led_by_the_hand():
         lead(x, closed=False)
     for x in np.append(np.linspace(-0.05, -0.6, 200), np.full(400, -0.6)):
         lead(x, closed=True)
-    assert physics.hand("eva", "right").holds == ("probe", "rod")
-    position, _, effort, _ = physics.rigid.read("probe")
+    assert physics.hand("eva", "right").held == ("probe", "rod")
+    position, _, effort, _ = physics.rigid.joint_measurements("probe")
     assert position[0] < -0.05
     assert effort[0] == pytest.approx(-physics.hand("eva", "right").force[0], rel=1e-2)
     for _ in range(300):
         lead(-0.6, closed=False)
-    assert physics.hand("eva", "right").holds is None
-    assert abs(physics.rigid.read("probe")[0][0]) < 1e-4
+    assert physics.hand("eva", "right").held is None
+    assert abs(physics.rigid.joint_measurements("probe")[0][0]) < 1e-4
 
 
 def test_a_fist_takes_nothing():
@@ -304,7 +304,7 @@ def test_a_fist_takes_nothing():
     away = move(physics, spec, 0.0, -0.2, 0.0, ticks=50)
     move(physics, away, 0.0, 0.0, 0.0, ticks=30, closed=True)
     move(physics, away, 0.0, 0.3, 0.0, ticks=100, wait=100, closed=True)
-    assert physics.hand("eva", "right").holds is None
+    assert physics.hand("eva", "right").held is None
     assert physics.hand("eva", "right").touching
 
 
@@ -312,7 +312,7 @@ def test_who_leaves_lets_go():
     physics, spec, body, _ = before_a_bunch()
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50)
     move(physics, near, 0.0, -0.1, 0.0, ticks=50, closed=True)
-    assert physics.hand("eva", "right").holds == ("plants", f"body/{body}")
+    assert physics.hand("eva", "right").held == ("plants", f"body/{body}")
     physics.remove_human("eva")
     assert not physics.plants.tie_stiffness.any()
     physics.step()
@@ -356,7 +356,7 @@ def test_twice_the_same_bits():
         physics, spec, _, _ = before_a_bunch(0.8, pull=15.0)
         near = move(physics, spec, 0.0, 0.04, 0.0, ticks=30)
         move(physics, near, 0.0, -0.3, -0.2, ticks=100, closed=True)
-        data = physics.rigid.data
+        data = physics.rigid.mj_data
         return data.qpos.tobytes() + data.qvel.tobytes() + physics.state.joint_q.tobytes()
 
     assert run() == run()

@@ -9,11 +9,11 @@ import pytest
 
 from tests.physics.test_human_body import eva, put, soft_arm
 from tests.physics.test_rigid_world import HOME, arm, step, yard
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.urdf import RobotError
 
 
-def pushing() -> Rigid:
+def pushing() -> RigidWorld:
     """Eva pushes the soft arm 0.1 m in, slowly, and stays."""
     rigid, spec = soft_arm()
     for x in np.linspace(-0.4, 0.1, 200):
@@ -25,46 +25,46 @@ def pushing() -> Rigid:
 
 def test_a_push_is_the_hands_force_and_the_drives_feel_its_jacobian():
     rigid = pushing()
-    given, (left, right) = rigid.pushed_by("eva")
+    given, (left, right) = rigid.hand_wrenches("eva")
     assert (left, right) == (False, True)
     (link,) = given["probe"]
     wrench = given["probe"][link]
-    np.testing.assert_allclose(wrench[:3], rigid.hand("eva", "right").force, atol=1e-6)
-    body = rigid.world.body(f"probe/{link}").id
-    jacobian = rigid.jacobian("probe", link, rigid.data.xipos[body])
-    np.testing.assert_allclose(jacobian.T @ wrench, rigid.read("probe")[3], atol=1e-6)
+    np.testing.assert_allclose(wrench[:3], rigid.hand_sample("eva", "right").force, atol=1e-6)
+    body = rigid.mj_model.body(f"probe/{link}").id
+    jacobian = rigid.jacobian("probe", link, rigid.mj_data.xipos[body])
+    np.testing.assert_allclose(jacobian.T @ wrench, rigid.joint_measurements("probe")[3], atol=1e-6)
 
 
 def test_who_bears_the_same_wrench_gives_way_as_much():
     """F05 in one world: without the hand, but with its wrench, position, effort and contact are the same."""
     touched = pushing()
-    given, _ = touched.pushed_by("eva")
+    given, _ = touched.hand_wrenches("eva")
     rigid, spec = soft_arm()
     rigid.move_human("eva", spec.pose)
-    rigid.bear("probe", given["probe"])
+    rigid.set_remote_wrenches("probe", given["probe"])
     step(rigid, 600)
-    for one, other in zip(rigid.read("probe"), touched.read("probe"), strict=True):
+    for one, other in zip(rigid.joint_measurements("probe"), touched.joint_measurements("probe"), strict=True):
         np.testing.assert_allclose(one, other, atol=2e-3 * max(1.0, np.abs(other).max()))
-    rigid.bear("probe", {})
+    rigid.set_remote_wrenches("probe", {})
     step(rigid, 300)
-    assert abs(rigid.read("probe")[0][0]) < 1e-4
-    assert (rigid.read("probe")[3] == 0.0).all()
-    assert not rigid.data.xfrc_applied.any()
+    assert abs(rigid.joint_measurements("probe")[0][0]) < 1e-4
+    assert (rigid.joint_measurements("probe")[3] == 0.0).all()
+    assert not rigid.mj_data.xfrc_applied.any()
     with pytest.raises(RobotError, match="a link that it has not"):
-        rigid.bear("probe", {"tail": np.zeros(6)})
+        rigid.set_remote_wrenches("probe", {"tail": np.zeros(6)})
 
 
 def test_what_is_borne_outlives_a_compilation():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm("early", y=3.0))
     rigid.add_robot(arm())
-    rigid.bear("anna", {"lower": np.array([0.0, 0.0, -30.0, 0.0, 0.0, 0.0])})
+    rigid.set_remote_wrenches("anna", {"lower": np.array([0.0, 0.0, -30.0, 0.0, 0.0, 0.0])})
     step(rigid, 300)
-    before = rigid.read("anna")[3].copy()
+    before = rigid.joint_measurements("anna")[3].copy()
     assert before[0] > 10.0
     rigid.remove_robot("early")
     step(rigid, 50)
-    np.testing.assert_allclose(rigid.read("anna")[3], before, rtol=1e-3)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[3], before, rtol=1e-3)
 
 
 def test_a_hand_that_holds_a_link_gives_its_pull():
@@ -73,84 +73,86 @@ def test_a_hand_that_holds_a_link_gives_its_pull():
     for x in np.linspace(-0.4, -0.14, 100):
         rigid.move_human("eva", put(spec.pose, (x, 0.0, 1.1)))
         step(rigid)
-    near = rigid.near_hand("eva", "right", 0.1)
+    near = rigid.nearest_to_hand("eva", "right", 0.1)
     assert near is not None
-    rigid.hold("eva", "right", near[1], near[2])
+    rigid.grasp("eva", "right", near[1], near[2])
     for y in np.linspace(0.0, 0.1, 100):
         rigid.move_human("eva", put(spec.pose, (-0.2, y, 1.1)))
         step(rigid)
     step(rigid, 300)
-    given, giving = rigid.pushed_by("eva")
+    given, giving = rigid.hand_wrenches("eva")
     assert giving == (False, True)
     wrench = given["probe"][near[2]]
-    hand = rigid.hand("eva", "right")
+    hand = rigid.hand_sample("eva", "right")
     np.testing.assert_allclose(wrench[:3], hand.force, atol=1e-9)
     assert np.linalg.norm(hand.force) > 2.0
     np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], rtol=0.02, atol=0.05)
-    body = rigid.world.body(f"probe/{near[2]}").id
-    jacobian = rigid.jacobian("probe", near[2], rigid.data.xipos[body])
-    np.testing.assert_allclose(jacobian.T @ wrench, rigid.weight("probe") - rigid.read("probe")[2], atol=0.05)
+    body = rigid.mj_model.body(f"probe/{near[2]}").id
+    jacobian = rigid.jacobian("probe", near[2], rigid.mj_data.xipos[body])
+    np.testing.assert_allclose(
+        jacobian.T @ wrench, rigid.gravity_effort("probe") - rigid.joint_measurements("probe")[2], atol=0.05
+    )
 
 
 # ---------------------------------------------------------------------- copies of people
 
 
 def test_hands_of_a_copy_touch_no_robot_and_hold_nothing():
-    rigid, spec = Rigid(yard()), eva(-1.0)
+    rigid, spec = RigidWorld(yard()), eva(-1.0)
     rigid.add_robot(arm())
-    rigid.add_human(spec, copy=True)
+    rigid.add_human(spec, is_remote=True)
     for x in np.linspace(-0.6, 0.0, 100):
         pose = put(spec.pose, (x, 0.0, 0.3))
         rigid.move_human("eva", dataclasses.replace(pose, right_closed=True))
         step(rigid)
     step(rigid, 50)
-    hand = rigid.hand("eva", "right")
+    hand = rigid.hand_sample("eva", "right")
     np.testing.assert_allclose(hand.pose, hand.controller, atol=1e-6)  # inside the chassis
-    assert (hand.touching, hand.holds) == (False, None)
-    np.testing.assert_array_equal(rigid.read("anna")[3], 0.0)
-    np.testing.assert_allclose(rigid.read("anna")[0], HOME, atol=1e-3)
+    assert (hand.touching, hand.held) == (False, None)
+    np.testing.assert_array_equal(rigid.joint_measurements("anna")[3], 0.0)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[0], HOME, atol=1e-3)
 
 
 def test_legs_of_a_copy_stop_a_base():
     """F27 on the robot's own client: what does not give way is computed there, against the copy."""
-    rigid, spec = Rigid(yard()), eva(1.0, heading=np.pi)
+    rigid, spec = RigidWorld(yard()), eva(1.0, heading=np.pi)
     rigid.add_robot(arm(heading=np.pi))
-    rigid.add_human(spec, copy=True)
-    rigid.drive_base("anna", (-0.5, 0.0, 0.0))
+    rigid.add_human(spec, is_remote=True)
+    rigid.command_base("anna", (-0.5, 0.0, 0.0))
     step(rigid, 500)
-    assert rigid.base("anna")[0][0] == pytest.approx(1.0 - 0.05 - 0.3, abs=2e-3)
+    assert rigid.base_state("anna")[0][0] == pytest.approx(1.0 - 0.05 - 0.3, abs=2e-3)
 
 
 @pytest.mark.parametrize("busy", [False, True])
 def test_a_copys_hand_pushes_what_lies_but_not_while_it_is_busy_at_home(busy):
-    rigid, spec = Rigid(yard(boxes=1)), eva(0.0, 4.0, heading=np.pi / 2)
-    rigid.add_human(spec, copy=True)
+    rigid, spec = RigidWorld(yard(boxes=1)), eva(0.0, 4.0, heading=np.pi / 2)
+    rigid.add_human(spec, is_remote=True)
     generation = rigid.generation
     for y in np.linspace(4.3, 5.0, 100):
         pose = put(spec.pose, (0.0, y, 0.2))
         rigid.move_human("eva", dataclasses.replace(pose, right_busy=busy))
         step(rigid)
     if not busy:
-        assert rigid.data.joint("box/0").qpos[1] > 5.05
+        assert rigid.mj_data.joint("box/0").qpos[1] > 5.05
         return
-    assert rigid.data.joint("box/0").qpos[1] == pytest.approx(5.0, abs=1e-3)
+    assert rigid.mj_data.joint("box/0").qpos[1] == pytest.approx(5.0, abs=1e-3)
     assert rigid.generation == generation + 1, "listed anew once, not every tick"
-    np.testing.assert_allclose(rigid.hand("eva", "right").pose, pose.right, atol=1e-3)
+    np.testing.assert_allclose(rigid.hand_sample("eva", "right").pose, pose.right, atol=1e-3)
     rigid.add_robot(arm(x=8.0))
     step(rigid, 20)
-    assert rigid.data.joint("box/0").qpos[1] == pytest.approx(5.0, abs=1e-3), "a compilation does not forget it"
+    assert rigid.mj_data.joint("box/0").qpos[1] == pytest.approx(5.0, abs=1e-3), "a compilation does not forget it"
 
 
 def test_my_hand_and_the_copy_of_anothers_push_each_other():
     """F14 between clients: each side has its own hand and a copy of the other's controller."""
-    rigid, mine, yours = Rigid(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
+    rigid, mine, yours = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
     rigid.add_human(mine)
-    rigid.add_human(yours, copy=True)
+    rigid.add_human(yours, is_remote=True)
     for x in np.linspace(-0.4, 0.0, 150):
         rigid.move_human("eva", put(mine.pose, (x, 0.0, 1.1)))
         rigid.move_human("ida", put(yours.pose, (-x, 0.0, 1.1)))
         step(rigid)
     step(rigid, 200)
-    force = rigid.hand("eva", "right").force[0]
+    force = rigid.hand_sample("eva", "right").force[0]
     assert force > 5.0
-    assert rigid.hand("ida", "right").force[0] == pytest.approx(-force, rel=1e-3)
+    assert rigid.hand_sample("ida", "right").force[0] == pytest.approx(-force, rel=1e-3)

@@ -73,7 +73,7 @@ def test_touched_pushed_released_coarsened_without_a_jump():
     """At both switches no pose changes by a bit and no momentum by 1e-6; what was bent stays as it came to rest."""
     model = laden()
     physics = Physics(model)
-    detail, switches = physics.detail, []
+    detail, switches = physics.level_of_detail, []
     refine, coarsen = physics.plants.refine, physics.plants.coarsen
 
     def seen(change, trees):
@@ -116,15 +116,15 @@ def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
     for closely in (False, True):
         physics = Physics(model)
         if closely:
-            physics.watch(middle(model)[None], 0.3)
+            physics.set_detail_focus(middle(model)[None], 0.3)
         physics.plants.wake(0)
         physics.state.joint_qd[0] = 0.0, 0.05, 0.05
         at, fine = [], 0
         for tick in range(400):
             if tick == 100:
-                physics.watch(np.zeros((0, 3)), 0.0)
+                physics.set_detail_focus(np.zeros((0, 3)), 0.0)
             physics.step()
-            at.append(physics.view().body_q[9, :3])
+            at.append(physics.snapshot().body_q[9, :3])
             fine += int(physics.state.tree_fine[0])
         assert (fine > 100) == closely
         ways.append(np.array(at))
@@ -137,17 +137,17 @@ def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
 def test_looking_closely_refines_what_moves_and_looking_away_coarsens_it():
     model = laden(3)
     physics = Physics(model)
-    physics.watch(middle(model, 1)[None], 0.2)
+    physics.set_detail_focus(middle(model, 1)[None], 0.2)
     physics.step()
-    assert len(physics.detail.fine_trees) == 0  # asleep: nothing of it moves
+    assert len(physics.level_of_detail.fine_trees) == 0  # asleep: nothing of it moves
     physics.plants.wake(np.arange(3))
     for _ in range(3):
         physics.step()
-    assert physics.detail.fine_trees.tolist() == [1]
-    physics.watch(np.zeros((0, 3)), 0.0)
+    assert physics.level_of_detail.fine_trees.tolist() == [1]
+    physics.set_detail_focus(np.zeros((0, 3)), 0.0)
     for _ in range(LINGER + 40):
         physics.step()
-    assert len(physics.detail.fine_trees) == 0
+    assert len(physics.level_of_detail.fine_trees) == 0
 
 
 def test_a_tree_stays_fine_while_somebody_is_there_and_not_once_its_bunch_is_gone():
@@ -173,7 +173,7 @@ def test_berries_are_the_same_ones_before_and_after():
     start = primitives.shapes.a.numpy()[kinds == 1, :3].copy()
     for tick in pushed(physics, middle(model)):
         if tick % 50 == 0:
-            primitives.update(physics.view(), np.array([0]))
+            primitives.update(physics.snapshot(), np.array([0]))
             berries = primitives.shapes.a.numpy()[: len(kinds)][kinds == 1]
             assert len(berries) == model.bunch_berries[0]
             assert np.array_equal(berries[:, 3], radii)
@@ -211,7 +211,7 @@ def test_trees_without_clusters_are_left_alone(bunches):
         trees.append(tree)
     physics = Physics(assemble(trees))
     physics.plants.wake(np.arange(2))
-    physics.watch(np.zeros((1, 3)), 10.0)
+    physics.set_detail_focus(np.zeros((1, 3)), 10.0)
     for _ in range(5):
         physics.step()
     assert not physics.state.tree_fine.any()

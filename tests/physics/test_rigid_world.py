@@ -11,7 +11,7 @@ import pytest
 from vinesim import frames
 from vinesim.physics.rigid import free_bunch as loose_module
 from vinesim.physics.rigid import static_world as yard_module
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
@@ -73,86 +73,86 @@ def yard(boxes: int = 0, **counts: int) -> Model:
     return model
 
 
-def step(rigid: Rigid, ticks: int = 1) -> None:
+def step(rigid: RigidWorld, ticks: int = 1) -> None:
     for _ in range(ticks):
-        rigid.prep()
-        rigid.finish()
+        rigid.predict()
+        rigid.integrate()
 
 
 def test_only_poles_and_trunks_stand_in_the_way():
-    names = [yard_geom.name for yard_geom in map(Rigid(yard()).world.geom, range(2))]
+    names = [yard_geom.name for yard_geom in map(RigidWorld(yard()).mj_model.geom, range(2))]
     assert names == ["ground", "fixed/0"]
 
 
 def test_split_step_is_mj_step_to_the_bit():
-    rigid = Rigid(yard(boxes=2))
+    rigid = RigidWorld(yard(boxes=2))
     rigid.add_robot(arm())
     rigid.add_robot(arm("bert", 1, y=1.5))
-    twin = mujoco.MjData(rigid.world)
-    mujoco.mj_copyData(twin, rigid.world, rigid.data)
+    twin = mujoco.MjData(rigid.mj_model)
+    mujoco.mj_copyData(twin, rigid.mj_model, rigid.mj_data)
     rng = np.random.default_rng(3)
     for tick in range(200):
         if tick % 20 == 0:
             rigid.command("anna", HOME + rng.normal(size=3) * 0.3, rng.normal(size=3))
-            rigid.drive_base("bert", (0.4, -0.1, 0.5))
-        rigid.prep()
+            rigid.command_base("bert", (0.4, -0.1, 0.5))
+        rigid.predict()
         rigid.velocity_free  # noqa: B018 (reading the prediction must not disturb the step)
-        rigid.inverse(np.eye(rigid.world.nv)[:4])
-        rigid.finish()
-        twin.ctrl[:] = rigid.data.ctrl
-        mujoco.mj_step(rigid.world, twin)
-        assert (twin.qpos == rigid.data.qpos).all()
-        assert (twin.qvel == rigid.data.qvel).all()
+        rigid.impulse_response(np.eye(rigid.mj_model.nv)[:4])
+        rigid.integrate()
+        twin.ctrl[:] = rigid.mj_data.ctrl
+        mujoco.mj_step(rigid.mj_model, twin)
+        assert (twin.qpos == rigid.mj_data.qpos).all()
+        assert (twin.qvel == rigid.mj_data.qvel).all()
 
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_prediction_and_response_are_what_the_second_half_does(exact):
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     if exact:
-        rigid.tune("anna", np.full(3, 60.0), np.full(3, 5.0), np.zeros(3), exact=np.ones(3, bool))
+        rigid.set_gains("anna", np.full(3, 60.0), np.full(3, 5.0), np.zeros(3), exact=np.ones(3, bool))
     rigid.command("anna", HOME + np.array([0.2, -0.3, 0.02]))
     step(rigid, 5)
     rng = np.random.default_rng(1)
-    force = np.zeros(rigid.world.nv)
-    force[rigid._robots["anna"].v] = rng.normal(size=3) * 3.0
-    rigid.prep()
-    predicted = rigid.velocity_free + rigid.inverse(force[None])[:, 0] * rigid.dt
-    rigid.finish(force)
-    np.testing.assert_allclose(rigid.data.qvel, predicted, atol=1e-12)
+    force = np.zeros(rigid.mj_model.nv)
+    force[rigid.robot("anna").v] = rng.normal(size=3) * 3.0
+    rigid.predict()
+    predicted = rigid.velocity_free + rigid.impulse_response(force[None])[:, 0] * rigid.dt
+    rigid.integrate(force)
+    np.testing.assert_allclose(rigid.mj_data.qvel, predicted, atol=1e-12)
 
 
 def test_response_holds_the_stiffness_of_a_limit_that_is_active():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.command("anna", np.array([0.4, -0.9, 0.2]))  # beyond the stop at 0.1
     step(rigid, 100)
-    rigid.prep()
-    assert rigid.data.nefc == 1
-    force = np.zeros(rigid.world.nv)
-    force[rigid._robots["anna"].v[2]] = -1.0
-    predicted = rigid.velocity_free + rigid.inverse(force[None])[:, 0] * rigid.dt
-    rigid.finish(force)
-    np.testing.assert_allclose(rigid.data.qvel, predicted, atol=1e-7)
+    rigid.predict()
+    assert rigid.mj_data.nefc == 1
+    force = np.zeros(rigid.mj_model.nv)
+    force[rigid.robot("anna").v[2]] = -1.0
+    predicted = rigid.velocity_free + rigid.impulse_response(force[None])[:, 0] * rigid.dt
+    rigid.integrate(force)
+    np.testing.assert_allclose(rigid.mj_data.qvel, predicted, atol=1e-7)
 
 
 def test_new_gains_do_not_change_what_was_felt():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.command("anna", HOME + 0.02)
     step(rigid, 10)
-    before = rigid.read("anna")[2].copy()
+    before = rigid.joint_measurements("anna")[2].copy()
     assert np.abs(before).max() > 1.0
-    rigid.tune("anna", np.full(3, 50.0), np.full(3, 5.0), np.full(3, 7.0), exact=np.ones(3, bool))
+    rigid.set_gains("anna", np.full(3, 50.0), np.full(3, 5.0), np.full(3, 7.0), exact=np.ones(3, bool))
     rigid.command("anna", HOME - 1.0)
-    np.testing.assert_allclose(rigid.read("anna")[2], before, atol=1e-9)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[2], before, atol=1e-9)
 
 
 def test_gravity_compensation_holds_the_pose_and_effort_is_the_weight():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     step(rigid, 300)
-    position, velocity, effort, contact = rigid.read("anna")
+    position, velocity, effort, contact = rigid.joint_measurements("anna")
     np.testing.assert_allclose(position, HOME, atol=1e-6)
     np.testing.assert_allclose(velocity, 0.0, atol=1e-6)
     assert (contact == 0.0).all()
@@ -166,29 +166,29 @@ def test_gravity_compensation_holds_the_pose_and_effort_is_the_weight():
 
 
 def test_a_weak_drive_gives_no_more_than_its_effort():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
-    rigid.push("anna", "slider", np.array([0.0, 0.0, -300.0]))
+    rigid.apply_wrench("anna", "slider", np.array([0.0, 0.0, -300.0]))
     step(rigid, 3)
-    _, _, effort, _ = rigid.read("anna")
+    _, _, effort, _ = rigid.joint_measurements("anna")
     assert abs(effort[0]) <= 90.0 + 1e-9
-    assert np.abs(rigid.data.qfrc_actuator[rigid._robots["anna"].v]).max() <= 90.0 + 1e-9
+    assert np.abs(rigid.mj_data.qfrc_actuator[rigid.robot("anna").v]).max() <= 90.0 + 1e-9
 
 
 def test_known_contact_is_read_as_contact_and_balanced_by_the_drives():
     """A force on the tool, handed in as the contact solve does: contact = J^T f, effort balances load and contact."""
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     step(rigid, 50)
-    _, _, at_rest, _ = rigid.read("anna")
+    _, _, at_rest, _ = rigid.joint_measurements("anna")
     push = np.array([6.0, 0.0, -12.0])
     for _ in range(400):
-        rigid.prep()
-        point = rigid.data.body("anna/tool").xpos
-        J = np.zeros((3, rigid.world.nv))
-        mujoco.mj_jac(rigid.world, rigid.data, J, None, point, rigid.data.body("anna/tool").id)
-        rigid.finish(J.T @ push)
-    _, velocity, effort, contact = rigid.read("anna")
+        rigid.predict()
+        point = rigid.mj_data.body("anna/tool").xpos
+        J = np.zeros((3, rigid.mj_model.nv))
+        mujoco.mj_jac(rigid.mj_model, rigid.mj_data, J, None, point, rigid.mj_data.body("anna/tool").id)
+        rigid.integrate(J.T @ push)
+    _, velocity, effort, contact = rigid.joint_measurements("anna")
     expected = rigid.jacobian("anna", "tool", rigid.link_pose("anna", "tool")[:3])[:3].T @ push
     assert np.abs(velocity).max() < 1e-6
     np.testing.assert_allclose(contact, expected, rtol=2e-2, atol=1e-2)
@@ -196,120 +196,120 @@ def test_known_contact_is_read_as_contact_and_balanced_by_the_drives():
 
 
 def test_contact_with_a_pole_is_read_too_and_the_tracks_slip_at_their_effort():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm(x=2.6))
-    rigid.drive_base("anna", (0.3, 0.0, 0.0))
+    rigid.command_base("anna", (0.3, 0.0, 0.0))
     step(rigid, 300)
-    pose, _ = rigid.base("anna")
+    pose, _ = rigid.base_state("anna")
     assert pose[0] == pytest.approx(3.0 - 0.05 - 0.3, abs=0.02)
-    assert rigid._contact[rigid._robots["anna"].base_v[0]] == pytest.approx(-800.0, rel=3e-2)
+    assert rigid.contact_force[rigid.robot("anna").base_v[0]] == pytest.approx(-800.0, rel=3e-2)
 
 
 def test_tracks_drive_and_hold():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm(heading=np.pi / 2))
-    rigid.drive_base("anna", (0.5, 0.0, 0.0))
+    rigid.command_base("anna", (0.5, 0.0, 0.0))
     step(rigid, 200)
-    pose, velocity = rigid.base("anna")
+    pose, velocity = rigid.base_state("anna")
     np.testing.assert_allclose(velocity[:2], [0.0, 0.5], atol=1e-3)
     assert pose[1] == pytest.approx(1.0, abs=0.05)
-    rigid.drive_base("anna", (0.0, 0.0, 0.0))
+    rigid.command_base("anna", (0.0, 0.0, 0.0))
     step(rigid, 100)
-    held, _ = rigid.base("anna")
-    rigid.push("anna", "chassis", np.array([100.0, 0.0, 0.0]))
+    held, _ = rigid.base_state("anna")
+    rigid.apply_wrench("anna", "chassis", np.array([100.0, 0.0, 0.0]))
     step(rigid, 500)
-    pushed, velocity = rigid.base("anna")
+    pushed, velocity = rigid.base_state("anna")
     assert np.abs(pushed[:2] - held[:2]).max() < 2e-3  # 100 N of 800 N: an eighth of the give
     assert np.abs(velocity).max() < 1e-5
 
 
 def test_base_turns_in_its_own_axes():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
-    rigid.drive_base("anna", (0.4, 0.0, 0.5))  # a circle of radius 0.8 m
+    rigid.command_base("anna", (0.4, 0.0, 0.5))  # a circle of radius 0.8 m
     step(rigid, 400)
-    pose, velocity = rigid.base("anna")
+    pose, velocity = rigid.base_state("anna")
     yaw = 2.0 * np.arctan2(pose[5], pose[6])
     assert np.hypot(*velocity[:2]) == pytest.approx(0.4, rel=0.02)
     np.testing.assert_allclose(pose[:2], [0.8 * np.sin(yaw), 0.8 * (1 - np.cos(yaw))], atol=0.05)
 
 
 def test_joining_in_mid_motion_carries_every_number_over():
-    rigid = Rigid(yard(boxes=1))
+    rigid = RigidWorld(yard(boxes=1))
     rigid.add_robot(arm())
     rigid.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
-    rigid.drive_base("anna", (0.2, 0.0, 0.1))
-    rigid.push("anna", "lower", np.array([0.0, 5.0, 0.0]))
+    rigid.command_base("anna", (0.2, 0.0, 0.1))
+    rigid.apply_wrench("anna", "lower", np.array([0.0, 5.0, 0.0]))
     step(rigid, 13)
     before = (
-        rigid.read("anna"),
-        rigid.base("anna"),
-        rigid.data.body("box/0").xpos.copy(),
+        rigid.joint_measurements("anna"),
+        rigid.base_state("anna"),
+        rigid.mj_data.body("box/0").xpos.copy(),
         rigid.link_pose("anna", "tool"),
     )
-    alone = Rigid(yard(boxes=1))
+    alone = RigidWorld(yard(boxes=1))
     alone.add_robot(arm())
     alone.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
-    alone.drive_base("anna", (0.2, 0.0, 0.1))
-    alone.push("anna", "lower", np.array([0.0, 5.0, 0.0]))
+    alone.command_base("anna", (0.2, 0.0, 0.1))
+    alone.apply_wrench("anna", "lower", np.array([0.0, 5.0, 0.0]))
     step(alone, 13)
 
     rigid.add_robot(arm("bert", 1, y=3.0))
-    for mine, old in zip(rigid.read("anna"), before[0], strict=True):
+    for mine, old in zip(rigid.joint_measurements("anna"), before[0], strict=True):
         assert (mine == old).all()
-    for mine, old in zip(rigid.base("anna"), before[1], strict=True):
+    for mine, old in zip(rigid.base_state("anna"), before[1], strict=True):
         assert (mine == old).all()
     assert (rigid.link_pose("anna", "tool") == before[3]).all()
     step(rigid, 20)
     step(alone, 20)
-    np.testing.assert_allclose(rigid.read("anna")[0], alone.read("anna")[0], atol=1e-9)
-    np.testing.assert_allclose(rigid.read("anna")[1], alone.read("anna")[1], atol=1e-8)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[0], alone.joint_measurements("anna")[0], atol=1e-9)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[1], alone.joint_measurements("anna")[1], atol=1e-8)
 
     rigid.remove_robot("bert")
     assert rigid.robots == ("anna",)
     step(rigid, 20)
     step(alone, 20)
-    np.testing.assert_allclose(rigid.read("anna")[0], alone.read("anna")[0], atol=1e-9)
-    np.testing.assert_allclose(rigid.base("anna")[0], alone.base("anna")[0], atol=1e-9)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[0], alone.joint_measurements("anna")[0], atol=1e-9)
+    np.testing.assert_allclose(rigid.base_state("anna")[0], alone.base_state("anna")[0], atol=1e-9)
 
 
 def test_a_copy_follows_the_pose_and_speed_it_receives():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.add_robot(arm("copy", 1, y=2.0))
-    rigid.drive_base("anna", (0.3, 0.0, 0.2))
+    rigid.command_base("anna", (0.3, 0.0, 0.2))
     for tick in range(300):
         t = 0.01 * tick
         rigid.command("anna", HOME + 0.3 * np.sin(t) * np.array([1, 1, 0.1]), 0.3 * np.cos(t) * np.array([1, 1, 0.1]))
-        base_q, base_qd = rigid.base("anna")
-        position, velocity, _, _ = rigid.read("anna")
+        base_q, base_qd = rigid.base_state("anna")
+        position, velocity, _, _ = rigid.joint_measurements("anna")
         base_q[1] += 2.0
-        rigid.follow("copy", base_q, base_qd, position, velocity)
+        rigid.follow_remote("copy", base_q, base_qd, position, velocity)
         step(rigid)
-    (mine, _), (copy, _) = rigid.base("anna"), rigid.base("copy")
+    (mine, _), (copy, _) = rigid.base_state("anna"), rigid.base_state("copy")
     np.testing.assert_allclose(copy[:2] - mine[:2], [0.0, 2.0], atol=5e-3)
-    np.testing.assert_allclose(rigid.read("copy")[0], rigid.read("anna")[0], atol=1e-2)
+    np.testing.assert_allclose(rigid.joint_measurements("copy")[0], rigid.joint_measurements("anna")[0], atol=1e-2)
 
 
 def test_robots_meet_each_other_but_not_themselves():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.command("anna", np.array([-1.0, 2.5, 0.0]))  # folded into its own chassis
     step(rigid, 100)
-    assert rigid.data.ncon == 0
+    assert rigid.mj_data.ncon == 0
     rigid.add_robot(arm("bert", 1, x=-0.65))
-    rigid.drive_base("bert", (0.2, 0.0, 0.0))
+    rigid.command_base("bert", (0.2, 0.0, 0.0))
     step(rigid, 100)
-    assert rigid.data.ncon > 0
-    assert rigid.base("anna")[0][0] - rigid.base("bert")[0][0] == pytest.approx(0.6, abs=2e-3)
+    assert rigid.mj_data.ncon > 0
+    assert rigid.base_state("anna")[0][0] - rigid.base_state("bert")[0][0] == pytest.approx(0.6, abs=2e-3)
 
 
 def test_links_for_sensors_ride_on_the_bodies():
-    rigid = Rigid(yard(boxes=1))
+    rigid = RigidWorld(yard(boxes=1))
     rigid.add_robot(arm("anna", 7, x=1.0, heading=0.5))
     step(rigid, 30)
-    links, poses = rigid.links(), rigid.link_q()
-    assert links is rigid.links()
+    links, poses = rigid.visuals(), rigid.visual_q()
+    assert links is rigid.visuals()
     assert [link.name for link in links] == ["box/0", "anna/chassis", "anna/upper", "anna/lower", "anna/slider"]
     assert links[0].organ == Organ.BOX
     assert {shape.kind for shape in links[0].shapes} == {"box"}
@@ -320,7 +320,7 @@ def test_links_for_sensors_ride_on_the_bodies():
     np.testing.assert_allclose(links[2].shapes[0].pose[3:], [0, np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
     np.testing.assert_allclose(poses[0, 2], 0.0, atol=2e-3)  # the box stands on the ground
     # both wheel and axle nobody drives: fixed, and the wheel has no shape
-    assert "anna/axle" not in [rigid.world.joint(i).name for i in range(rigid.world.njnt)]
+    assert "anna/axle" not in [rigid.mj_model.joint(i).name for i in range(rigid.mj_model.njnt)]
 
 
 @pytest.mark.parametrize(
@@ -336,7 +336,7 @@ def test_links_for_sensors_ride_on_the_bodies():
     ],
 )
 def test_what_is_wrong_with_a_robot_is_said_and_the_world_goes_on(change, says):
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm("other"))
     with pytest.raises(RobotError, match=says) as caught:
         rigid.add_robot(dataclasses.replace(arm(), **change))
@@ -344,7 +344,7 @@ def test_what_is_wrong_with_a_robot_is_said_and_the_world_goes_on(change, says):
     assert rigid.robots == ("other",)
     step(rigid, 2)
     with pytest.raises(ValueError, match="there are: other"):
-        rigid.read("anna")
+        rigid.joint_measurements("anna")
     with pytest.raises(RobotError, match="already here"):
         rigid.add_robot(arm("other"))
 
@@ -358,14 +358,14 @@ def test_a_mimicking_finger_copies_the_one_that_is_driven():
         '<limit lower="-1" upper="1" effort="10" velocity="1"/><mimic joint="extend" multiplier="-2" offset="0.3"/>'
         '</joint><link name="tool"/>',
     )
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(dataclasses.replace(arm(), urdf=twin))
-    thumb = rigid.data.joint("anna/oppose")
+    thumb = rigid.mj_data.joint("anna/oppose")
     assert thumb.qpos[0] == pytest.approx(0.3 - 2 * 0.05)
     rigid.command("anna", np.array([0.4, -0.9, 0.09]))
     step(rigid, 200)
-    assert rigid.read("anna")[0][2] == pytest.approx(0.09, abs=1e-4)
-    assert rigid.data.joint("anna/oppose").qpos[0] == pytest.approx(0.3 - 2 * 0.09, abs=1e-3)
+    assert rigid.joint_measurements("anna")[0][2] == pytest.approx(0.09, abs=1e-4)
+    assert rigid.mj_data.joint("anna/oppose").qpos[0] == pytest.approx(0.3 - 2 * 0.09, abs=1e-3)
 
 
 def test_a_mesh_is_touched_as_the_box_around_it(tmp_path):
@@ -380,17 +380,17 @@ def test_a_mesh_is_touched_as_the_box_around_it(tmp_path):
     file.write_bytes(b" " * 80 + np.uint32(12).tobytes() + record.tobytes())
     mesh = f'<mesh filename="{file}"/>'
     urdf = ARM.replace('<sphere radius="0.04"/>', mesh)
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(dataclasses.replace(arm(), urdf=urdf))
-    rigid.prep()
+    rigid.predict()
     geom = rigid.geoms.link.index("slider")
     assert rigid.geoms.kind[geom] == 6
     np.testing.assert_allclose(np.sort(rigid.geoms.size[geom]), np.sort((high - low) / 2), atol=1e-6)
     index = rigid.geoms.id[geom]
-    center = rigid.data.geom_xpos[index] + rigid.data.geom_xmat[index].reshape(3, 3) @ rigid.geoms.center[geom]
+    center = rigid.mj_data.geom_xpos[index] + rigid.mj_data.geom_xmat[index].reshape(3, 3) @ rigid.geoms.center[geom]
     pose = rigid.link_pose("anna", "slider")
     np.testing.assert_allclose(center, pose[:3] + frames.rotate(pose[3:], (low + high) / 2), atol=1e-6)
-    shape = next(link for link in rigid.links() if link.name == "anna/slider").shapes[0]
+    shape = next(link for link in rigid.visuals() if link.name == "anna/slider").shapes[0]
     assert (shape.kind, shape.file, shape.size) == ("mesh", str(file), (1.0, 1.0, 1.0))
 
 
@@ -399,7 +399,7 @@ def test_a_mesh_that_is_none_is_named(content, tmp_path):
     file = tmp_path / f"shell.{'obj' if content.startswith(b'v') else 'stl'}"
     file.write_bytes(content)
     urdf = ARM.replace('<sphere radius="0.04"/>', f'<mesh filename="{file}"/>')
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     with pytest.raises(RobotError, match=r"'anna'.*shell") as caught:
         rigid.add_robot(dataclasses.replace(arm(), urdf=urdf))
     assert "\n" not in str(caught.value)
@@ -407,81 +407,81 @@ def test_a_mesh_that_is_none_is_named(content, tmp_path):
 
 
 def test_gains_can_be_tuned_and_survive_a_newcomer():
-    rigid = Rigid(yard())
+    rigid = RigidWorld(yard())
     rigid.add_robot(arm())
-    rigid.tune("anna", np.array([4000.0, 0.0, 8000.0]), np.array([250.0, 5.0, 400.0]), np.array([0.0, 2.0, 0.0]))
+    rigid.set_gains("anna", np.array([4000.0, 0.0, 8000.0]), np.array([250.0, 5.0, 400.0]), np.array([0.0, 2.0, 0.0]))
     rigid.add_robot(arm("bert", 1, y=3.0))
     step(rigid, 20)
-    _, velocity, effort, _ = rigid.read("anna")
-    gravity = rigid.data.qfrc_gravcomp[rigid._robots["anna"].v[1]]
+    _, velocity, effort, _ = rigid.joint_measurements("anna")
+    gravity = rigid.mj_data.qfrc_gravcomp[rigid.robot("anna").v[1]]
     assert effort[1] - gravity == pytest.approx(2.0 - 5.0 * velocity[1], abs=1e-9)
     assert velocity[1] > 0.1
 
 
 def test_boxes_at_rest_sleep_until_something_pushes_them():
-    rigid = Rigid(yard(boxes=3))
+    rigid = RigidWorld(yard(boxes=3))
     rigid.add_robot(arm())
-    nothing = np.full(rigid.world.nv, -0.0)
+    nothing = np.full(rigid.mj_model.nv, -0.0)
     for _ in range(100):
-        rigid.prep()
-        rigid.finish(nothing)
-    assert rigid.data.ncon == 0
+        rigid.predict()
+        rigid.integrate(nothing)
+    assert rigid.mj_data.ncon == 0
     assert (rigid.velocity_free[:18] == 0.0).all()
     push = nothing.copy()
-    push[rigid.world.joint("box/1").dofadr[0]] = 30.0  # mu m g is 15.7 N
+    push[rigid.mj_model.joint("box/1").dofadr[0]] = 30.0  # mu m g is 15.7 N
     for _ in range(20):
-        rigid.prep()
-        rigid.finish(push)
-    rigid.prep()
-    moved = rigid.data.joint("box/1").qpos[0]
+        rigid.predict()
+        rigid.integrate(push)
+    rigid.predict()
+    moved = rigid.mj_data.joint("box/1").qpos[0]
     assert moved == pytest.approx(0.5 * (30.0 - 0.8 * 2.0 * 9.81) / 2.0 * 0.2**2, rel=0.25)
-    assert rigid.data.joint("box/0").qpos[0] == 0.0
-    assert rigid.data.joint("box/0").qvel[0] == 0.0
+    assert rigid.mj_data.joint("box/0").qpos[0] == 0.0
+    assert rigid.mj_data.joint("box/0").qvel[0] == 0.0
 
 
 def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
-    rigid, alone = Rigid(yard()), Rigid(yard())
+    rigid, alone = RigidWorld(yard()), RigidWorld(yard())
     for world in (rigid, alone):
         world.add_robot(arm())
         world.add_robot(arm("bert", 1, y=3.0))
-        world.drive_base("bert", (0.3, 0.0, 0.0))
+        world.command_base("bert", (0.3, 0.0, 0.0))
     step(rigid, 20)
     step(alone, 20)
-    where = rigid.base("anna")[0]
-    rigid.prep()
-    rigid.data.qvel[rigid._robots["anna"].v[1]] = np.nan
-    rigid.finish()
+    where = rigid.base_state("anna")[0]
+    rigid.predict()
+    rigid.mj_data.qvel[rigid.robot("anna").v[1]] = np.nan
+    rigid.integrate()
     step(rigid, 30)
     step(alone, 31)
     assert rigid.faults == 1
-    assert "anna" in rigid.complaint
-    assert "bert" not in rigid.complaint
-    np.testing.assert_allclose(rigid.base("anna")[0], where, atol=1e-3)
-    np.testing.assert_allclose(rigid.read("anna")[0], HOME, atol=1e-2)
-    np.testing.assert_allclose(rigid.base("bert")[0], alone.base("bert")[0], atol=1e-6)
-    assert rigid.data.time == pytest.approx(alone.data.time)
+    assert "anna" in rigid.last_fault
+    assert "bert" not in rigid.last_fault
+    np.testing.assert_allclose(rigid.base_state("anna")[0], where, atol=1e-3)
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[0], HOME, atol=1e-2)
+    np.testing.assert_allclose(rigid.base_state("bert")[0], alone.base_state("bert")[0], atol=1e-6)
+    assert rigid.mj_data.time == pytest.approx(alone.mj_data.time)
 
 
-def loose(shapes: int, mass: float = 0.6) -> loose_module.Loose:
+def loose(shapes: int, mass: float = 0.6) -> loose_module.FreeBunch:
     """A bunch of some spheres and, last, a capsule."""
     start = np.stack([0.02 * np.arange(shapes), 0.003 * np.arange(shapes), np.zeros(shapes)], 1)
     end = start.copy()
     end[-1, 0] += 0.03
     inertia = np.array([6e-4, 1.5e-3, 1.4e-3])
     radius, product = 0.04 - 0.001 * np.arange(shapes), np.array([1e-5, -3e-5, 4e-5])
-    return loose_module.Loose(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
+    return loose_module.FreeBunch(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
 
 
-@pytest.mark.parametrize("shapes", [1, 5, loose_module.LUMPS])
+@pytest.mark.parametrize("shapes", [1, 5, loose_module.MAX_GEOMS])
 def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
     """All constants that MuJoCo derives from weight and shapes, against a world compiled with the bunch in it."""
     model = assemble([], box_pose=[[1.0, 0, 0, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.3]], box_mass=[[2.0]])
-    rigid = Rigid(model)
+    rigid = RigidWorld(model)
     bunch = loose(shapes)
     rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
-    spec = yard_module.furnished(model, rigid.parameters)
-    loose_module.drop(spec, bunch)
-    ours, theirs = rigid.world, spec.compile()
+    spec = yard_module.build_static_world(model, rigid.parameters)
+    loose_module.add_free_bunch(spec, bunch)
+    ours, theirs = rigid.mj_model, spec.compile()
     a, b = ours.body("loose/0").id, theirs.nbody - 1
     for name in loose_module.OF_BODY:
         np.testing.assert_allclose(getattr(ours, name)[a], getattr(theirs, name)[b], rtol=1e-12, err_msg=name)
@@ -501,34 +501,34 @@ def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
 
 
 def test_waiting_bodies_sleep_and_nobody_sees_them():
-    rigid = Rigid(assemble([]))
+    rigid = RigidWorld(assemble([]))
     for _ in range(20):
-        rigid.prep()
-        rigid.finish()
-    assert rigid.links() == ()
+        rigid.predict()
+        rigid.integrate()
+    assert rigid.visuals() == ()
     assert len(rigid.geoms.id) == 0
-    assert rigid.data.nv_awake == 0
-    assert rigid.data.ncon == 0
+    assert rigid.mj_data.nv_awake == 0
+    assert rigid.mj_data.ncon == 0
 
 
 def test_more_bunches_than_bodies_wait_for_them():
     """The pool grows by a compilation when it is used up; those that fall go on falling."""
-    rigid = Rigid(assemble([]))
+    rigid = RigidWorld(assemble([]))
     generations = []
-    for bunch in range(loose_module.WAITING + 2):
+    for bunch in range(loose_module.POOL_SIZE + 2):
         rigid.add_bunch(bunch, loose(3), frames.pose(np.array([float(bunch), 0.0, 5.0])), np.zeros(6))
-        generations.append(rigid.world)
-        rigid.prep()
-        rigid.finish()
-    assert all(world is generations[0] for world in generations[: loose_module.WAITING])
+        generations.append(rigid.mj_model)
+        rigid.predict()
+        rigid.integrate()
+    assert all(world is generations[0] for world in generations[: loose_module.POOL_SIZE])
     assert generations[-1] is not generations[0]
     ticks = np.arange(len(generations), 0, -1)
     fallen = 5.0 - 9.81 * rigid.dt**2 * ticks * (ticks + 1) / 2.0
-    heights = [rigid.bunch_pose(bunch)[2] for bunch in rigid.loose]
+    heights = [rigid.bunch_pose(bunch)[2] for bunch in rigid.free_bunches]
     np.testing.assert_allclose(heights, fallen, atol=1e-9)
     rigid.remove_bunch(4)
-    assert 4 not in rigid.loose
-    assert [link.name for link in rigid.links()] == [f"bunch/{bunch}" for bunch in rigid.loose]
+    assert 4 not in rigid.free_bunches
+    assert [link.name for link in rigid.visuals()] == [f"bunch/{bunch}" for bunch in rigid.free_bunches]
     with pytest.raises(ValueError, match="shapes; a loose one has"):
-        rigid.add_bunch(4, loose(loose_module.LUMPS + 1), frames.pose(np.zeros(3)), np.zeros(6))
-    assert 4 not in rigid.loose
+        rigid.add_bunch(4, loose(loose_module.MAX_GEOMS + 1), frames.pose(np.zeros(3)), np.zeros(6))
+    assert 4 not in rigid.free_bunches

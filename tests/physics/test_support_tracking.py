@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.shared_vineyard import BOX, BUNCH, cart, vineyard
 from vinesim import frames
-from vinesim.physics.rigid.support_tracking import PATIENCE, Riding
+from vinesim.physics.rigid.support_tracking import PATIENCE, SupportTracker
 from vinesim.physics.step import Physics
 from vinesim.robot.drives import Robot
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -21,122 +21,128 @@ def run(physics: Physics, ticks: int, robot: Robot | None = None, speed: float =
             robot.command_base(speed, 0.0, physics.time)
             robot.control(physics.time)
         physics.step()
-        physics.riding.update()
+        physics.support_tracker.update()
 
 
 def settle(physics: Physics, limit: int = 800, robot: Robot | None = None) -> None:
     run(physics, 2, robot)
     for _ in range(limit):
         run(physics, 1, robot)
-        if not physics.riding.moving:
+        if not physics.support_tracker.moving:
             return
     pytest.fail("never at rest")
 
 
 def in_box(physics: Physics, bunch: int = 0, box: int = 0) -> None:
     physics.pick(bunch)
-    there = frames.compose(physics.riding.read(BOX(box))[0], frames.pose([-0.1, 0.0, 0.07]))
+    there = frames.compose(physics.support_tracker.object_state(BOX(box))[0], frames.pose([-0.1, 0.0, 0.07]))
     physics.rigid.place_bunch(bunch, there, np.zeros(6))
 
 
 def test_boxes_start_at_rest_on_the_ground_and_a_picked_bunch_moves_until_it_lies():
     physics = Physics(vineyard())
     run(physics, 5)
-    assert physics.riding.things.tolist() == [BOX(0), BOX(1)]
-    assert physics.riding.moving == []
+    assert physics.support_tracker.object_ids.tolist() == [BOX(0), BOX(1)]
+    assert physics.support_tracker.moving == []
     physics.pick(0)
     run(physics, 1)
-    assert physics.riding.moving == [BUNCH(0)]
+    assert physics.support_tracker.moving == [BUNCH(0)]
     settle(physics)
-    assert physics.riding.lies(BUNCH(0))[0] == ""
-    np.testing.assert_allclose(physics.riding.lies(BUNCH(0))[1], physics.riding.read(BUNCH(0))[0], atol=1e-12)
+    assert physics.support_tracker.pose_on_support(BUNCH(0))[0] == ""
+    np.testing.assert_allclose(
+        physics.support_tracker.pose_on_support(BUNCH(0))[1],
+        physics.support_tracker.object_state(BUNCH(0))[0],
+        atol=1e-12,
+    )
 
 
 def test_in_a_box_it_lies_in_the_frame_of_the_box_wherever_that_goes():
     physics = Physics(vineyard())
     in_box(physics)
     settle(physics)
-    parent, relative = physics.riding.lies(BUNCH(0))
+    parent, relative = physics.support_tracker.pose_on_support(BUNCH(0))
     assert parent == "box/0"
     # the box is carried away with what is in it, in small steps
     for _ in range(150):
         for number in (BOX(0), BUNCH(0)):
-            pose = physics.riding.read(number)[0]
+            pose = physics.support_tracker.object_state(number)[0]
             pose[1] += 0.002
-            physics.riding.place(number, pose, np.zeros(6))
+            physics.support_tracker.set_state(number, pose, np.zeros(6))
         run(physics, 1)
-    assert physics.riding.moving == [BOX(0)]
+    assert physics.support_tracker.moving == [BOX(0)]
     settle(physics)
-    np.testing.assert_allclose(physics.riding.lies(BUNCH(0))[1][:3], relative[:3], atol=0.05)
-    pose, _ = physics.riding.where("box/0", physics.riding.lies(BUNCH(0))[1])
-    np.testing.assert_allclose(pose[:3], physics.riding.read(BUNCH(0))[0][:3], atol=1e-9)
+    np.testing.assert_allclose(physics.support_tracker.pose_on_support(BUNCH(0))[1][:3], relative[:3], atol=0.05)
+    pose, _ = physics.support_tracker.to_world("box/0", physics.support_tracker.pose_on_support(BUNCH(0))[1])
+    np.testing.assert_allclose(pose[:3], physics.support_tracker.object_state(BUNCH(0))[0][:3], atol=1e-9)
 
 
 def test_on_a_robot_a_box_rests_in_the_frame_of_its_link_and_what_is_in_it_in_the_box():
     physics = Physics(vineyard())
     robot = Robot(physics.rigid, cart(), "anna", pose=frames.pose([-5.0, -3.0, 0.0]))
-    physics.riding.place(BOX(0), frames.compose(physics.rigid.base("anna")[0], DECK), np.zeros(6))
+    physics.support_tracker.set_state(BOX(0), frames.compose(physics.rigid.base_state("anna")[0], DECK), np.zeros(6))
     in_box(physics)
     settle(physics, robot=robot)
-    assert physics.riding.lies(BOX(0))[0] == "anna/base_footprint"
-    assert physics.riding.lies(BUNCH(0))[0] == "box/0"
+    assert physics.support_tracker.pose_on_support(BOX(0))[0] == "anna/base_footprint"
+    assert physics.support_tracker.pose_on_support(BUNCH(0))[0] == "box/0"
     for _ in range(100):
         run(physics, 1, robot, 0.5)
-        assert physics.riding.moving == []
-    pose, velocity = physics.riding.where("anna/base_footprint", physics.riding.lies(BOX(0))[1])
-    here, speed = physics.riding.read(BOX(0))
+        assert physics.support_tracker.moving == []
+    pose, velocity = physics.support_tracker.to_world(
+        "anna/base_footprint", physics.support_tracker.pose_on_support(BOX(0))[1]
+    )
+    here, speed = physics.support_tracker.object_state(BOX(0))
     np.testing.assert_allclose(pose[:3], here[:3], atol=1e-6)
     np.testing.assert_allclose(velocity[:3], speed[:3], atol=0.02)
     assert here[0] > -4.8
     # with the robot its parent goes
     physics.remove_robot("anna")
     run(physics, 1)
-    assert BOX(0) in physics.riding.moving
+    assert BOX(0) in physics.support_tracker.moving
     settle(physics)
-    assert physics.riding.lies(BOX(0))[0] == ""
-    assert physics.riding.read(BOX(0))[0][2] < 0.05
+    assert physics.support_tracker.pose_on_support(BOX(0))[0] == ""
+    assert physics.support_tracker.object_state(BOX(0))[0][2] < 0.05
 
 
 def test_who_touches_what_moves():
     physics = Physics(vineyard())
     robot = Robot(physics.rigid, cart(), "anna", pose=frames.pose([-2.72, 0.0, 0.0]))
     run(physics, 20, robot)
-    assert physics.riding.touched == []
+    assert physics.support_tracker.touched == []
     touched = set()
     for _ in range(100):
         run(physics, 1, robot, 0.3)
-        touched.update(physics.riding.touched)
+        touched.update(physics.support_tracker.touched)
     assert touched == {(BOX(0), "anna")}
-    assert physics.riding.lies(BOX(0))[0] == "", "what is pushed along the ground does not ride"
+    assert physics.support_tracker.pose_on_support(BOX(0))[0] == "", "what is pushed along the ground does not ride"
 
 
 def test_a_thing_is_at_rest_after_half_a_second_and_told_ones_at_once():
     physics = Physics(vineyard())
-    riding: Riding = physics.riding
-    riding.place(BOX(0), frames.pose([-2.0, 0.5, 0.001]), np.zeros(6))
+    riding: SupportTracker = physics.support_tracker
+    riding.set_state(BOX(0), frames.pose([-2.0, 0.5, 0.001]), np.zeros(6))
     run(physics, 1)
     assert riding.moving == [BOX(0)]
     ticks = next(i for i in range(2 * PATIENCE) if run(physics, 1) or not riding.moving)
     assert PATIENCE - 5 <= ticks <= PATIENCE + 10
-    riding.place(BOX(1), frames.pose([-2.0, 1.5, 0.0]), np.zeros(6))
-    riding.settle(BOX(1), "", frames.pose([-2.0, 1.5, 0.0]))
+    riding.set_state(BOX(1), frames.pose([-2.0, 1.5, 0.0]), np.zeros(6))
+    riding.set_at_rest(BOX(1), "", frames.pose([-2.0, 1.5, 0.0]))
     run(physics, 1)
     assert riding.moving == []
-    riding.unsettle([BOX(0)])
+    riding.set_moving([BOX(0)])
     assert riding.moving == [BOX(0)]
 
 
 def test_a_copy_is_pulled_the_faster_part_at_once_and_a_far_one_put_there():
     physics = Physics(vineyard())
-    riding, start = physics.riding, physics.riding.read(BOX(0))[0]
+    riding, start = physics.support_tracker, physics.support_tracker.object_state(BOX(0))[0]
     way, speed = np.array([0.1, 0.0, 0.2, 0, 0, 0, 0]), np.array([0.3, 0, 0, 0, 0, 0.1])
     goal, far = start + way, start + 20.0 * way
-    riding.pull_all([BOX(0)], goal[None], speed[None], np.array([0.2]))
-    pose, velocity = riding.read(BOX(0))
+    riding.blend_towards([BOX(0)], goal[None], speed[None], np.array([0.2]))
+    pose, velocity = riding.object_state(BOX(0))
     np.testing.assert_allclose(pose[:3], start[:3] + 0.2 * (goal - start)[:3], atol=1e-12)
     np.testing.assert_allclose(velocity, speed, atol=1e-12)
-    riding.pull_all([BOX(0)], far[None], speed[None], np.array([0.2]))
-    np.testing.assert_allclose(riding.read(BOX(0))[0][:3], far[:3], atol=1e-12)
+    riding.blend_towards([BOX(0)], far[None], speed[None], np.array([0.2]))
+    np.testing.assert_allclose(riding.object_state(BOX(0))[0][:3], far[:3], atol=1e-12)
 
 
 def test_a_bunch_that_has_just_come_can_be_called_moving_at_once():
@@ -145,8 +151,8 @@ def test_a_bunch_that_has_just_come_can_be_called_moving_at_once():
     tree = TreeBuilder(frames.pose(np.array([0.5, 0.0, 1.5])))
     tree.add_bunch(tree.add_rod(-1, 0.6, (0.006, 0.004), RodMaterial(2e9, 900.0), 6)[-1], 0.4, clusters=False)
     physics = Physics(assemble([tree]))
-    physics.riding.update()
-    physics.told_pick(0, frames.pose([0.5, 0.0, 1.0]), np.zeros(6))
-    physics.riding.unsettle([BUNCH(0)])
-    physics.riding.update()
-    assert BUNCH(0) in physics.riding.moving
+    physics.support_tracker.update()
+    physics.apply_remote_pick(0, frames.pose([0.5, 0.0, 1.0]), np.zeros(6))
+    physics.support_tracker.set_moving([BUNCH(0)])
+    physics.support_tracker.update()
+    assert BUNCH(0) in physics.support_tracker.moving

@@ -224,5 +224,5 @@ def test_a_tick_blows_on_what_is_near_a_robot() -> None:
     first, last = model.bodies_of(0), model.bodies_of(9)
     assert 0 in physics.plants.awake
     assert 9 not in physics.plants.awake
-    assert physics.view().body_q[first.stop - 1, 1] > grown[first.stop - 1, 1] + 0.01
+    assert physics.snapshot().body_q[first.stop - 1, 1] > grown[first.stop - 1, 1] + 0.01
     np.testing.assert_array_equal(physics.state.joint_q[last], model.joint_settled[last])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.admittance_controller import AdmittanceController
 from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import CommandError, Robot
@@ -16,7 +16,7 @@ class Pushed:
     """A robot whose left hand somebody pushes."""
 
     def __init__(self, *, heeding: bool, **gains: float) -> None:
-        self.rigid = Rigid(assemble([]))
+        self.rigid = RigidWorld(assemble([]))
         self.robot = Robot(self.rigid, load_description("vinebot"), "anna")
         self.time = 0.0
         self.controller = AdmittanceController(self.robot, "arm_left", "wrist_left_ft", **gains) if heeding else None
@@ -25,13 +25,13 @@ class Pushed:
 
     def _step(self) -> None:
         self.robot.control(self.time)
-        self.rigid.prep()
-        self.rigid.finish()
+        self.rigid.predict()
+        self.rigid.integrate()
         self.time += self.rigid.dt
 
     def run(self, seconds: float, force: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
         """Places of the hand [tick, 3] under a steady force."""
-        self.rigid.push("anna", "gripper_left_base_link", np.array(force))
+        self.rigid.apply_wrench("anna", "gripper_left_base_link", np.array(force))
         places = []
         for _ in range(round(seconds / self.rigid.dt)):
             if self.controller is not None:
@@ -84,7 +84,7 @@ def test_weight_is_no_push_even_after_a_turn_of_the_hand() -> None:
 
 
 def test_wrong_settings_are_named() -> None:
-    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     with pytest.raises(CommandError, match=r"no wrist sensor 'elbow'.*wrist_left_ft"):
         AdmittanceController(robot, "arm_left", "elbow")
     with pytest.raises(CommandError, match="above 0"):

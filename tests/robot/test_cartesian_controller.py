@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose, solve_prioritized_ik
 from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
@@ -23,8 +23,8 @@ def led(
     for tick in range(round(seconds / 0.01)):
         hand.move_towards(goal, ahead, up, speed=0.3, shoulder_height=float(goal[2]))
         robot.control(0.01 * tick)
-        robot.rigid.prep()
-        robot.rigid.finish()
+        robot.rigid.predict()
+        robot.rigid.integrate()
         points.append(hand.tip_position)
     return np.array(points)
 
@@ -36,7 +36,7 @@ def led(
     ids=["level, to a bunch", "down, to a box"],
 )
 def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple, ahead: tuple, up: np.ndarray):
-    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     hand = CartesianController(robot, side)
     there = np.array(goal) * [1.0, 1.0 if side == "left" else -1.0, 1.0]
     led(hand, there, np.array(ahead), np.array(up))
@@ -47,7 +47,7 @@ def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple,
 
 
 def test_a_hand_goes_straight_and_not_too_fast():
-    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     hand = CartesianController(robot, "left", tip_offset=0.03)
     led(hand, np.array([0.6, 0.25, 1.3]), np.array([1.0, 0.0, 0.0]), UP)
     hand.reset()

@@ -11,8 +11,8 @@ import pytest
 
 from tests.support.contact_scenes import bunch_scene
 from vinesim import frames
-from vinesim.physics.rigid.free_bunch import Loose
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.free_bunch import FreeBunch
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription, load_description
 from vinesim.robot.drives import CommandError, CommandInterface, RemoteRobot, Robot
@@ -29,7 +29,7 @@ class Yard:
     """One robot on bare ground, and a clock."""
 
     def __init__(self, description: RobotDescription, pose: np.ndarray | None = None) -> None:
-        self.rigid = Rigid(assemble([]))
+        self.rigid = RigidWorld(assemble([]))
         self.robot = Robot(self.rigid, description, "anna", pose=pose)
         self.time = 0.0
 
@@ -38,10 +38,10 @@ class Yard:
         rows = []
         for _ in range(round(seconds / self.rigid.dt)):
             self.robot.control(self.time)
-            self.rigid.prep()
-            self.rigid.finish()
+            self.rigid.predict()
+            self.rigid.integrate()
             self.time += self.rigid.dt
-            position, velocity, effort, _ = self.rigid.read("anna")
+            position, velocity, effort, _ = self.rigid.joint_measurements("anna")
             rows.append((position, velocity, effort, self.robot.setpoint.copy()))
         return np.array(rows)
 
@@ -131,7 +131,7 @@ def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
 def test_zero_effort_lets_the_joint_be_moved_and_position_does_not(yard: Yard) -> None:
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
     start = yard.run(0.2)[-1, 0, joint]
-    yard.rigid.push("anna", "arm_left_7_link", np.array([0.0, 0.0, 20.0]))
+    yard.rigid.apply_wrench("anna", "arm_left_7_link", np.array([0.0, 0.0, 20.0]))
     assert abs(yard.run(1.0)[-1, 0, joint] - start) < 0.01
     yard.robot.command_effort([0.0], ["arm_left_1_joint"])
     assert abs(yard.run(1.0)[-1, 0, joint] - start) > 0.2
@@ -143,10 +143,10 @@ def test_impedance_gives_way_as_its_stiffness_says(yard: Yard) -> None:
     start = yard.run(0.1)[-1, 0, joint]
     yard.robot.command_impedance([60.0], [12.0], ["arm_left_4_joint"])
     force = np.array([0.0, 0.0, -12.0])
-    yard.rigid.push("anna", "arm_left_7_link", force)
+    yard.rigid.apply_wrench("anna", "arm_left_7_link", force)
     rows = yard.run(4.0)
-    body = yard.rigid.world.body("anna/arm_left_7_link").id
-    jacobian = yard.rigid.jacobian("anna", "arm_left_7_link", yard.rigid.data.xipos[body])[:3, joint]
+    body = yard.rigid.mj_model.body("anna/arm_left_7_link").id
+    jacobian = yard.rigid.jacobian("anna", "arm_left_7_link", yard.rigid.mj_data.xipos[body])[:3, joint]
     assert abs(rows[-1, 0, joint] - start) > 0.03
     assert 60.0 * (rows[-1, 0, joint] - start) == pytest.approx(jacobian @ force, rel=0.01)
     with pytest.raises(CommandError, match="below zero"):
@@ -158,20 +158,20 @@ def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: RobotDes
     yard.run(0.02)
     Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
-    start = yard.rigid.read("anna")[0][joint]
-    yard.rigid.push("anna", "arm_left_7_link", np.array([0.0, 0.0, 20.0]))
+    start = yard.rigid.joint_measurements("anna")[0][joint]
+    yard.rigid.apply_wrench("anna", "arm_left_7_link", np.array([0.0, 0.0, 20.0]))
     assert abs(yard.run(1.0)[-1, 0, joint] - start) > 0.2
 
 
 def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yard) -> None:
     before = yard.run(0.2)[-1, 0]
-    yard.rigid.push("anna", "arm_left_4_link", np.array([900.0, 0.0, 0.0]))
+    yard.rigid.apply_wrench("anna", "arm_left_4_link", np.array([900.0, 0.0, 0.0]))
     rows = yard.run(0.6)
     assert (np.abs(rows[:, 2]) <= yard.robot.max_effort * (1.0 + 1e-9)).all()
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
     yielded = rows[-1, 0, joint] - before[joint]
     assert abs(yielded) > 0.1
-    yard.rigid.push("anna", "arm_left_4_link", np.zeros(3))
+    yard.rigid.apply_wrench("anna", "arm_left_4_link", np.zeros(3))
     back = yard.run(2.5)
     assert back[-1, 0, joint] == pytest.approx(before[joint], abs=1e-3)
     beyond = (before[joint] - back[:, 0, joint]) * np.sign(yielded)
@@ -191,7 +191,7 @@ def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard)
     speeds, turns = [], []
     for _ in range(200):
         yard.run(yard.rigid.dt)
-        _, velocity = yard.rigid.base("anna")
+        _, velocity = yard.rigid.base_state("anna")
         speeds.append(np.hypot(velocity[0], velocity[1]))
         turns.append(velocity[5])
     speeds = np.array(speeds)
@@ -204,7 +204,7 @@ def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard)
     assert np.abs(turns[stopped:]).max() < 0.01
     yard.robot.command_base(9.0, 9.0, yard.time)
     yard.run(0.45)
-    assert np.linalg.norm(yard.rigid.base("anna")[1][:2]) < limits.linear * 1.1
+    assert np.linalg.norm(yard.rigid.base_state("anna")[1][:2]) < limits.linear * 1.1
 
 
 def test_samples_agree_with_the_rigid_world(vinebot: RobotDescription) -> None:
@@ -257,7 +257,7 @@ def test_stop_holds_everything_where_it_is(yard: Yard) -> None:
     assert (yard.robot.interface == CommandInterface.POSITION).all()
     rows = yard.run(1.5)
     np.testing.assert_allclose(rows[-1, 1], 0.0, atol=1e-3)
-    assert np.abs(yard.rigid.base("anna")[1]).max() < 0.02
+    assert np.abs(yard.rigid.base_state("anna")[1]).max() < 0.02
 
 
 def test_wrong_commands_are_named(yard: Yard) -> None:
@@ -273,7 +273,7 @@ def test_wrong_commands_are_named(yard: Yard) -> None:
 
 def test_remote_copy_follows_its_original(vinebot: RobotDescription) -> None:
     here = Yard(vinebot)
-    far = Rigid(assemble([]))
+    far = RigidWorld(assemble([]))
     copy = RemoteRobot(far, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
     home = vinebot.home.copy()
     reach = here.robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint", "torso_lift_joint"])
@@ -283,11 +283,11 @@ def test_remote_copy_follows_its_original(vinebot: RobotDescription) -> None:
         here.robot.command_base(0.3, 0.2, here.time)
         here.run(here.rigid.dt)
         copy.follow(here.robot.update(here.time))
-        far.prep()
-        far.finish()
+        far.predict()
+        far.integrate()
         if tick > 50:
-            joints.append(np.abs(far.read("anna")[0] - here.rigid.read("anna")[0]).max())
-            bases.append(np.linalg.norm(far.base("anna")[0][:3] - here.rigid.base("anna")[0][:3]))
+            joints.append(np.abs(far.joint_measurements("anna")[0] - here.rigid.joint_measurements("anna")[0]).max())
+            bases.append(np.linalg.norm(far.base_state("anna")[0][:3] - here.rigid.base_state("anna")[0][:3]))
     assert max(joints) < 0.01
     assert max(bases) < 0.03
     assert copy.sample(0.0).base_q[2] == 0.0
@@ -339,7 +339,7 @@ def test_each_interface_tracks_a_swing(vinebot: RobotDescription, interface: str
         t = yard.time + yard.rigid.dt
         wanted = start + 0.15 * (1.0 - np.cos(w * t)) * np.array([1, -1])
         rate = 0.15 * w * np.sin(w * t) * np.array([1, -1])
-        position, velocity, _, _ = yard.rigid.read("anna")
+        position, velocity, _, _ = yard.rigid.joint_measurements("anna")
         if interface == "position":
             yard.robot.command_position(wanted, names)
         elif interface == "velocity":
@@ -359,11 +359,11 @@ def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
     for command in (
         lambda: yard.robot.command_velocity(np.zeros(len(joints))),
         lambda: yard.robot.command_motor_position(yard.robot.sample(yard.time).elements.motor),
-        lambda: yard.robot.command_position(yard.rigid.read("anna")[0]),
+        lambda: yard.robot.command_position(yard.rigid.joint_measurements("anna")[0]),
         lambda: yard.robot.command_effort(np.zeros(len(joints))),
         lambda: yard.robot.command_velocity(np.zeros(len(joints))),
     ):
-        before = yard.rigid.read("anna")[0].copy()
+        before = yard.rigid.joint_measurements("anna")[0].copy()
         command()
         rows = yard.run(0.5)
         assert np.abs(rows[:, 0] - before).max() < 2e-4
@@ -377,7 +377,7 @@ def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
     moving = rows[:, 0] < yard.robot.upper_limit[joint] - 0.2
     assert rows[moving, 1].max() == pytest.approx(yard.robot.max_velocity[joint], rel=0.02)
     assert rows[0, 2] == pytest.approx(yard.robot.max_effort[joint], rel=1e-6)
-    assert np.abs(rows[10:40, 2] - yard.rigid.weight("anna")[joint]).max() < 0.2 * yard.robot.max_effort[joint]
+    assert np.abs(rows[10:40, 2] - yard.rigid.gravity_effort("anna")[joint]).max() < 0.2 * yard.robot.max_effort[joint]
 
 
 # ---------------------------------------------------------------------- what sensors on it feel
@@ -397,7 +397,7 @@ def hand_of(description: RobotDescription, position: np.ndarray | None = None) -
 
 def centre_of_hand(yard: Yard) -> np.ndarray:
     """[3] in the base."""
-    return hand_of(yard.robot.description, yard.rigid.read("anna")[0])[1]
+    return hand_of(yard.robot.description, yard.rigid.joint_measurements("anna")[0])[1]
 
 
 def wrench_of(yard: Yard) -> tuple[np.ndarray, np.ndarray]:
@@ -416,12 +416,12 @@ def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: RobotDescr
     np.testing.assert_allclose(force, down, atol=0.01)
     np.testing.assert_allclose(torque, np.cross(centre - place, down), atol=0.01)
     push = np.array([6.0, -8.0, 3.0])
-    yard.rigid.push("anna", "gripper_left_base_link", push)
+    yard.rigid.apply_wrench("anna", "gripper_left_base_link", push)
     yard.run(3.0)
     pushed, twisted = wrench_of(yard)
     np.testing.assert_allclose(pushed - force, push, atol=0.03)
-    body = yard.rigid.world.body("anna/gripper_left_base_link").id
-    lever = yard.rigid.data.xipos[body] - yard.robot.frame_pose("wrist_left_ft_link")[:3]
+    body = yard.rigid.mj_model.body("anna/gripper_left_base_link").id
+    lever = yard.rigid.mj_data.xipos[body] - yard.robot.frame_pose("wrist_left_ft_link")[:3]
     np.testing.assert_allclose(twisted - torque, np.cross(lever, push), atol=0.03)
     other = next(w for w in yard.robot.sample(yard.time).wrenches if w.name == "wrist_right_ft")
     assert np.linalg.norm(other.force) == pytest.approx(9.81 * mass, rel=0.01)
@@ -496,11 +496,13 @@ def bunch_in_hand(description: RobotDescription, effort: float) -> tuple[Yard, i
     yard.robot.command_gripper("gripper_left", 0.08)
     yard.run(0.5)
     middle = yard.robot.frame_pose("gripper_left_grasping_link")
-    ball = Loose(0.3, np.zeros(3), np.full(3, 1e-4), np.zeros(3), np.zeros((1, 3)), np.zeros((1, 3)), np.array([0.03]))
+    ball = FreeBunch(
+        0.3, np.zeros(3), np.full(3, 1e-4), np.zeros(3), np.zeros((1, 3)), np.zeros((1, 3)), np.array([0.03])
+    )
     yard.rigid.add_bunch(0, ball, middle, np.zeros(6))
     yard.robot.command_gripper("gripper_left", 0.0, effort)
-    body = yard.rigid.world.body("loose/0").id
-    weight = yard.rigid.data.xfrc_applied[body]
+    body = yard.rigid.mj_model.body("loose/0").id
+    weight = yard.rigid.mj_data.xfrc_applied[body]
     weight[2] = 0.3 * 9.81  # somebody holds it until it is held
     yard.run(1.0)
     weight[:] = 0.0
@@ -516,7 +518,7 @@ def slid(yard: Yard, body: int, force: np.ndarray) -> float:
         return frames.compose(frames.inverse(hand), yard.rigid.bunch_pose(0))[:3]
 
     before = place()
-    yard.rigid.data.xfrc_applied[body, :3] = force
+    yard.rigid.mj_data.xfrc_applied[body, :3] = force
     yard.run(1.0)
     return float(np.linalg.norm(place() - before))
 
@@ -525,7 +527,7 @@ def test_a_bunch_is_held_by_friction_and_no_more(vinebot: RobotDescription) -> N
     """Two pads of 15 N and mu 0.8 hold 24 N: with the weight of 2.9 N, 16 N more hold and 25 N more do not."""
     yard, body = bunch_in_hand(vinebot, 15.0)
     fingers = vinebot.joint_indices("gripper_left")
-    squeeze = yard.rigid.read("anna")[3][fingers]
+    squeeze = yard.rigid.joint_measurements("anna")[3][fingers]
     np.testing.assert_allclose(squeeze, 15.0, atol=0.3 * 9.81 * 0.2)  # the hand is tilted: a bit of the bunch's weight
     along = frames.rotate(yard.robot.frame_pose("gripper_left_grasping_link")[3:], np.array([0.0, 0.0, -1.0]))
     assert slid(yard, body, 16.0 * along) < 1e-3
@@ -550,7 +552,7 @@ def test_gripper_commands_that_make_no_sense_are_named(yard: Yard) -> None:
 def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: RobotDescription) -> None:
     """Beside the peduncle it cuts nothing, over it the bunch; and the wrist feels the vine that touches the hand."""
     model, body, _ = bunch_scene()
-    stalk = Physics(model).view().body_q[body - 1, :3].astype(float)
+    stalk = Physics(model).snapshot().body_q[body - 1, :3].astype(float)
     cutter = next(c for c in vinebot.cutters if c.group == "gripper_left")
     home = vinebot.link_poses(vinebot.home)[cutter.frame]
     ahead = np.array([cutter.half[0] - 0.005, 0.0, 0.0])  # before the blades' cover, not in it
@@ -563,15 +565,15 @@ def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: RobotDescrip
         robot.command_cutter(group)
         robot.control(physics.time)
         physics.step()
-        return physics.partings
+        return physics.detachments
 
     assert cut("gripper_left") == ()
-    physics.rigid.place("anna", frames.pose(stalk - mouth), vinebot.home)
+    physics.rigid.place_robot("anna", frames.pose(stalk - mouth), vinebot.home)
     assert cut("gripper_right") == ()
     (parting,) = cut("gripper_left")
     assert (parting.bunch, parting.cause, parting.actor) == (0, "blade", "anna")
     robot.remove()
-    assert physics.parting.blades == []
+    assert physics.detachment_monitor.blades == []
     physics.step()
 
 
@@ -622,7 +624,7 @@ def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
     for _ in range(1500):
         robot.control(physics.time)
         physics.step()
-    position, velocity, _, contact = physics.rigid.read("anna")
+    position, velocity, _, contact = physics.rigid.joint_measurements("anna")
     assert any(c.link.startswith("gripper_left") for c in physics.contacts)
     assert np.abs(contact[joints]).max() > 0.3
     assert np.abs(velocity[joints]).max() < 2e-3

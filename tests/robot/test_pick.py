@@ -38,7 +38,7 @@ def vineyard(seed: int) -> tuple[Model, PickPlan]:
 
 def awake(physics: Physics) -> None:
     """Let MuJoCo compute the forces of what lies still, too."""
-    physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    physics.rigid.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
 def picker(physics: Physics, description: RobotDescription, pose: np.ndarray) -> Robot:
@@ -143,5 +143,5 @@ def test_the_same_pick_twice_is_the_same_to_the_bit(vinebot: RobotDescription):
             pick.control(physics.time)
             pick.robot.control(physics.time)
             physics.step()
-        ends.append(physics.rigid.data.qpos.tobytes() + physics.state.joint_q.tobytes())
+        ends.append(physics.rigid.mj_data.qpos.tobytes() + physics.state.joint_q.tobytes())
     assert ends[0] == ends[1]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
 from vinesim.robot.drives import CommandError, Robot
 from vinesim.robot.tasks.push import Phase, PushBunch
@@ -24,14 +24,14 @@ def vinebot() -> RobotDescription:
 
 @pytest.fixture(scope="module")
 def robot(vinebot: RobotDescription) -> Robot:
-    return Robot(Rigid(assemble([])), vinebot, "anna")
+    return Robot(RigidWorld(assemble([])), vinebot, "anna")
 
 
 class Run:
     """One push at ``target``, recorded tick by tick."""
 
     def __init__(self, robot: Robot, side: str, target: np.ndarray, base: np.ndarray = HERE, **options) -> None:
-        robot.rigid.place("anna", base, robot.description.home)
+        robot.rigid.place_robot("anna", base, robot.description.home)
         robot.stop()
         self.reach = reach = PushBunch(robot, side, lambda: target, repeat=False, **options)
         self.phases, self.tips, self.speeds, self.setpoints, self.errors = [], [], [], [robot.setpoint.copy()], {}
@@ -43,12 +43,12 @@ class Run:
             if reach.phase is not before:
                 self.errors[before] = error
             robot.control(self.time)
-            robot.rigid.prep()
-            robot.rigid.finish()
+            robot.rigid.predict()
+            robot.rigid.integrate()
             self.time += robot.rigid.dt
             self.phases.append(reach.phase)
             self.tips.append(reach.tip)
-            self.speeds.append(robot.rigid.read("anna")[1])
+            self.speeds.append(robot.rigid.joint_measurements("anna")[1])
             self.setpoints.append(robot.setpoint.copy())
 
 
@@ -113,7 +113,7 @@ def test_the_hand_is_smooth(robot: Robot) -> None:
 
 
 def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescription) -> None:
-    robot = Robot(Rigid(assemble([])), vinebot, "anna")
+    robot = Robot(RigidWorld(assemble([])), vinebot, "anna")
     time = 0.0
     reach = PushBunch(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold_time=0.2)
     errors = []
@@ -124,8 +124,8 @@ def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescr
         if reach.phase is not before and before is Phase.TOUCH:
             errors.append(error)
         robot.control(time)
-        robot.rigid.prep()
-        robot.rigid.finish()
+        robot.rigid.predict()
+        robot.rigid.integrate()
         time += robot.rigid.dt
     assert reach.push_count == 2
     assert max(errors) < 0.01
@@ -137,13 +137,13 @@ def test_what_is_out_of_reach_is_given_up_calmly(robot: Robot, caplog: pytest.Lo
     assert Phase.TOUCH not in run.phases
     assert "out of reach" in caplog.text
     assert (np.abs(run.speeds) <= 2.0 * robot.max_velocity).all()
-    position = robot.rigid.read("anna")[0]
+    position = robot.rigid.joint_measurements("anna")[0]
     assert (position >= robot.lower_limit - 0.02).all()
     assert (position <= robot.upper_limit + 0.02).all()
 
 
 def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
-    robot = Robot(Rigid(assemble([])), vinebot, "anna")
+    robot = Robot(RigidWorld(assemble([])), vinebot, "anna")
     arms = [
         PushBunch(robot, "left", lambda: np.array([0.7, 0.25, 1.45]), repeat=False),
         PushBunch(robot, "right", lambda: np.array([0.6, -0.3, 1.4]), repeat=False, use_lift=False),
@@ -157,8 +157,8 @@ def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
             if before is Phase.TOUCH and arm.phase is Phase.PUSH:
                 touched[arm.tool] = error
         robot.control(time)
-        robot.rigid.prep()
-        robot.rigid.finish()
+        robot.rigid.predict()
+        robot.rigid.integrate()
         time += robot.rigid.dt
     assert len(touched) == 2
     assert max(touched.values()) < 0.01
@@ -167,7 +167,7 @@ def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
 def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: RobotDescription) -> None:
     ends = []
     for _ in range(2):
-        robot = Robot(Rigid(assemble([])), vinebot, "anna")
+        robot = Robot(RigidWorld(assemble([])), vinebot, "anna")
         ends.append(np.array(Run(robot, "left", np.array([0.6, 0.1, 1.6])).tips).tobytes())
     assert ends[0] == ends[1]
 
@@ -184,6 +184,6 @@ def test_a_foreign_robot_reaches_by_its_names_alone() -> None:
         if "not installed" in str(error):
             pytest.skip(str(error))
         raise
-    run = Run(Robot(Rigid(assemble([])), tiago, "anna"), "left", np.array([0.55, 0.25, 1.1]))
+    run = Run(Robot(RigidWorld(assemble([])), tiago, "anna"), "left", np.array([0.55, 0.25, 1.1]))
     assert run.reach.push_count == 1
     assert run.errors[Phase.TOUCH] < 0.01

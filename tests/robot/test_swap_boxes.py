@@ -26,7 +26,7 @@ def yard() -> tuple[Model, SwapPlan]:
 
 def begun(count: int = 6) -> SwapBoxes:
     model, swap = yard()
-    physics = Physics(model, picking=False)
+    physics = Physics(model, detachment=False)
     robot = Robot(physics.rigid, load_description("logistic"), "carrier", pose=swap.start)
     swap_planning.fill_box(physics, swap.full_box, count)
     return SwapBoxes(physics, robot, swap)
@@ -42,13 +42,13 @@ def test_a_full_box_goes_and_an_empty_one_comes():
     exchange = begun()
     model, swap = yard()
     place = exchange.box_pose(swap.full_box).copy()
-    load_kg = sum(float(model.body_mass[model.bunch_body[bunch]]) for bunch in exchange.physics.rigid.loose)
+    load_kg = sum(float(model.body_mass[model.bunch_body[bunch]]) for bunch in exchange.physics.rigid.free_bunches)
     lift = exchange.robot.description.joint_indices("lift_front")[0]
     carried = []
     while not exchange.is_done:
         tick(exchange)
         if exchange.phase == "turn":
-            carried.append(exchange.robot.rigid.read("carrier")[2][lift])
+            carried.append(exchange.robot.rigid.joint_measurements("carrier")[2][lift])
     assert exchange.succeeded, exchange.reason
     report = exchange.report()
     assert report["exchanged"]
@@ -64,7 +64,7 @@ def test_a_full_box_goes_and_an_empty_one_comes():
 
 def test_a_box_that_is_not_there_is_told_in_words():
     exchange = begun(count=0)
-    joint = exchange.physics.rigid.data.joint("box/1")
+    joint = exchange.physics.rigid.mj_data.joint("box/1")
     while exchange.phase != "take the empty box":
         tick(exchange)
     joint.qpos[2] = 5.0  # somebody takes it away

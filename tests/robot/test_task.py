@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
@@ -29,7 +29,7 @@ class Story(Task):
 
 @pytest.fixture(scope="module")
 def robot() -> Robot:
-    return Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    return Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
 
 
 def tell(story: Story) -> Story:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.trajectory_controller import (
     GoalHandle,
     Outcome,
@@ -26,7 +26,7 @@ class Stage:
     """A robot whose left arm a controller moves."""
 
     def __init__(self, **tolerances) -> None:
-        self.rigid = Rigid(assemble([]))
+        self.rigid = RigidWorld(assemble([]))
         self.robot = Robot(self.rigid, load_description("vinebot"), "anna")
         self.controller = TrajectoryController(self.robot, ARM, **tolerances)
         self.home = self.robot.setpoint[self.controller.indices].copy()
@@ -40,15 +40,15 @@ class Stage:
                 return
             self.controller(self.time)
             self.robot.control(self.time)
-            self.rigid.prep()
-            self.rigid.finish()
+            self.rigid.predict()
+            self.rigid.integrate()
             self.time += self.rigid.dt
-            position, velocity, _, _ = self.rigid.read("anna")
+            position, velocity, _, _ = self.rigid.joint_measurements("anna")
             self.rows.append(np.stack([position, velocity])[:, self.controller.indices])
 
     def at(self, joints: tuple[str, ...] = ARM) -> np.ndarray:
         """Positions of some joints."""
-        return self.rigid.read("anna")[0][self.robot.joint_indices(joints)]
+        return self.rigid.joint_measurements("anna")[0][self.robot.joint_indices(joints)]
 
 
 def swing(stage: Stage, *, smooth: bool = True) -> Trajectory:
@@ -117,7 +117,7 @@ def test_a_trajectory_too_fast_for_the_drives_breaks_its_path_tolerance() -> Non
 
 def test_a_blocked_arm_misses_its_goal_in_time() -> None:
     stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01), goal_time_tolerance=0.5)
-    stage.rigid.push("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
+    stage.rigid.apply_wrench("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
     run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
     stage.run(3.0, until=run)
     assert run.outcome is Outcome.GOAL_TOLERANCE_VIOLATED
@@ -127,11 +127,11 @@ def test_a_blocked_arm_misses_its_goal_in_time() -> None:
 
 def test_without_a_limit_of_time_it_waits_until_the_goal_is_met() -> None:
     stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01))
-    stage.rigid.push("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
+    stage.rigid.apply_wrench("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
     run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
     stage.run(3.0, until=run)
     assert not run.is_done
-    stage.rigid.push("anna", "arm_left_4_link", np.zeros(3))
+    stage.rigid.apply_wrench("anna", "arm_left_4_link", np.zeros(3))
     stage.run(3.0, until=run)
     assert run.outcome is Outcome.SUCCESSFUL
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.waypoint_follower import STUCK_TIMEOUT, WaypointFollower
 from vinesim.robot.description.description import load_description
 from vinesim.robot.drives import Robot
@@ -24,15 +24,15 @@ def drive(way: WaypointFollower, seconds: float = 60.0) -> np.ndarray:
         time = 0.01 * len(poses)
         way.control(time)
         robot.control(time)
-        robot.rigid.prep()
-        robot.rigid.finish()
-        poses.append(robot.rigid.base(robot.name)[0])
+        robot.rigid.predict()
+        robot.rigid.integrate()
+        poses.append(robot.rigid.base_state(robot.name)[0])
     return np.array(poses)
 
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_points_are_passed_in_their_order_and_the_heading_is_the_last(backwards: bool):
-    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     points = np.array([[1.0, 0.5], [1.0, 1.5], [0.2, 1.0]])
     way = WaypointFollower(robot, points, 2.0, reverse=backwards)
     poses = drive(way)
@@ -49,7 +49,7 @@ def test_points_are_passed_in_their_order_and_the_heading_is_the_last(backwards:
 
 
 def test_a_base_keeps_to_its_speeds():
-    robot = Robot(Rigid(assemble([])), load_description("vinebot"), "anna")
+    robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     poses = drive(WaypointFollower(robot, np.array([[2.0, 0.0]]), 1.0, speed=0.4, turn_rate=0.3))
     assert np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).max() / 0.01 < 1.1 * 0.4
     assert np.abs(np.diff([heading(pose) for pose in poses])).max() / 0.01 < 1.1 * 0.3
@@ -57,7 +57,9 @@ def test_a_base_keeps_to_its_speeds():
 
 def test_an_obstacle_is_noticed():
     wall = {"fixed_start": [[1.0, 0.0, -0.3]], "fixed_end": [[1.0, 0.0, 2.0]], "fixed_radius": [[0.1, 0.1]]}
-    robot = Robot(Rigid(assemble([], **wall)), load_description("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0]))
+    robot = Robot(
+        RigidWorld(assemble([], **wall)), load_description("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0])
+    )
     way = WaypointFollower(robot, np.array([[2.0, 0.0]]))
     poses = drive(way, 30.0)
     assert way.is_stuck

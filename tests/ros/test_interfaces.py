@@ -27,7 +27,7 @@ OFFICIAL = {
 ASK_HASHES = """
 import rclpy
 from rclpy.context import Context
-from vinesim.ros import interfaces
+from vinesim.ros.messages import interfaces
 interfaces.ensure_importable(["tf2_msgs"])
 from tf2_msgs.msg import TF2Error, TFMessage
 context = Context()
@@ -41,7 +41,7 @@ node.destroy_node()
 context.shutdown()
 """
 
-BUILD = "import sys; from vinesim.ros import interfaces; sys.stdout.write(str(interfaces.build('tf2_msgs')))"
+BUILD = "import sys; from vinesim.ros.messages import interfaces; sys.stdout.write(str(interfaces.build('tf2_msgs')))"
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,14 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.kernels.shading import materials
-from vinesim.physics.rigid.human_body import PARTS, figure, hand_shapes, standing
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.human_body import BODY_PARTS, body_shapes, hand_shapes, standing_pose
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import CRATE_WALL
 from vinesim.robot.description import description
 from vinesim.scene import appearance
 from vinesim.scene.appearance import AppearanceError
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.values import HumanSpec, Link, Mesh, Shape
+from vinesim.scene.values import HumanSpec, Mesh, RigidVisual, Shape
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene import rigid_primitives
@@ -28,16 +28,16 @@ ROOM = 0.06
 SIZES = [(0.6, 0.4, 0.15), (0.6, 0.4, 0.24), (0.6, 0.4, 0.3), (0.4, 0.3, 0.24)]
 
 
-def person(name: str, height: float = 1.75) -> Rigid:
-    rigid = Rigid(sensor_scenes.empty())
-    pose = appearance.apply_posture(standing(frames.pose(np.zeros(3)), height), name, height)
+def person(name: str, height: float = 1.75) -> RigidWorld:
+    rigid = RigidWorld(sensor_scenes.empty())
+    pose = appearance.apply_posture(standing_pose(frames.pose(np.zeros(3)), height), name, height)
     rigid.add_human(HumanSpec("eva", 4, pose, height))
-    rigid.prep()
-    rigid.finish()
+    rigid.predict()
+    rigid.integrate()
     return rigid
 
 
-def silhouette(shapes: tuple[Link, ...], poses: np.ndarray, eye: np.ndarray) -> np.ndarray:
+def silhouette(shapes: tuple[RigidVisual, ...], poses: np.ndarray, eye: np.ndarray) -> np.ndarray:
     """Pixels [height, width] that show a person who stands at the origin."""
     primitives, _ = sensor_scenes.world(*shapes, at=poses)
     _, seen = sensor_scenes.raster(primitives, look_at(eye, np.array([0.0, 0.0, 0.95])))
@@ -51,13 +51,13 @@ def test_a_person_looks_as_large_as_what_touches(side: float, height: float) -> 
     """From anywhere what is drawn, grown by a few centimetres, covers the bodies that touch, and nearly the reverse."""
     rigid = person("stand", height)
     eye = 4.0 * np.array([np.cos(side), np.sin(side), 0.0]) + [0.0, 0.0, 1.3]
-    seen = silhouette(rigid.links(), rigid.link_q(), eye)
-    touching = dict(zip(PARTS, ((shape,) for shape in figure(height)), strict=True))
+    seen = silhouette(rigid.visuals(), rigid.visual_q(), eye)
+    touching = dict(zip(BODY_PARTS, ((shape,) for shape in body_shapes(height)), strict=True))
     touching |= {f"{hand}_hand": hand_shapes(hand) for hand in ("left", "right")}
-    rows = [i for i, link in enumerate(rigid.links()) if link.name.partition("/")[2] in touching]
-    named = [rigid.links()[i].name for i in rows]
-    bodies = tuple(Link(name, Organ.HUMAN, 4, touching[name.partition("/")[2]]) for name in named)
-    felt = silhouette(bodies, rigid.link_q()[rows], eye)
+    rows = [i for i, link in enumerate(rigid.visuals()) if link.name.partition("/")[2] in touching]
+    named = [rigid.visuals()[i].name for i in rows]
+    bodies = tuple(RigidVisual(name, Organ.HUMAN, 4, touching[name.partition("/")[2]]) for name in named)
+    felt = silhouette(bodies, rigid.visual_q()[rows], eye)
     reach = round(ROOM * sensor_scenes.SMALL.fx / 4.0)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     assert felt.sum() > 500
@@ -68,9 +68,9 @@ def test_a_person_looks_as_large_as_what_touches(side: float, height: float) -> 
 
 def test_everything_drawn_of_somebody_carries_that_label() -> None:
     rigid = person("pick")
-    primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
+    primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
     mine = primitives.label == label(Organ.HUMAN, 4)
-    shapes = [shape for link in rigid.links() for shape in link.shapes]
+    shapes = [shape for link in rigid.visuals() for shape in link.shapes]
     assert mine.sum() == sum(len(shape.mesh.corners) if shape.mesh else 1 for shape in shapes)
     assert mine.sum() == len(primitives.label) - 1  # the stand-in for plants
     assert mine.sum() < 5000
@@ -178,7 +178,7 @@ def test_what_is_wrong_with_a_figure_is_said_in_one_line(tmp_path, line: str, wo
 
 def test_an_unknown_posture_is_said() -> None:
     with pytest.raises(AppearanceError, match="posture 'dance' is unknown; give one of: stand, pick"):
-        appearance.apply_posture(standing(frames.pose(np.zeros(3))), "dance", 1.75)
+        appearance.apply_posture(standing_pose(frames.pose(np.zeros(3))), "dance", 1.75)
 
 
 def test_a_cone_tapers_the_way_it_says() -> None:
@@ -197,12 +197,12 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
     """F48: an open hand before a camera shows gaps between fingers and reaches further than a fist."""
     views = {}
     for name, bent in (("open", 0.0), ("fist", 1.0)):
-        pose = standing(frames.pose(np.zeros(3)))
+        pose = standing_pose(frames.pose(np.zeros(3)))
         up = frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0]))
         hand = {"right": frames.pose(np.array([0.5, -0.4, 1.4]), up), "right_fingers": (bent,) * 5}
-        rigid = Rigid(sensor_scenes.empty())
+        rigid = RigidWorld(sensor_scenes.empty())
         rigid.add_human(HumanSpec("eva", 4, dataclasses.replace(pose, **hand)))
-        primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
+        primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
         depth, _ = sensor_scenes.raster(primitives, look_at(np.array([1.1, -0.4, 1.4]), np.array([0.5, -0.4, 1.42])))
         views[name] = depth < 0.75
     rows = {name: np.flatnonzero(view.any(1)) for name, view in views.items()}
@@ -215,9 +215,9 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
 
 def test_a_lamp_is_seen_in_its_colour() -> None:
     """F41: the lit tier of a robot's signal tower is the greenest thing in a picture of it, in the shade too."""
-    rigid = Rigid(sensor_scenes.empty())
+    rigid = RigidWorld(sensor_scenes.empty())
     rigid.add_robot(description.load_description("vinebot").to_spec("bot"))
-    primitives, _ = sensor_scenes.world(*rigid.links(), at=rigid.link_q())
+    primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
     pose = look_at(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.6, 0.3, 0.5)).render(primitives, pose)
     _, seen = sensor_scenes.raster(primitives, pose)

@@ -169,7 +169,7 @@ def test_things_cast_shadows_that_follow_them() -> None:
     lit, dark = ground(1.3, 0.55, 0.0), ground(1.3, 0.15, 0.0)
     assert dark < 0.7 * lit
     at[0, 1] += 0.6
-    primitives.update(dataclasses.replace(view, link_q=at, links=view.links))
+    primitives.update(dataclasses.replace(view, link_q=at, links=view.visuals))
     assert ground(1.3, 0.15, 0.05) < 0.7 * lit  # not yet: shadows are redrawn at a bounded rate
     assert ground(1.3, 0.15, 0.2) > 0.8 * lit
     assert ground(1.3, 0.55, 0.2) < 0.7 * lit

@@ -9,7 +9,7 @@ from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.values import CameraFrame, CameraInfo, Link
+from vinesim.scene.values import CameraFrame, CameraInfo, RigidVisual
 from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
@@ -259,7 +259,7 @@ def test_a_picked_bunch_keeps_its_number(grove) -> None:
     bunch = 22
     pose = _before(model, rest, bunch)
     before = _of(truth.bunch_truths(primitives, rest, truth.render_buffers(primitives, NEAR, pose)), bunch)
-    link = Link(f"bunch/{bunch}", Organ.BUNCH, bunch, ())
+    link = RigidVisual(f"bunch/{bunch}", Organ.BUNCH, bunch, ())
     lying = rest_snapshot(model, (link,), rest.body_q[model.bunch_body[[bunch]]])
     lying.bunch_attached[bunch] = False
     loose = Primitives(model, grass=2.0)

@@ -43,7 +43,7 @@ class Farm:
         """The second robot pushes a bunch."""
         centre = bunch_centres(self.model)[self.bunch]
         robot = self.farm.robots["farm_2"]
-        base, _ = self.farm.physics.rigid.base("farm_2")
+        base, _ = self.farm.physics.rigid.base_state("farm_2")
         local = frames.rotate(frames.conjugate(base[3:]), centre - base[:3])
         side = "left" if local[1] >= 0.0 else "right"
         self.farm.pre_step.append(PushBunch(robot, side, lambda: centre, repeat=False).control)
@@ -72,8 +72,8 @@ def test_two_robots_of_one_client_are_two_actors_to_the_others():
     first.command_position([0.5], ["head_1_joint"])
     second.command_position([-0.5], ["head_1_joint"])
     head = world.vinebot.joints.index("head_1_joint")
-    world.until(lambda: visitor.physics.rigid.read("farm_2")[0][head] < -0.49, 3.0)
-    assert visitor.physics.rigid.read("farm_1")[0][head] == pytest.approx(0.5, abs=0.02)
+    world.until(lambda: visitor.physics.rigid.joint_measurements("farm_2")[0][head] < -0.49, 3.0)
+    assert visitor.physics.rigid.joint_measurements("farm_1")[0][head] == pytest.approx(0.5, abs=0.02)
 
     # what the second one touches is told by it, and moves on the visitor's side
     world.reach()

@@ -32,7 +32,7 @@ class Vineyard:
         hang = assemble([cane((0.0, 0.0, 0.0), bunch=0.5)])
         pose = hang.forward_kinematics(hang.joint_settled)[hang.bunch_body[0]]
         middle = pose[:3] + frames.rotate(pose[3:].astype(float), np.array([0.085, 0.0, 0.0]))
-        self.physics = Physics(assemble([cane(BUNCH - middle, bunch=0.5)]), picking=False)
+        self.physics = Physics(assemble([cane(BUNCH - middle, bunch=0.5)]), detachment=False)
         self.robot = Robot(self.physics.rigid, description, "tiago")
 
     def run(self, seconds: float) -> None:
@@ -44,7 +44,7 @@ class Vineyard:
 def test_it_holds_its_pose_with_every_link_weighing_what_the_file_says(tiago):
     world = Vineyard(tiago)
     world.run(2.0)
-    position, velocity, effort, _ = world.physics.rigid.read("tiago")
+    position, velocity, effort, _ = world.physics.rigid.joint_measurements("tiago")
     assert np.abs(position - tiago.home).max() < 1e-3
     assert np.abs(velocity).max() < 1e-3
     torso = tiago.joints.index("torso_lift_joint")
@@ -55,15 +55,15 @@ def test_it_holds_its_pose_with_every_link_weighing_what_the_file_says(tiago):
 def test_it_drives_a_circle_and_stops_when_nobody_commands(tiago):
     world = Vineyard(tiago)
     rigid = world.physics.rigid
-    rigid.place("tiago", frames.pose([10.0, 0.0, 0.0]), tiago.home)
+    rigid.place_robot("tiago", frames.pose([10.0, 0.0, 0.0]), tiago.home)
     for _ in range(300):
         world.robot.command_base(0.4, 0.4, world.physics.time)
         world.run(world.physics.dt)
-    pose, velocity = rigid.base("tiago")
+    pose, velocity = rigid.base_state("tiago")
     assert np.hypot(*velocity[:2]) == pytest.approx(0.4, rel=0.02)
     assert np.linalg.norm(pose[:2] - [10.0, 1.0]) == pytest.approx(1.0, abs=0.1)
     world.run(1.5)
-    assert np.abs(rigid.base("tiago")[1]).max() < 1e-2
+    assert np.abs(rigid.base_state("tiago")[1]).max() < 1e-2
 
 
 def test_its_fingers_close_with_their_mimics(tiago):
@@ -74,7 +74,7 @@ def test_its_fingers_close_with_their_mimics(tiago):
         goal = drive.lower + share * (drive.upper - drive.lower)
         world.robot.command_position(np.full(len(finger), goal), finger)
         world.run(1.5)
-        np.testing.assert_allclose(world.physics.rigid.read("tiago")[0][finger], goal, atol=5e-3)
+        np.testing.assert_allclose(world.physics.rigid.joint_measurements("tiago")[0][finger], goal, atol=5e-3)
 
 
 def test_it_reaches_for_a_bunch_and_pushes_it(tiago):
@@ -86,7 +86,7 @@ def test_it_reaches_for_a_bunch_and_pushes_it(tiago):
         world.run(world.physics.dt)
         contacts = [c for c in world.physics.contacts if c.actor == "tiago"]
         pushed = max(pushed, float(np.linalg.norm(sum((c.force for c in contacts), np.zeros(3)))))
-        effort = max(effort, float(np.abs(world.physics.rigid.read("tiago")[3]).max()))
+        effort = max(effort, float(np.abs(world.physics.rigid.joint_measurements("tiago")[3]).max()))
     assert (reach.push_count, reach.missed_count) == (1, 0)
     assert 0.5 < pushed < 60.0
     assert effort > 0.1, "its joints feel the bunch"

@@ -10,7 +10,7 @@ import pytest
 from tests.support.shared_vineyard import BOX, BUNCH, World, apart, heard, pose_of, sent, vineyard
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.human_body import standing_pose
 from vinesim.scene.ids import Kind, Organ, thing_named
 from vinesim.scene.values import HumanPose
 
@@ -59,7 +59,7 @@ def test_a_bunch_is_told_of_from_cut_to_rest_then_nothing_until_it_is_gripped():
     assert worst < 0.10
     world.run(0.2)
     assert apart(ada, bob, BUNCH(0)) < 1e-3
-    assert ada.physics.riding.lies(BUNCH(0))[0] == ""
+    assert ada.physics.support_tracker.pose_on_support(BUNCH(0))[0] == ""
     before = sent(ada), sent(bob)
     world.run(1.0)
     assert (sent(ada), sent(bob)) == before
@@ -76,16 +76,20 @@ def test_a_bunch_is_told_of_from_cut_to_rest_then_nothing_until_it_is_gripped():
     assert apart(ada, bob, BUNCH(0)) < 0.01
     # held still it rests in the hand
     world.until(lambda: at_rest(world), 3.0)
-    parent, _ = ada.physics.riding.lies(BUNCH(0))
+    parent, _ = ada.physics.support_tracker.pose_on_support(BUNCH(0))
     assert parent in ("ada/left", "ada/right")
-    assert bob.physics.riding.lies(BUNCH(0))[0] == parent
+    assert bob.physics.support_tracker.pose_on_support(BUNCH(0))[0] == parent
     # put down, it stays behind when the hand goes up, whatever was said of the hand
     for lift, fingers, seconds in ((down, 0.07, 0.8), (down, 0.0, 0.5), (down + 0.5, 0.0, 0.5)):
         ask(ada, lift, fingers)
         world.run(seconds)
     world.until(lambda: at_rest(world), 5.0)
     world.run(0.1)
-    assert ada.physics.riding.lies(BUNCH(0))[0] == bob.physics.riding.lies(BUNCH(0))[0] == ""
+    assert (
+        ada.physics.support_tracker.pose_on_support(BUNCH(0))[0]
+        == bob.physics.support_tracker.pose_on_support(BUNCH(0))[0]
+        == ""
+    )
     assert pose_of(ada, BUNCH(0))[2] < lying + 0.05
     assert apart(ada, bob, BUNCH(0)) < 1e-3
 
@@ -97,7 +101,7 @@ def test_in_a_box_a_bunch_is_silent_and_a_pushed_box_is_one_stream():
     world.until(lambda: at_rest(world), 5.0)
     world.run(0.2)
     for bunch in range(2):
-        assert bob.physics.riding.lies(BUNCH(bunch))[0] == "box/0"
+        assert bob.physics.support_tracker.pose_on_support(BUNCH(bunch))[0] == "box/0"
         assert apart(ada, bob, BUNCH(bunch)) < 1e-3
     before = sent(ada)
     world.run(0.5)
@@ -125,12 +129,16 @@ def test_in_a_box_a_bunch_is_silent_and_a_pushed_box_is_one_stream():
 def test_a_box_that_rides_on_a_robot_costs_nothing_and_is_where_the_robot_is():
     """F80."""
     world, ada, bob = near_worlds((-1.0, -1.0), (1.0, -3.0))
-    deck = frames.compose(ada.physics.rigid.base("ada")[0], frames.pose([0.0, 0.0, 0.253]))
-    ada.physics.riding.place(BOX(1), deck, np.zeros(6))
-    world.until(lambda: ada.physics.riding.moving, 1.0)
+    deck = frames.compose(ada.physics.rigid.base_state("ada")[0], frames.pose([0.0, 0.0, 0.253]))
+    ada.physics.support_tracker.set_state(BOX(1), deck, np.zeros(6))
+    world.until(lambda: ada.physics.support_tracker.moving, 1.0)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)
-    assert bob.physics.riding.lies(BOX(1))[0] == ada.physics.riding.lies(BOX(1))[0] == "ada/base_footprint"
+    assert (
+        bob.physics.support_tracker.pose_on_support(BOX(1))[0]
+        == ada.physics.support_tracker.pose_on_support(BOX(1))[0]
+        == "ada/base_footprint"
+    )
     before = sent(ada), sent(bob)
     start = pose_of(ada, BOX(1))[0]
     drive(ada, 1.0)
@@ -145,8 +153,8 @@ def test_a_box_that_rides_on_a_robot_costs_nothing_and_is_where_the_robot_is():
     assert apart(ada, bob, BOX(1)) < 0.02
     assert (sent(ada), sent(bob)) == before
     # what has left it is where it went, not where it was said to lie; and that is ada's to say
-    beside = frames.compose(ada.physics.rigid.base("ada")[0], frames.pose([0.0, 1.0, 0.001]))
-    ada.physics.riding.place(BOX(1), beside, np.zeros(6))
+    beside = frames.compose(ada.physics.rigid.base_state("ada")[0], frames.pose([0.0, 1.0, 0.001]))
+    ada.physics.support_tracker.set_state(BOX(1), beside, np.zeros(6))
     world.run(0.1)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)
@@ -166,7 +174,7 @@ def test_a_bunch_on_its_vine_is_moved_and_seen_from_near_and_only_from_there(nea
     drive(ada, 0.1)
     world.run(0.8)
     for client in (ada, bob):
-        client.physics.refresh()
+        client.physics.update_kinematics()
     here, there, rest = (
         frames.compose(q[body].astype(float), frames.pose([0.1, 0.0, 0.0]))[:3]
         for q in (
@@ -196,7 +204,7 @@ def test_two_cut_one_bunch_in_the_same_tick_and_it_is_one_bunch_of_one_owner():
     world.until(lambda: at_rest(world), 5.0)
     world.run(0.2)
     assert apart(ada, bob, BUNCH(0)) < 1e-3
-    assert [client.physics.rigid.loose for client in (ada, bob)] == [(0,), (0,)]
+    assert [client.physics.rigid.free_bunches for client in (ada, bob)] == [(0,), (0,)]
     assert len([fact for _, fact in world.server.facts if fact.thing == BUNCH(0)]) == 1
 
 
@@ -207,13 +215,13 @@ def test_a_cut_cane_falls_for_everybody_near_and_lies_the_same():
     world.run(0.3)
     assert bob.physics.state.body_cut[body]
     for client in (ada, bob):
-        client.physics.refresh()
+        client.physics.update_kinematics()
     falling = ada.physics.state.body_q[body, 2]
     assert falling < 1.2
     assert abs(bob.physics.state.body_q[body, 2] - falling) < 0.12
     world.until(lambda: ada.replicator.owner(1) is None and bob.replicator.owner(1) is None, 12.0)
     for client in (ada, bob):
-        client.physics.refresh()
+        client.physics.update_kinematics()
     here = ada.model.bodies_of(1)
     assert np.abs(ada.physics.state.body_q[here] - bob.physics.state.body_q[here])[:, :3].max() < 5e-3
     fact = world.server.facts.of(1)
@@ -227,11 +235,11 @@ def test_every_kind_of_thing_that_moves_has_a_channel():
     world, ada, bob = near_worlds()
     ada.physics.pick(1)
     world.run(0.2)
-    view = ada.physics.view()
-    named = {link.organ: thing_named(link.name) for link in view.links}
+    view = ada.physics.snapshot()
+    named = {link.organ: thing_named(link.name) for link in view.visuals}
     assert {organ for organ, number in named.items() if number is not None} == {Organ.BOX, Organ.BUNCH}
     assert {organ for organ, number in named.items() if number is None} <= {Organ.ROBOT, Organ.HUMAN}
-    assert {link.name.partition("/")[0] for link in view.links if thing_named(link.name) is None} == {"ada", "bob"}
+    assert {link.name.partition("/")[0] for link in view.visuals if thing_named(link.name) is None} == {"ada", "bob"}
     assert bob.replicator.actors.keys() == {"ada"}
     assert {Kind(number >> 24) for number in ada.replicator.mine} == {Kind.BUNCH, Kind.TREE}
     assert set(Kind) == {Kind.TREE, Kind.BUNCH, Kind.BOX}
@@ -244,7 +252,7 @@ def test_a_story_is_the_same_twice():
         world.run(0.8)
         bob.physics.cut(int(ada.model.tree_first[1]) + 8)
         world.run(0.4)
-        return b"".join(client.physics.rigid.data.qpos.tobytes() for client in (ada, bob))
+        return b"".join(client.physics.rigid.mj_data.qpos.tobytes() for client in (ada, bob))
 
     assert story() == story()
 
@@ -267,16 +275,16 @@ def test_whoever_comes_late_finds_everything_as_it_was_left():
         world.leave(name)
     cy = world.join("cy", -2.0, 1.5)
     world.until(lambda: not cy.physics.state.bunch_attached.any(), 0.2)
-    assert len(cy.physics.lying) == 2, "no body is made at once"
+    assert len(cy.physics.dormant_bunches) == 2, "no body is made at once"
     world.run(0.5)
-    assert sorted(cy.physics.rigid.loose) == [0, 1], "but who is near gets one"
+    assert sorted(cy.physics.rigid.free_bunches) == [0, 1], "but who is near gets one"
     np.testing.assert_allclose(pose_of(cy, BOX(0)), pose_of(ada, BOX(0)), atol=1e-3)
     for bunch in range(2):
         np.testing.assert_allclose(pose_of(cy, BUNCH(bunch)), pose_of(ada, BUNCH(bunch)), atol=5e-3)
-        assert cy.physics.riding.lies(BUNCH(bunch))[0] == "box/0"
+        assert cy.physics.support_tracker.pose_on_support(BUNCH(bunch))[0] == "box/0"
     assert cy.physics.state.body_cut.tolist() == ada.physics.state.body_cut.tolist()
-    ada.physics.refresh()
-    cy.physics.refresh()
+    ada.physics.update_kinematics()
+    cy.physics.update_kinematics()
     off = cy.physics.state.body_q[:, :3] - ada.physics.state.body_q[:, :3]
     assert np.linalg.norm(off, axis=1).max() < 0.01
     assert sent(cy) == 0, "it had nothing to add"
@@ -322,8 +330,8 @@ def test_while_the_server_is_away_everybody_works_on_and_all_agree_afterwards():
 
 def test_a_robot_that_leaves_leaves_behind_what_rode_on_it():
     world, ada, bob = near_worlds((-1.0, -1.0), (1.0, -2.0))
-    deck = frames.compose(ada.physics.rigid.base("ada")[0], frames.pose([0.0, 0.0, 0.253]))
-    ada.physics.riding.place(BOX(1), deck, np.zeros(6))
+    deck = frames.compose(ada.physics.rigid.base_state("ada")[0], frames.pose([0.0, 0.0, 0.253]))
+    ada.physics.support_tracker.set_state(BOX(1), deck, np.zeros(6))
     world.run(0.2)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)
@@ -352,7 +360,7 @@ def test_a_person_takes_a_bunch_off_its_vine_carries_it_and_lets_it_fall_for_eve
     def source(time: float) -> HumanPose:
         come, carry = np.clip((time - 0.5) / 0.5, 0.0, 1.0), np.clip((time - 1.4) / 1.2, 0.0, 1.0)
         at = hang + np.array([0.075 + 0.25 * (1.0 - come) + 0.1 * carry, -0.8 * carry, -0.2 * carry])
-        return dataclasses.replace(standing(stands), right=frames.pose(at, facing), right_closed=1.1 < time < 2.8)
+        return dataclasses.replace(standing_pose(stands), right=frames.pose(at, facing), right_closed=1.1 < time < 2.8)
 
     eva = Client(
         world.scene, weak, None, world.hub.bus("eva"), name="eva", pose=stands, source=source, clock=lambda: world.now
@@ -360,17 +368,17 @@ def test_a_person_takes_a_bunch_off_its_vine_carries_it_and_lets_it_fall_for_eve
     eva.physics.wind = None
     world.clients["eva"] = eva
     world.run(1.3)
-    assert eva.physics.hand("eva", "right").holds[0] == "plants"
+    assert eva.physics.hand("eva", "right").held[0] == "plants"
     world.until(lambda: not eva.physics.state.bunch_attached[0], 1.5)
     world.run(0.1)
     for client in (ada, bob):
         assert not client.physics.state.bunch_attached[0]
         assert client.replicator.owner(BUNCH(0)) == "eva"
         assert apart(eva, client, BUNCH(0)) < 0.06
-    world.until(lambda: eva.physics.hand("eva", "right").holds is None, 2.0)
+    world.until(lambda: eva.physics.hand("eva", "right").held is None, 2.0)
     world.until(lambda: at_rest(world), 8.0)
     world.run(0.1)
     assert pose_of(eva, BUNCH(0))[2] < 0.3
     for client in (ada, bob):
-        assert client.physics.riding.lies(BUNCH(0))[0] == ""
+        assert client.physics.support_tracker.pose_on_support(BUNCH(0))[0] == ""
         assert apart(eva, client, BUNCH(0)) < 5e-3

@@ -35,7 +35,7 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
         for name, pose in (("worker", task.base_pose), ("visitor", frames.pose([*beside, 0.0])))
     )
     # let MuJoCo compute the forces of what lies still, too
-    visitor.physics.rigid.world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    visitor.physics.rigid.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
     def run(ticks: int = 1) -> None:
         for _ in range(ticks):
@@ -53,21 +53,23 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
         run()
         cut = not worker.physics.state.bunch_attached[task.bunch]
         if cut and visitor.replicator.owner(bunch) == "worker":
-            here, there = (client.physics.riding.read(bunch)[0] for client in (worker, visitor))
+            here, there = (client.physics.support_tracker.object_state(bunch)[0] for client in (worker, visitor))
             worst.append(float(np.linalg.norm(here[:3] - there[:3])))
     assert pick.picked, pick.reason
     run(300)
     assert not visitor.physics.state.bunch_attached[task.bunch]
     assert visitor.physics.state.bunch_attached.sum() == len(model.bunch_body) - 1
     here, there = (
-        frames.compose(frames.inverse(riding.read(box)[0]), riding.read(bunch)[0])
-        for riding in (worker.physics.riding, visitor.physics.riding)
+        frames.compose(frames.inverse(riding.object_state(box)[0]), riding.object_state(bunch)[0])
+        for riding in (worker.physics.support_tracker, visitor.physics.support_tracker)
     )
     assert np.linalg.norm(here[:3] - there[:3]) < 5e-3
-    assert visitor.physics.riding.lies(bunch)[0] == f"box/{task.box}"
-    world = visitor.physics.rigid.world
+    assert visitor.physics.support_tracker.pose_on_support(bunch)[0] == f"box/{task.box}"
+    world = visitor.physics.rigid.mj_model
     world.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    visitor.physics.riding.place(bunch, visitor.physics.riding.read(bunch)[0], np.zeros(6))
+    visitor.physics.support_tracker.set_state(
+        bunch, visitor.physics.support_tracker.object_state(bunch)[0], np.zeros(6)
+    )
     run(100)
     weighed = np.mean([(run(), pressed_on_ground(visitor.physics, task.box))[1] for _ in range(50)]) - empty
     assert weighed == pytest.approx(float(model.body_mass[model.bunch_body[task.bunch]]) * GRAVITY, rel=0.03)

@@ -85,7 +85,7 @@ def test_the_whole_way(world):
     awake = picker.physics.plants.awake
     assert world.tree in awake
     roots = world.model.tree_pose[awake, :3]
-    base = picker.robot.rigid.base("picker")[0][:3]
+    base = picker.robot.rigid.base_state("picker")[0][:3]
     assert np.linalg.norm(roots[:, :2] - base[:2], axis=1).max() < 3.5
     assert len(awake) < 0.2 * len(world.model.tree_first)
 
@@ -108,7 +108,7 @@ def test_the_whole_way(world):
     picker.pre_step.clear()
     away = picker.robot.description.home
     picker.robot.command_position(away)
-    world.until(lambda: world.tree not in picker.physics.sleep.restless, 60.0)
+    world.until(lambda: world.tree not in picker.physics.sleep_monitor.restless, 60.0)
     world.until(lambda: visitor.replicator.owner(world.tree) is None, 2.0)
     here = world.model.bodies_of(world.tree)
     mine, theirs = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]

@@ -10,7 +10,7 @@ from vinesim.physics.step import Physics
 
 def pressed_on_ground(physics: Physics, box: int) -> float:
     """Upward force of the ground on a box [N], from MuJoCo's own contacts: its weight, with all that lies in it."""
-    world, data = physics.rigid.world, physics.rigid.data
+    world, data = physics.rigid.mj_model, physics.rigid.mj_data
     ground, body = world.geom("ground").id, world.body(f"box/{box}").id
     total = 0.0
     for i, geoms in enumerate(data.contact.geom):

@@ -13,7 +13,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import CameraInfo, Link, Shape, View
+from vinesim.scene.values import CameraInfo, RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import CameraRasterizer, CameraSpec, pinhole
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
@@ -39,11 +39,11 @@ def shape(kind: str, *size: float, at=(0.0, 0.0, 0.0), turn=frames.IDENTITY, **o
     return Shape(kind, tuple(size), frames.pose(np.array(at, float), turn), **others)
 
 
-def thing(*shapes: Shape, name: str = "thing", organ: Organ = Organ.ROBOT, index: int = 0) -> Link:
-    return Link(name, organ, index, tuple(shapes))
+def thing(*shapes: Shape, name: str = "thing", organ: Organ = Organ.ROBOT, index: int = 0) -> RigidVisual:
+    return RigidVisual(name, organ, index, tuple(shapes))
 
 
-def world(*links: Link, model: Model | None = None, at=None, grass: float = 0.0) -> tuple[Primitives, View]:
+def world(*links: RigidVisual, model: Model | None = None, at=None, grass: float = 0.0) -> tuple[Primitives, Snapshot]:
     """Primitives that show ``links`` at poses ``at`` [link, 7] (the origin unless given)."""
     model = empty() if model is None else model
     poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (len(links), 1)) if at is None else np.asarray(at, float)

@@ -161,7 +161,7 @@ BUNCH, BOX = functools.partial(thing, Kind.BUNCH), functools.partial(thing, Kind
 
 
 def pose_of(client: Client, number: int) -> np.ndarray:
-    return client.physics.riding.read(number)[0]
+    return client.physics.support_tracker.object_state(number)[0]
 
 
 def apart(a: Client, b: Client, number: int) -> float:

@@ -98,7 +98,7 @@ class Client:
         """Pose [7] of the base of this client's robot or of a remote one; ``KeyError`` if there is none of that name."""
         if name != self._client.name and name not in self._client.remote_actors:
             raise KeyError(f"no actor {name!r}; there are: {', '.join((self._client.name, *self.remote_actors))}")
-        return self._client.physics.rigid.base(name)[0]
+        return self._client.physics.rigid.base_state(name)[0]
 
     def step(self, count: int = 1) -> None:
         """Advance by ``count`` steps of 10 ms at once: receive, control, step, sense, send. It does not wait."""

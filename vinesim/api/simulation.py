@@ -29,7 +29,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
-from vinesim.scene.values import Contact, Parting, View
+from vinesim.scene.values import Contact, Parting, Snapshot
 
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
@@ -79,7 +79,7 @@ class Simulation:
         changes = {name: value for name, value in (("dt", dt), ("sleep", sleep)) if value is not None}
         self.parameters: PhysicsParameters = msgspec.structs.replace(chosen, **changes)
         """All numbers of the physics; they are fixed from the start."""
-        self.physics = Physics(model, parameters=self.parameters, device=device, threads=threads, picking=detach)
+        self.physics = Physics(model, parameters=self.parameters, device=device, threads=threads, detachment=detach)
         """The solver below, for what this class does not offer."""
         self.robots: dict[str, Robot] = {}
         """Robots by name; their commands take effect in the next step."""
@@ -100,7 +100,7 @@ class Simulation:
             for robot in self.robots.values():
                 robot.control(self.physics.time)
             self.physics.step()
-            self._detachments += self.physics.partings
+            self._detachments += self.physics.detachments
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
         self._loads.clear()
@@ -128,7 +128,7 @@ class Simulation:
 
         Joint rotations and rates may be written; call :meth:`wake` afterwards.
         """
-        self.physics.refresh()
+        self.physics.update_kinematics()
         return self.physics.state
 
     @property
@@ -148,12 +148,12 @@ class Simulation:
 
     def energy(self, tree: int | None = None) -> Energy:
         """Kinetic, elastic and gravitational energy [J] of the plants, or of one tree."""
-        self.physics.refresh()
+        self.physics.update_kinematics()
         return energy(self.physics.plants, self.parameters.gravity, self._one(tree))
 
     def momentum(self, tree: int | None = None) -> Momentum:
         """Linear momentum [kg m/s] and angular momentum about the world's origin [kg m^2/s] of plants, or of a tree."""
-        self.physics.refresh()
+        self.physics.update_kinematics()
         return momentum(self.physics.plants, self._one(tree))
 
     def body_pose(self, body: int) -> np.ndarray:
@@ -178,9 +178,9 @@ class Simulation:
                 return body
             body = bodies.start + int(following[0])
 
-    def snapshot(self) -> View:
+    def snapshot(self) -> Snapshot:
         """The whole world at the current time, for sensors: a value that never changes."""
-        return self.physics.view()
+        return self.physics.snapshot()
 
     # ------------------------------------------------------------------ actions
 

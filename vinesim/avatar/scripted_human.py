@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.human_body import standing_pose
 from vinesim.scene.values import HumanPose
 
 WALK = 1.1
@@ -71,13 +71,13 @@ class Legs:
         return np.stack([there[0], *self._feet])
 
 
-class Walker:
+class ScriptedHuman:
     """Called once a tick, it says where the tracked points are at the tick's end: a source for a client's person."""
 
     def __init__(self, root: np.ndarray, height: float = 1.75, dt: float = 0.01) -> None:
         self.dt = dt
         self.root = np.asarray(root, float)
-        self.pose = standing(self.root, height)
+        self.pose = standing_pose(self.root, height)
         self.closed = {"left": False, "right": False}
         self._heading = frames.to_yaw(self.root[3:])
         self._place = self.root[:2].copy()
@@ -88,7 +88,7 @@ class Walker:
         self._legs = Legs(self.pose, dt)
         self._acts: deque[Iterator[None]] = deque()
 
-    def do(self, *acts: Iterator[None]) -> Walker:
+    def do(self, *acts: Iterator[None]) -> ScriptedHuman:
         """Do some acts, one after the other, after whatever is being done."""
         self._acts.extend(acts)
         return self

@@ -17,7 +17,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.bench import scenes as scenes
 from vinesim.bench.mujoco_reference import MujocoScene
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
@@ -72,7 +72,7 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
         )
         home = robot.home if i else raised
         physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
-        physics.rigid.drive_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))
+        physics.rigid.command_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))
     _swing_joints(physics, robot, raised, 0)
     physics.step()
     reached = physics.contact_solver.near_trees
@@ -161,7 +161,7 @@ def _compare_with_mujoco(case: str, bench: str, model, robots: list[RobotSpec], 
         )
 
 
-def _command(rigid: Rigid, robots: list[RobotSpec], tick: int) -> None:
+def _command(rigid: RigidWorld, robots: list[RobotSpec], tick: int) -> None:
     """The bar, 4 cm above its start, and the hands, closed and lifted by 2 cm, go up and down by a centimetre."""
     wave = 0.01 * np.sin(0.06 * tick)
     for robot in robots:

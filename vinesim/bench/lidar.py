@@ -45,7 +45,7 @@ def lidar() -> Iterator[Measurement]:
     rays = head.direction.numpy()
     reach = spec.farthest.value
     trees = np.unique(model.body_tree[model.bunch_body])[:20]
-    awake = dataclasses.replace(rest_snapshot(model), moved=trees)
+    awake = dataclasses.replace(rest_snapshot(model), moved_trees=trees)
 
     def follow() -> None:
         primitives.update(awake)

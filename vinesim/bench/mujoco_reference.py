@@ -12,9 +12,9 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, furnished
+from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, build_static_world
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -69,10 +69,10 @@ class MujocoScene:
     def __init__(
         self, model: Model, robots: list[RobotSpec], *, dt: float = 0.01, contact_time_constant: float | None = None
     ) -> None:
-        self.rigid = mine = Rigid(model, parameters=PhysicsParameters(dt=dt))
+        self.rigid = mine = RigidWorld(model, parameters=PhysicsParameters(dt=dt))
         for robot in robots:
             mine.add_robot(robot)
-        spec = furnished(model, mine.parameters)
+        spec = build_static_world(model, mine.parameters)
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         for bit, robot in enumerate(robots, FIRST_ACTOR):
@@ -92,24 +92,24 @@ class MujocoScene:
             world.geom_solref[:] = contact_time_constant, 1.0
             world.geom_solimp[:] = 0.99, 0.999, 0.001, 0.5, 2.0
         data = mujoco.MjData(world)
-        for j in range(mine.world.njnt):
-            joint = mine.world.joint(j)
+        for j in range(mine.mj_model.njnt):
+            joint = mine.mj_model.joint(j)
             if joint.name.split("/")[0].split(":")[0] in mine.robots:
-                data.joint(joint.name).qpos[:] = mine.data.joint(j).qpos
+                data.joint(joint.name).qpos[:] = mine.mj_data.joint(j).qpos
         for body, q in enumerate(model.joint_settled):
             data.joint(f"plant/{body}").qpos[:] = frames.to_wxyz(q)
-        mine.inhabit(world, data)
+        mine.rebind(world, data)
         self.world, self.data = world, data
 
     def step(self) -> None:
         """One tick of everything."""
-        self.rigid.drive()
+        self.rigid.apply_controls()
         mujoco.mj_step(self.world, self.data)
-        self.rigid.stale()
+        self.rigid.invalidate_kinematics()
 
     def body_pose(self, body: int) -> np.ndarray:
         """Pose [7] of a plant's body after the last step."""
-        self.rigid.refresh()
+        self.rigid.update_kinematics()
         there = self.data.body(f"plant/{body}")
         return np.concatenate([there.xpos, frames.from_wxyz(there.xquat)])
 

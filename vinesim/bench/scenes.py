@@ -106,7 +106,7 @@ def bar(name: str, first: int, count: int) -> RobotSpec:
 
 def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
     """Wake some trees and let nothing fall asleep again."""
-    physics.sleep.quiet = -1.0
+    physics.sleep_monitor.quiet = -1.0
     physics.plants.wake(trees)
     return physics
 

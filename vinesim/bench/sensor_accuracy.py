@@ -20,7 +20,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import Link, Measurement, Shape, View
+from vinesim.scene.values import Measurement, RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
 from vinesim.sensors.camera.renderers import RendererUnavailable
 from vinesim.sensors.export.images import depth_colours, look_at, write_png
@@ -70,7 +70,7 @@ def measure_plane(spec: CameraSpec) -> DepthStatistics:
     for number, away in enumerate(RANGES):
         wall = Shape("box", (0.05, 20.0, 20.0), frames.pose(np.array([away + 0.05, 0.0, 1.0])))
         nothing = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=0)
-        view = rest_snapshot(nothing, (Link("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None])
+        view = rest_snapshot(nothing, (RigidVisual("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None])
         primitives = Primitives(nothing, grass=0.0)
         primitives.update(view)
         camera = Camera(spec, spec.info("optical"), seed=SEED, image_index=number)
@@ -80,7 +80,9 @@ def measure_plane(spec: CameraSpec) -> DepthStatistics:
     return found
 
 
-def measure_plants(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> dict[str, DepthStatistics]:
+def measure_plants(
+    spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot
+) -> dict[str, DepthStatistics]:
     """Leaves and bunches, looked at from all ranges around some bunches."""
     rng = np.random.default_rng(SEED)
     camera = Camera(spec, spec.info("optical"), seed=SEED)
@@ -100,7 +102,7 @@ def measure_plants(spec: CameraSpec, model: Model, primitives: Primitives, view:
     return found
 
 
-def _towards_a_bunch(rng: np.random.Generator, model: Model, view: View, away: float) -> np.ndarray:
+def _towards_a_bunch(rng: np.random.Generator, model: Model, view: Snapshot, away: float) -> np.ndarray:
     """Pose [7] of an optical frame that looks at some bunch from a distance, from a robot's height."""
     bunch = int(rng.integers(len(model.bunch_body)))
     pose = view.body_q[model.bunch_body[bunch]].astype(float)
@@ -111,7 +113,7 @@ def _towards_a_bunch(rng: np.random.Generator, model: Model, view: View, away: f
     return look_at(middle + np.array([level * np.cos(around), level * np.sin(around), rise]), middle)
 
 
-def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, view: View) -> np.ndarray:
+def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot) -> np.ndarray:
     """Share of the bunch that is hidden, share of its berries that are seen [bunch in a picture, 2]; whole bunches."""
     rng = np.random.default_rng(SEED)
     info = spec.info("optical")
@@ -170,7 +172,7 @@ class PixelView:
     primitive: np.ndarray
 
 
-def compare_renderers(spec: CameraSpec, model: Model, view: View) -> dict[str, PixelView]:
+def compare_renderers(spec: CameraSpec, model: Model, view: Snapshot) -> dict[str, PixelView]:
     """One view by every renderer that runs here on the CPU, and by the ray caster, which is the measure of all."""
     info, pose = spec.info("optical"), look_at(*RENDERER_VIEW)
     lens, found = pinhole(info, pose), {}

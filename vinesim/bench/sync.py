@@ -159,7 +159,7 @@ class Authority:
         self._screen.subscribe("authority/trees", EVERY)
         self._say = self._screen.publisher("authority/pose")
         self._answer = self._bus.publisher("authority/trees")
-        self.physics = Physics(pair.model, picking=False)
+        self.physics = Physics(pair.model, detachment=False)
         self._copy: RemoteRobot | None = None
         self.joint_q = pair.model.joint_settled[pair.model.bodies_of(pair.tree)].copy()
         """The watched tree, as shown [body, 4]."""
@@ -242,8 +242,8 @@ class Recorder:
             self.authority.tick()
         shown.append(self.authority.joint_q if self.authority is not None else shown[0])
         told = pair.inbox.robots["first"].position
-        position, speed = (x.copy() for x in pair.first.physics.rigid.read("first")[:2])
-        copy = pair.second.physics.rigid.read("first")[0].copy()
+        position, speed = (x.copy() for x in pair.first.physics.rigid.joint_measurements("first")[:2])
+        copy = pair.second.physics.rigid.joint_measurements("first")[0].copy()
         force = [np.linalg.norm(_trace(client).rows().force[-1]) for client in pair.clients]
         bunch = np.stack([_trace(client).rows().displacement[-1] for client in pair.clients])
         joints = np.stack([position, told, copy])

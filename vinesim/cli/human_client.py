@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from vinesim.avatar.scripted_human import Walker
+    from vinesim.avatar.scripted_human import ScriptedHuman
 
 
 def run(
@@ -24,7 +24,7 @@ def run(
     status: str, **_: Any,
 ) -> int:  # fmt: skip
     """Walk, reach for a bunch, hold it and pull at it, let go; until told to stop. Then write report.json."""
-    from vinesim.avatar.scripted_human import Walker
+    from vinesim.avatar.scripted_human import ScriptedHuman
     from vinesim.cli.robot_client import SWITCH_INTERVAL, report_status, save_report, tick_until
     from vinesim.client.client import Client
     from vinesim.client.rate_loop import RateLoop
@@ -46,7 +46,7 @@ def run(
     validate_bunch(model, reach)
     name = name or f"human-{os.getpid()}"
     start = start_pose(plan, spawn)
-    walker = Walker(start, height)
+    walker = ScriptedHuman(start, height)
     stop = threading.Event()
     with contextlib.ExitStack() as stack:
         if connect is None:
@@ -84,7 +84,7 @@ def run(
     return 0
 
 
-def pull_repeatedly(walker: Walker, point: Callable[[], np.ndarray]) -> Iterator[None]:
+def pull_repeatedly(walker: ScriptedHuman, point: Callable[[], np.ndarray]) -> Iterator[None]:
     """Hold what is at a point, pull at it, let it go; for ever."""
     while True:
         yield from walker.reach("right", point)

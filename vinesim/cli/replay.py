@@ -110,7 +110,7 @@ def _look(
     while not (bus.ended or stop.is_set()):
         bus.play(spectator.physics.dt * speed)
         if place is None and spectator.physics.rigid.robots:
-            spectator.pose = follow_view(spectator.physics.rigid.base(min(spectator.physics.rigid.robots))[0])
+            spectator.pose = follow_view(spectator.physics.rigid.base_state(min(spectator.physics.rigid.robots))[0])
         spectator.tick()
     pictures.save(spectator)
     print(f"{pictures.count} pictures are in {out}/", file=sys.stderr)

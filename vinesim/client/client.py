@@ -21,7 +21,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.humans import Person, RemotePerson
+from vinesim.client.humans import LocalHuman, RemoteHuman
 from vinesim.client.recording.trace import Trace
 from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
 from vinesim.client.remote.spawner import RemoteSpawner
@@ -30,7 +30,7 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.exchange import Exchange, Inbox
 from vinesim.net.transport.bus import Bus
 from vinesim.physics.plants.wind import Wind
-from vinesim.physics.rigid.human_body import standing
+from vinesim.physics.rigid.human_body import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
@@ -76,13 +76,13 @@ class Client:
         ``executor`` prepares others who join, so that no tick has to; without one they are there at once.
         """
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, picking=self.picking)
+        self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking)
         if any(scene.wind.mean) or scene.wind.gusts > 0.0:
             wind = scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
         self.robots: dict[str, Robot] = {}
         """All robots that this client moves, by name; the first is :attr:`robot`."""
-        self.humans: dict[str, Person] = {}
+        self.humans: dict[str, LocalHuman] = {}
         """All people that this client moves, by name."""
         self.replicators: dict[str, Exchange] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
@@ -90,7 +90,7 @@ class Client:
         self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
         self._add_own_actor(description, pose, source, height, bus)
         self.replicator = self.replicators[name]
-        self.remote_actors: dict[str, RemoteRobot | RemotePerson] = {}
+        self.remote_actors: dict[str, RemoteRobot | RemoteHuman] = {}
         self.pre_step: list[Callable[[float], None]] = []
         """Called every tick with the simulation time, before the drives: what the robot is to do."""
         self.post_step: list[Callable[[Client], None]] = []
@@ -110,7 +110,7 @@ class Client:
     ) -> None:  # fmt: skip
         """Come into the world as what this client is to be."""
         if description is None:
-            spec = HumanSpec(self.name, label_index(self.name), standing(pose, height), height)
+            spec = HumanSpec(self.name, label_index(self.name), standing_pose(pose, height), height)
             self.add_human(spec, source, bus)
         else:
             self.robot = self.add_robot(description, self.name, pose, bus)
@@ -128,14 +128,14 @@ class Client:
         self._add_replicator(name, exchange)
         return robot
 
-    def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> Person:
+    def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> LocalHuman:
         """Move one more person as ``source`` says (see :class:`Person`; None: still); ``bus`` is opened in its name."""
         hello = Hello(
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
         exchange = Exchange(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
-        self.humans[spec.name] = person = Person(self.physics, spec, source or (lambda _: spec.pose))
+        self.humans[spec.name] = person = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
         self._add_replicator(spec.name, exchange)
         return person
 
@@ -188,7 +188,7 @@ class Client:
     def sense(self) -> None:
         """Note the watched bunch, and tell everybody who listens."""
         if self.trace is not None:
-            self.physics.refresh()
+            self.physics.update_kinematics()
             body = self.trace.body
             force = np.zeros(3)
             for contact in self.physics.contacts:
@@ -213,7 +213,7 @@ class Client:
             settled = exchange.send(
                 now, pose, touched=touched, moving=moving, read=things.read_state,
                 grabbed=things.with_trees(parted), parted=parted, cut=things.cut_roots, changed=things.is_changed,
-                lies=self.physics.riding.lies, pushed=actor.pushed(self.remote_actors) if isinstance(actor, Person) else None,
+                lies=self.physics.support_tracker.pose_on_support, pushed=actor.pushed(self.remote_actors) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too
@@ -230,12 +230,12 @@ class Client:
             if riders:
                 self.replicators[name].send(
                     now, robot.update(now), read=self.objects.read_state, grabbed=riders, parted=riders,
-                    lies=self.physics.riding.lies,
+                    lies=self.physics.support_tracker.pose_on_support,
                 )  # fmt: skip
 
     def side_of(self, point: np.ndarray) -> str:
         """The arm that is on the same side as a point [3] in the world."""
-        base, _ = self.physics.rigid.base(self.name)
+        base, _ = self.physics.rigid.base_state(self.name)
         local = frames.rotate(frames.conjugate(base[3:]), point - base[:3])
         return "left" if local[1] >= 0.0 else "right"
 
@@ -249,7 +249,7 @@ class Client:
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
-        here = {name: self.physics.rigid.stands(name)[:2] for name in inboxes}
+        here = {name: self.physics.rigid.actor_position(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
         loose = {update.thing: update for update in inbox.things}
         nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
@@ -277,7 +277,7 @@ class Client:
     def _apply_remote_wrenches(self, name: str, pushes: dict[str, np.ndarray]) -> None:
         """Let a robot feel what other clients' people do to it."""
         try:
-            self.physics.rigid.bear(name, pushes)
+            self.physics.rigid.set_remote_wrenches(name, pushes)
         except RobotError as error:
             log.debug("a push on nothing: %s", error)
 
@@ -318,8 +318,8 @@ class InterestAudit:
         """Judge one tick by where the others' copies stand."""
         sent = sum(exchange.counters.environment.bytes_out for exchange in client.replicators.values())
         rigid = client.physics.rigid
-        here = [rigid.stands(name)[:2] for name in client.replicators]
-        there = [rigid.stands(name)[:2] for name in client.remote_actors]
+        here = [rigid.actor_position(name)[:2] for name in client.replicators]
+        there = [rigid.actor_position(name)[:2] for name in client.remote_actors]
         distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
         if distance > client.replicator.near + self.MARGIN:
             self.bytes += sent - self._seen

@@ -10,14 +10,14 @@ import numpy as np
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.rigid.human_body import JUMP, LINGER, SIDES
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.scene.values import POINT_NAMES, HumanPose, HumanSpec, HumanUpdate
 
 _HEAD, _HANDS = POINT_NAMES.index("head"), [POINT_NAMES.index(side) for side in SIDES]
 
 
-class Person:
+class LocalHuman:
     """A person whom this client moves: somebody tells every tick where the tracked points are."""
 
     def __init__(self, physics: Physics, spec: HumanSpec, source: Callable[[float], HumanPose]) -> None:
@@ -37,12 +37,12 @@ class Person:
 
     def update(self, now: float) -> HumanUpdate:
         """What other clients are told: where everything is, hands that are held back included, and how fast."""
-        self._given, giving = self.physics.rigid.pushed_by(self.name)
+        self._given, giving = self.physics.rigid.hand_wrenches(self.name)
         points, before = self.pose.points, self._told
         for i, side in enumerate(SIDES):
             hand = self.physics.hand(self.name, side)
             was = self._free[i] < LINGER
-            self._free[i] = 0 if giving[i] or hand.holds is not None else self._free[i] + 1
+            self._free[i] = 0 if giving[i] or hand.held is not None else self._free[i] + 1
             if self._free[i] < LINGER:
                 points[_HANDS[i]] = hand.pose
             if was != (self._free[i] < LINGER):
@@ -62,10 +62,10 @@ class Person:
         return {robot: links for robot, links in self._given.items() if robot in robots}
 
 
-class RemotePerson:
+class RemoteHuman:
     """The copy of a person whom another client moves: bit for bit where that client says; the hands push what lies."""
 
-    def __init__(self, rigid: Rigid, name: str) -> None:
+    def __init__(self, rigid: RigidWorld, name: str) -> None:
         """``name`` is here already; see :func:`spec_of`."""
         self.rigid, self.name = rigid, name
 

@@ -109,7 +109,7 @@ class PictureWriter:
             self._draw(client)
 
     def _draw(self, spectator: Spectator) -> None:
-        view = spectator.physics.view()
+        view = spectator.physics.snapshot()
         self._primitives.update(view, np.flatnonzero(self._moved))
         self._moved[:] = False
         ahead = frames.rotate(spectator.pose[3:], np.array([1.0, 0.0, 0.0]))

@@ -15,19 +15,29 @@ from vinesim.physics.plants.fault_guard import FaultGuard
 from vinesim.physics.plants.level_of_detail import LevelOfDetail
 from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.physics.plants.wind import Wind
-from vinesim.physics.rigid.dormant_bunches import Lying
-from vinesim.physics.rigid.hand_grasp import Holding
-from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.physics.rigid.support_tracking import Riding
+from vinesim.physics.rigid.dormant_bunches import DormantBunches
+from vinesim.physics.rigid.hand_grasp import GraspManager
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.physics.rigid.support_tracking import SupportTracker
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import Contact, HandSample, Haptic, HumanPose, HumanSpec, Link, Parting, RobotSpec, View
+from vinesim.scene.values import (
+    Contact,
+    HandSample,
+    Haptic,
+    HumanPose,
+    HumanSpec,
+    Parting,
+    RigidVisual,
+    RobotSpec,
+    Snapshot,
+)
 
 
 class Physics:
     """A vineyard that moves: plants, rigid bodies, and what passes between them.
 
-    One thread owns it. What others may read leaves it as :class:`View` and other frozen values.
+    One thread owns it. What others may read leaves it as :class:`Snapshot` and other frozen values.
     """
 
     def __init__(
@@ -37,9 +47,9 @@ class Physics:
         parameters: PhysicsParameters = PhysicsParameters(),
         device: str = "cpu",
         threads: int = 1,
-        picking: bool = True,
+        detachment: bool = True,
     ) -> None:
-        """``device``, ``threads``: see :class:`ArticulationSolver`; ``picking``: whether bunches detach when pulled too hard."""
+        """``device``, ``threads``: see :class:`ArticulationSolver`; ``detachment``: whether bunches detach when pulled too hard."""
         p = parameters
         self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
@@ -47,45 +57,45 @@ class Physics:
             model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, fast_rate=p.fast_joint_rate,
             max_rate=p.max_joint_rate, fault_rate=p.fault_joint_rate,
         )  # fmt: skip
-        self.rigid = Rigid(model, parameters=p)
+        self.rigid = RigidWorld(model, parameters=p)
         self.contact_solver = ContactSolver(
             model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
         )
-        self.parting = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
-        self.holding = Holding(self.plants, self.rigid, self.contact_solver)
-        self.riding = Riding(self.rigid)
-        self.lying = Lying(self.plants, self.rigid, self.contact_solver, self.riding)
-        self._links: tuple[tuple[Link, ...], tuple[Link, ...], tuple[Link, ...]] = ((), (), ())
-        self._picking = picking
-        self.detail = LevelOfDetail(
+        self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
+        self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
+        self.support_tracker = SupportTracker(self.rigid)
+        self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
+        self._visuals: tuple[tuple[RigidVisual, ...], tuple[RigidVisual, ...], tuple[RigidVisual, ...]] = ((), (), ())
+        self._detachment = detachment
+        self.level_of_detail = LevelOfDetail(
             self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
             patience=p.steps(p.detail_rest_duration),
         )  # fmt: skip
-        self.sleep = SleepMonitor(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
-        self.guard = FaultGuard(self.plants)
+        self.sleep_monitor = SleepMonitor(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
+        self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
-        self.partings: tuple[Parting, ...] = ()
+        self.detachments: tuple[Parting, ...] = ()
         """What left its plant in the last tick, or by command before it; sorted by body."""
-        self.stirred = np.zeros(0, np.int32)
+        self.remotely_posed = np.zeros(0, np.int32)
         """Trees that have moved without being awake [k], because others said so since the last tick."""
         self.tick = 0
         self._body_q: np.ndarray | None = None
         self._fresh = True
         self.stages: tuple[tuple[str, Callable[[], None]], ...] = (
-            ("wind: blow on what somebody may see", self._blow),
-            ("holding: close and open hands, pull at plants", self.holding.begin),
-            ("rigid: predict without plants", self.rigid.prep),
-            ("contacts: wake the trees that moving bodies are near to", self.contact_solver.wake_near_trees),
-            ("detail: berries move where somebody is near", self._refine),
-            ("plants: predict without contacts", self.plants.predict),
-            ("contacts: solve those of plants and rigid bodies", self.contact_solver.solve),
-            ("plants: move, pushed by them", self._commit),
-            ("rigid: move, pushed by them", self._finish),
-            ("guard: stop what went wrong", self._guard),
-            ("parting: let go what was pulled, bent or cut off", self._part),
-            ("holding: hands go with what they hold, and feel it", self._hold),
-            ("sleep: rest what nobody touches or reaches", self._sleep),
+            ("wind: set the air velocity at trees near actors", self._blow),
+            ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
+            ("rigid: predict velocities without plant contacts", self.rigid.predict),
+            ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
+            ("detail: refine bunches near actors", self._refine),
+            ("plants: predict velocities without contacts", self.plants.predict),
+            ("contacts: solve for plants and rigid bodies together", self.contact_solver.solve),
+            ("plants: integrate with contact wrenches", self._commit),
+            ("rigid: integrate with contact forces", self._finish),
+            ("faults: stop trees with invalid rates", self._guard),
+            ("detachment: detach what broke or was cut", self._part),
+            ("grasps: move hands with what they hold, measure forces", self._hold),
+            ("sleep: put quiet trees to sleep", self._sleep),
         )
 
     def step(self) -> None:
@@ -104,22 +114,22 @@ class Physics:
     @property
     def contacts(self) -> tuple[Contact, ...]:
         """Who pressed on which plant in the last tick, sorted by (tree, body, shape, geom); then who held one."""
-        return self.contact_solver.contacts + self.holding.contacts
+        return self.contact_solver.contacts + self.grasp_manager.contacts
 
     @property
     def touched(self) -> tuple[tuple[int, str], ...]:
         """(tree, actor) for every tree pressed on or held in the last tick, sorted."""
-        if not self.holding.contacts:
+        if not self.grasp_manager.contacts:
             return self.contact_solver.touched_trees
-        held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.holding.contacts)
+        held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.grasp_manager.contacts)
         return tuple(sorted({*self.contact_solver.touched_trees, *held}))
 
     @property
     def haptics(self) -> tuple[Haptic, ...]:
         """What the controllers of people are to vibrate with after the last tick."""
-        return self.holding.haptics
+        return self.grasp_manager.haptics
 
-    def refresh(self) -> None:
+    def update_kinematics(self) -> None:
         """Bring ``state.body_q`` from the start of the last tick to its end."""
         if not self._fresh:
             self.plants.forward_kinematics()
@@ -127,58 +137,58 @@ class Physics:
 
     def wake(self, trees: np.ndarray) -> None:
         """Wake trees [k] whose joints were written from outside, between steps, and bring their poses up to date."""
-        self.sleep.wake(trees)
+        self.sleep_monitor.wake(trees)
         self.plants.forward_kinematics(trees)
         self._body_q = None
 
-    def view(self) -> View:
+    def snapshot(self) -> Snapshot:
         """The world after the last tick. While no tree is awake, views share one array of plant poses."""
         if self._body_q is None:
-            self.refresh()
+            self.update_kinematics()
             self._body_q = self.state.body_q.copy()
-        return View(
+        return Snapshot(
             time=self.time,
             tick=self.tick,
             body_q=self._body_q,
             bunch_attached=self.state.bunch_attached.copy(),
-            links=self.links(),
-            link_q=self.link_q(),
-            moved=np.union1d(self.plants.awake, self.stirred),
+            visuals=self.visuals(),
+            visual_q=self.visual_q(),
+            moved_trees=np.union1d(self.plants.awake, self.remotely_posed),
         )
 
-    def links(self) -> tuple[Link, ...]:
+    def visuals(self) -> tuple[RigidVisual, ...]:
         """All rigid bodies that can be seen, with a body or without; the same object until one comes or goes."""
-        rigid, lying = self.rigid.links(), self.lying.links()
-        if self._links[0] is not rigid or self._links[1] is not lying:
-            self._links = rigid, lying, rigid + lying
-        return self._links[2]
+        rigid, lying = self.rigid.visuals(), self.dormant_bunches.visuals()
+        if self._visuals[0] is not rigid or self._visuals[1] is not lying:
+            self._visuals = rigid, lying, rigid + lying
+        return self._visuals[2]
 
-    def link_q(self) -> np.ndarray:
-        """Poses [link, 7] of :meth:`links`."""
-        rigid = self.rigid.link_q()
-        return np.concatenate([rigid, self.lying.link_q()]) if len(self.lying) else rigid
+    def visual_q(self) -> np.ndarray:
+        """Poses [visual, 7] of :meth:`visuals`."""
+        rigid = self.rigid.visual_q()
+        return np.concatenate([rigid, self.dormant_bunches.visual_q()]) if len(self.dormant_bunches) else rigid
 
     # ------------------------------------------------------------------ who is here
 
     def add_robot(self, spec: RobotSpec) -> None:
-        """See :meth:`Rigid.add_robot`."""
+        """See :meth:`RigidWorld.add_robot`."""
         self.rigid.add_robot(spec)
 
     def remove_robot(self, name: str) -> None:
-        """See :meth:`Rigid.remove_robot`; its blades go with it."""
+        """See :meth:`RigidWorld.remove_robot`; its blades go with it."""
         self.rigid.remove_robot(name)
-        self.parting.blades = [blade for blade in self.parting.blades if blade.actor != name]
+        self.detachment_monitor.blades = [blade for blade in self.detachment_monitor.blades if blade.actor != name]
 
-    def add_human(self, spec: HumanSpec, *, copy: bool = False) -> None:
-        """See :meth:`Rigid.add_human`; a copy touches only trees of which its own client tells."""
-        self.rigid.add_human(spec, copy=copy)
-        if copy:
+    def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
+        """See :meth:`RigidWorld.add_human`; a remote one touches only trees whose state its own client sends."""
+        self.rigid.add_human(spec, is_remote=is_remote)
+        if is_remote:
             self.contact_solver.remote_actors.add(spec.name)
 
     def remove_human(self, name: str) -> None:
-        """See :meth:`Rigid.remove_human`; what the hands held is let go."""
+        """See :meth:`RigidWorld.remove_human`; what the hands held is let go."""
         self.rigid.remove_human(name)
-        self.holding.forget(name)
+        self.grasp_manager.remove_ties_of(name)
         self.contact_solver.remote_actors.discard(name)
 
     def move_human(self, name: str, pose: HumanPose) -> None:
@@ -187,62 +197,62 @@ class Physics:
 
     def hand(self, name: str, side: str) -> HandSample:
         """A person's ``"left"`` or ``"right"`` hand after the last tick."""
-        return self.rigid.hand(name, side)
+        return self.rigid.hand_sample(name, side)
 
     def pick(self, bunch: int) -> None:
         """Take a bunch off its vine, between ticks; see :meth:`DetachmentMonitor.pick`."""
-        self.parting.pick(bunch)
+        self.detachment_monitor.pick(bunch)
         self._body_q = None
 
     def cut(self, body: int) -> None:
         """Cut a piece of wood off its vine, between ticks; see :meth:`DetachmentMonitor.cut`."""
-        self.parting.cut(body)
+        self.detachment_monitor.cut(body)
         self._body_q = None
 
-    def told_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+    def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Another client has picked a bunch; see :meth:`DetachmentMonitor.apply_remote_pick`."""
-        self.parting.apply_remote_pick(bunch, pose, velocity)
+        self.detachment_monitor.apply_remote_pick(bunch, pose, velocity)
         self._body_q = None
 
-    def told_cut(self, body: int) -> None:
+    def apply_remote_cut(self, body: int) -> None:
         """Another client has cut a piece of wood off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
-        self.parting.apply_remote_cut(body)
+        self.detachment_monitor.apply_remote_cut(body)
         self._body_q = None
 
-    def told_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
+    def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
         """Others say in what shape trees rest ([body of the tree, 4] each): so they do here, and none wakes for it."""
         for tree, turned in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(turned, np.float32))
         self.plants.put_to_sleep(np.array(trees, np.int32))
         self.contact_solver.update_tree_bounds(np.array(trees, np.int32))
-        self.stirred = np.union1d(self.stirred, trees).astype(np.int32)
+        self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
         self._body_q = None
 
-    def watch(self, points: np.ndarray, radius: float) -> None:
+    def set_detail_focus(self, points: np.ndarray, radius: float) -> None:
         """Let berries move one cluster at a time wherever somebody looks closely; see :meth:`LevelOfDetail.set_focus`."""
-        self.detail.set_focus(points, radius)
+        self.level_of_detail.set_focus(points, radius)
 
-    def blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
+    def add_blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
         """Give a robot's link a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
 
         x runs along the blades, y from one to the other. :meth:`Blade.close` cuts what passes through the mouth.
         """
         self.rigid.link_pose(actor, link)  # says in words if there is no such link
         blade = Blade(actor, link, np.asarray(pose, float), np.asarray(half, float))
-        self.parting.blades.append(blade)
+        self.detachment_monitor.blades.append(blade)
         return blade
 
     # ------------------------------------------------------------------ stages that only hand over
 
     def _blow(self) -> None:
         if self.wind is not None:
-            actors = [self.rigid.stands(name) for name in self.rigid.actors]
+            actors = [self.rigid.actor_position(name) for name in self.rigid.actors]
             self.wind.update(
                 self.plants, self.time, (np.array(actors), self.parameters.wind_radius) if actors else None
             )
 
     def _refine(self) -> None:
-        self.detail.update(self.contact_solver.near_trees)
+        self.level_of_detail.update(self.contact_solver.near_trees)
 
     def _commit(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
@@ -250,24 +260,24 @@ class Physics:
             self._body_q, self._fresh = None, False
 
     def _finish(self) -> None:
-        self.rigid.finish(self.contact_solver.rigid_force)
+        self.rigid.integrate(self.contact_solver.rigid_force)
 
     def _guard(self) -> None:
-        self.guard.stop_faulty_trees()
+        self.fault_guard.stop_faulty_trees()
 
     def _part(self) -> None:
-        self.partings = self.parting.update(check_load=self._picking)
-        if self.partings:
+        self.detachments = self.detachment_monitor.update(check_load=self._detachment)
+        if self.detachments:
             self._body_q = None
 
     def _hold(self) -> None:
-        self.holding.end(self.partings)
-        self.parting.hand_contacts = self.holding.contacts
+        self.grasp_manager.end_step(self.detachments)
+        self.detachment_monitor.hand_contacts = self.grasp_manager.contacts
 
     def _sleep(self) -> None:
         if not self.parameters.sleep:
             return
-        held = self.holding.trees
-        self.sleep.update(
+        held = self.grasp_manager.held_trees
+        self.sleep_monitor.update(
             np.union1d(self.contact_solver.near_trees, held) if len(held) else self.contact_solver.near_trees
         )

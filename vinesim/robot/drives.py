@@ -24,7 +24,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.plants.detachment import Blade
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription, SensorMount
 from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, RobotSample, RobotUpdate, Wrench
@@ -51,7 +51,7 @@ class RobotInstance:
 
     def __init__(
         self,
-        rigid: Rigid,
+        rigid: RigidWorld,
         description: RobotDescription,
         name: str = "",
         index: int = 0,
@@ -80,8 +80,8 @@ class RobotInstance:
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """What the robot knows of itself at ``time`` [s]; of ``contacts`` it keeps its own."""
-        position, velocity, effort, contact = self.rigid.read(self.name)
-        base_q, base_qd = self.rigid.base(self.name)
+        position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
         return RobotSample(
             actor=self.name,
             joints=JointSample(time, self.description.joints, position, velocity, effort, contact),
@@ -133,7 +133,7 @@ class Robot(RobotInstance):
 
     def __init__(
         self,
-        rigid: Rigid,
+        rigid: RigidWorld,
         description: RobotDescription,
         name: str = "",
         index: int = 0,
@@ -165,7 +165,7 @@ class Robot(RobotInstance):
         self._cutters: dict[str, list[Blade]] = {}
         self._physics: Physics | None = None
         for mount in (*description.wrenches, *description.imus):
-            rigid.instrument(self.name, mount.frame)
+            rigid.add_link_sensor(self.name, mount.frame)
         self._links_beyond_sensor = {
             mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches
         }
@@ -175,7 +175,7 @@ class Robot(RobotInstance):
         """Give the robot the cutters of its description, to cut what grows in ``physics``."""
         self._physics = physics
         for cutter in self.description.cutters:
-            blade = physics.blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
+            blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
             self._cutters.setdefault(cutter.group, []).append(blade)
 
     def remove(self) -> None:
@@ -187,7 +187,7 @@ class Robot(RobotInstance):
 
     def stop(self) -> None:
         """Forget all commands and hold every joint and the base where they are."""
-        self.setpoint = self.rigid.read(self.name)[0].copy()
+        self.setpoint = self.rigid.joint_measurements(self.name)[0].copy()
         """[joint] what the servos are asked for [rad or m]"""
         self.interface = np.full(len(self.setpoint), CommandInterface.POSITION)
         """[joint] :class:`CommandInterface` by which each was commanded last"""
@@ -319,7 +319,7 @@ class Robot(RobotInstance):
     def _switch_interface(self, joints: np.ndarray, interface: CommandInterface) -> None:
         before = self.interface[joints] == CommandInterface.MOTOR_POSITION
         if before.any() or interface == CommandInterface.MOTOR_POSITION:  # from motors to links, or back
-            position, _, effort, _ = self.rigid.read(self.name)
+            position, _, effort, _ = self.rigid.joint_measurements(self.name)
             motor = position + effort / self.series_stiffness
             self.setpoint[joints] = np.where(
                 before == (interface == CommandInterface.MOTOR_POSITION),
@@ -346,7 +346,7 @@ class Robot(RobotInstance):
         """Hand set-points for the tick that starts at ``time`` [s] to the servos; call it before physics steps."""
         if self._gains_changed:
             self._prepare_interfaces()
-        position, velocity = self.rigid.state(self.name)
+        position, velocity = self.rigid.joint_state(self.name)
         rate = self._advance_setpoints(position, velocity)
         if self._gains_changed or self._gains_vary:
             braked, brake = self._speed_limiters(velocity)
@@ -355,7 +355,7 @@ class Robot(RobotInstance):
         self._velocity = velocity
         self.rigid.command(self.name, self.setpoint, rate)
         self._command_base_velocity(time)
-        self._odometry(self.rigid.base(self.name)[0])
+        self._odometry(self.rigid.base_state(self.name)[0])
 
     def _prepare_interfaces(self) -> None:
         """Prepare what changes only with the interfaces, gains and limits."""
@@ -385,7 +385,7 @@ class Robot(RobotInstance):
         wanted = (self._command - start) / dt
         wanted[self._velocity_joints] = self._command[self._velocity_joints]
         # Nor may it run ahead faster than the drive can follow: at its limit the servo would shoot past the speed.
-        gain = self._max_impulse / np.maximum(self.rigid.inertia(self.name), 1e-9)
+        gain = self._max_impulse / np.maximum(self.rigid.joint_inertia(self.name), 1e-9)
         slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.max_velocity)
         fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.max_velocity)
         rate = np.clip(wanted, slowest, fastest)
@@ -417,8 +417,8 @@ class Robot(RobotInstance):
         """Give the servos the gains and efforts that the interfaces ask for."""
         by_effort, by_motor = self._in_effort, self._in_motor_position
         damping = np.where(by_motor, self._series_damping, self._damping)
-        effort = np.where(by_motor, -self.rigid.weight(self.name), 0.0)
-        self.rigid.tune(
+        effort = np.where(by_motor, -self.rigid.gravity_effort(self.name), 0.0)
+        self.rigid.set_gains(
             self.name,
             np.where(by_effort, 0.0, self._active_stiffness),
             np.where(braked, brake, np.where(by_effort, 0.0, damping)),
@@ -434,7 +434,7 @@ class Robot(RobotInstance):
         goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
         change = self.rigid.dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
         self._base_velocity += np.clip(goal - self._base_velocity, -change, change)
-        self.rigid.drive_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
+        self.rigid.command_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """What the robot knows of itself at ``time`` [s], sensors and elastic elements included."""
@@ -453,7 +453,7 @@ class Robot(RobotInstance):
         )
 
     def _wrench(self, mount: SensorMount, time: float, contacts: Sequence[Contact]) -> Wrench:
-        wrench = self.rigid.wrench(self.name, mount.frame)
+        wrench = self.rigid.link_wrench(self.name, mount.frame)
         mine = [contact for contact in contacts if contact.link in self._links_beyond_sensor[mount.frame]]
         if mine:  # with plants, which the rigid world does not know
             pose = self.frame_pose(mount.frame)
@@ -466,14 +466,14 @@ class Robot(RobotInstance):
 
     def _imu(self, mount: SensorMount, time: float) -> Imu:
         turn = self.frame_pose(mount.frame)[3:]
-        spin = self.rigid.angular_velocity(self.name, mount.frame)
-        acceleration = self.rigid.acceleration(self.name, mount.frame)[3:]
+        spin = self.rigid.link_angular_velocity(self.name, mount.frame)
+        acceleration = self.rigid.link_acceleration(self.name, mount.frame)[3:]
         return Imu(time, mount.name, mount.frame, turn, spin, acceleration)
 
     def update(self, time: float) -> RobotUpdate:
         """What other clients are told: actual joints, never commands."""
-        position, velocity, _, _ = self.rigid.read(self.name)
-        base_q, base_qd = self.rigid.base(self.name)
+        position, velocity, _, _ = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)
 
 
@@ -500,13 +500,13 @@ class RemoteRobot(RobotInstance):
                 f"{self.name}: update has {update.position.size} joints, its description {count}; "
                 "load the same robot on both clients"
             )
-        here, _ = self.rigid.base(self.name)
+        here, _ = self.rigid.base_state(self.name)
         if np.linalg.norm(update.base_q[:3] - here[:3]) > self.TELEPORT_DISTANCE:
             self._teleport(update, here)
-        self.rigid.follow(self.name, update.base_q, update.base_qd, update.position, update.velocity)
+        self.rigid.follow_remote(self.name, update.base_q, update.base_qd, update.position, update.velocity)
 
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
         if abs(update.base_q[2] - here[2]) > 1e-3:  # a base rolls on its plane; another height is another world
             self.rigid.remove_robot(self.name)
             self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))
-        self.rigid.place(self.name, update.base_q, update.position)
+        self.rigid.place_robot(self.name, update.base_q, update.position)

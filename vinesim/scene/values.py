@@ -45,7 +45,7 @@ class Shape:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Link:
+class RigidVisual:
     """One rigid body as sensors see it: its name, what it is, and its shapes."""
 
     name: str
@@ -178,7 +178,7 @@ class HandSample:
     force: np.ndarray
     """[3] N with which the hand pushes or pulls the world in this tick, world axes."""
     touching: bool
-    holds: tuple[str, str] | None
+    held: tuple[str, str] | None
     """Actor and link of what it holds, named as in :class:`Contact`."""
 
 
@@ -198,7 +198,7 @@ class Haptic:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class View:
+class Snapshot:
     """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
 
     time: float
@@ -208,11 +208,11 @@ class View:
     """Plant bodies [body, 7] m, 1."""
     bunch_attached: np.ndarray
     """[bunch] bool"""
-    links: tuple[Link, ...]
+    visuals: tuple[RigidVisual, ...]
     """Rigid bodies; the same tuple object as long as no actor comes or goes."""
-    link_q: np.ndarray
+    visual_q: np.ndarray
     """Their poses [link, 7] m, 1."""
-    moved: np.ndarray
+    moved_trees: np.ndarray
     """Indices of the trees that are awake [k]: only these have moved since they fell asleep."""
 
 

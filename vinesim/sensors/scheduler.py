@@ -23,7 +23,7 @@ from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.sensing import lidar_echoes, stereo_depth
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, LidarScan, View
+from vinesim.scene.values import CameraFrame, LidarScan, Snapshot
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
@@ -95,7 +95,7 @@ class SensorScheduler:
         self._scans = {m.name: SpinningScan(m.sensor, m.rate) for m in sensors if isinstance(m.sensor, Lidar)}
         self._pending_poses: dict[str, list[tuple[float, np.ndarray]]] = {name: [] for name in self._scans}
         self._condition = threading.Condition()
-        self._latest: tuple[View, Mapping[str, np.ndarray]] | None = None
+        self._latest: tuple[Snapshot, Mapping[str, np.ndarray]] | None = None
         self._moved_trees: list[np.ndarray] = []
         self._stopping = False
         self._thread: threading.Thread | None = None
@@ -131,7 +131,7 @@ class SensorScheduler:
             if kind is None:  # a failure of the body comes first
                 raise
 
-    def submit(self, view: View, poses: Mapping[str, np.ndarray]) -> None:
+    def submit(self, view: Snapshot, poses: Mapping[str, np.ndarray]) -> None:
         """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
         self._raise()
         with self._condition:
@@ -140,8 +140,8 @@ class SensorScheduler:
                 self._pending_poses[name].append((view.time, poses[name]))
                 if len(self._pending_poses[name]) > _MAX_PENDING_POSES:
                     del self._pending_poses[name][: _MAX_PENDING_POSES // 2]
-            if len(view.moved):
-                self._moved_trees.append(view.moved)
+            if len(view.moved_trees):
+                self._moved_trees.append(view.moved_trees)
                 if len(self._moved_trees) > 256:
                     self._moved_trees = [np.unique(np.concatenate(self._moved_trees))]
             self._condition.notify()

@@ -16,15 +16,15 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.human_body import standing
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.human_body import standing_pose
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description import description
 from vinesim.scene import appearance
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.values import HumanSpec, View
+from vinesim.scene.values import HumanSpec, Snapshot
 from vinesim.sensors.scene.primitives import rest_snapshot
 
 HEAP_DENSITY = 330.0
@@ -89,14 +89,14 @@ class SceneComposer:
     crates: tuple[CratePlacement, ...] = ()
     """After those of the scene."""
 
-    def compose(self, model: Model) -> View:
+    def compose(self, model: Model) -> Snapshot:
         """The vineyard with all of it at rest; :class:`PlacementError` if two would stand in each other."""
         furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
             return self.populate(Physics(furnished))
-        rigid = Rigid(furnished)  # plants that nobody picks from need not be ready to move
+        rigid = RigidWorld(furnished)  # plants that nobody picks from need not be ready to move
         self._add_actors(rigid)
-        return rest_snapshot(model, rigid.links(), rigid.link_q())
+        return rest_snapshot(model, rigid.visuals(), rigid.visual_q())
 
     def with_crates(self, model: Model) -> Model:
         """The same vineyard with the crates after its own boxes."""
@@ -109,21 +109,21 @@ class SceneComposer:
             box_mass=np.append(model.box_mass, [CRATE_MASS] * count).astype(model.box_mass.dtype),
         )
 
-    def populate(self, physics: Physics) -> View:
+    def populate(self, physics: Physics) -> Snapshot:
         """In a world that is furnished: fill the crates, then let everybody in."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             fill_crate(physics, number, crate)
         self._add_actors(physics.rigid)
-        return physics.view()
+        return physics.snapshot()
 
-    def _add_actors(self, rigid: Rigid) -> None:
+    def _add_actors(self, rigid: RigidWorld) -> None:
         """Let robots and people in."""
         for index, one in enumerate(self.robots):
             pose = _ground_pose(one.x, one.y, one.yaw)
             rigid.add_robot(description.load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
             pose = appearance.apply_posture(
-                standing(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height
+                standing_pose(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height
             )
             rigid.add_human(HumanSpec(f"person_{index}", index, pose, one.height))
         _check_clearance(rigid)
@@ -206,17 +206,17 @@ def _top_height(physics: Physics, bunch: int) -> float:
     return float(_rachis_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 
-def _step_rigid(rigid: Rigid, ticks: int) -> None:
+def _step_rigid(rigid: RigidWorld, ticks: int) -> None:
     """Let loose things fall, without the plants."""
     for _ in range(ticks):
-        rigid.prep()
-        rigid.finish()
+        rigid.predict()
+        rigid.integrate()
 
 
-def _check_clearance(rigid: Rigid) -> None:
+def _check_clearance(rigid: RigidWorld) -> None:
     """:class:`PlacementError` if whoever has come stands in somebody or something."""
-    rigid.prep()
-    for names in rigid.overlaps():
+    rigid.predict()
+    for names in rigid.penetrations():
         one, other = sorted(names[:2], key=rigid.actors.__contains__, reverse=True)
         if names[2] > MAX_PENETRATION and one in rigid.actors:
             kind, _, number = other.partition("/")

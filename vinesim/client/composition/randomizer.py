@@ -22,7 +22,7 @@ from vinesim.physics.step import Physics
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import View
+from vinesim.scene.values import Snapshot
 
 ROBOT_NAMES = ("vinebot", "logistic")
 FOOTPRINT_RADIUS = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
@@ -51,7 +51,7 @@ class SceneRandomizer:
         """All that decides what happens, as JSON."""
         return {"share": self.share, "robots": list(ROBOT_NAMES)}
 
-    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
+    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
         """See :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
         if rng.uniform() >= self.share:
             return None
@@ -67,7 +67,7 @@ class SceneRandomizer:
             happens: dict[str, Any] = {"actors": stage.actor_records(model)}
             if rng.uniform() < WIND_SHARE:
                 happens["wind"] = _simulate_wind(physics, rng)
-            return physics.view(), middle, happens
+            return physics.snapshot(), middle, happens
         return None
 
 

@@ -42,8 +42,8 @@ class ObjectSync:
 
     def receive(self, inbox: Inbox) -> None:
         """Do what others say is so, every tick before the step."""
-        riding = self.physics.riding
-        self.physics.stirred = self.physics.stirred[:0]
+        riding = self.physics.support_tracker
+        self.physics.remotely_posed = self.physics.remotely_posed[:0]
         self._apply_records(inbox.facts)
         told = {update.thing: update for update in inbox.things}
         for update in inbox.things:
@@ -52,8 +52,8 @@ class ObjectSync:
         if told:
             blend = np.array([BLEND_PER_STEP if number in self._remote_updates else 1.0 for number in told])
             poses = np.array([update.pose for update in inbox.things])
-            riding.pull_all(list(told), poses, np.array([update.velocity for update in inbox.things]), blend)
-            riding.unsettle(list(told))
+            riding.blend_towards(list(told), poses, np.array([update.velocity for update in inbox.things]), blend)
+            riding.set_moving(list(told))
         self._remote_updates = told
         self._hold_resting_objects()
         self._activate_dormant_bunches()
@@ -67,25 +67,29 @@ class ObjectSync:
             elif self._apply_object_record(fact, holds):
                 lie.append(fact)
         if trees:
-            self.physics.told_rest([update.tree for update in trees], [update.joint_q for update in trees])
+            self.physics.apply_remote_rest([update.tree for update in trees], [update.joint_q for update in trees])
         if lie:
             bunches = [unthing(fact.thing)[1] for fact in lie]
             self._changed_trees.update(self._tree_of(bunch) for bunch in bunches)
-            self.physics.lying.lay(bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie]))
+            self.physics.dormant_bunches.add(
+                bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie])
+            )
 
     def _apply_object_record(self, fact: Fact, holds: bool) -> bool:
         """Let a box or a bunch be where a fact says; True if it is a bunch that has no body here and needs none yet."""
         number = fact.thing
         kind, bunch = unthing(number)
-        bodiless = kind == Kind.BUNCH and number not in self.physics.riding
-        if not (holds or (bodiless and bunch not in self.physics.lying)):
+        bodiless = kind == Kind.BUNCH and number not in self.physics.support_tracker
+        if not (holds or (bodiless and bunch not in self.physics.dormant_bunches)):
             return False
         self._remote_updates.pop(number, None)
         if fact.moving:
             self._clear_resting(number)
             pose = np.array(fact.pose)
-            self._ensure_body(number, *(self.physics.riding.where(fact.parent, pose) or (pose, np.zeros(6))))
-            self.physics.riding.unsettle([number])
+            self._ensure_body(
+                number, *(self.physics.support_tracker.to_world(fact.parent, pose) or (pose, np.zeros(6)))
+            )
+            self.physics.support_tracker.set_moving([number])
             return False
         self._set_resting(number, fact)
         if not bodiless:
@@ -106,40 +110,40 @@ class ObjectSync:
 
     def _activate_dormant_bunches(self) -> None:
         """Give bunches that lie near an actor their bodies, a few now and then."""
-        lying = self.physics.lying
+        lying = self.physics.dormant_bunches
         if len(lying) and self.physics.tick % ACTIVATION_PERIOD == 0:
             rigid = self.physics.rigid
-            actors = [rigid.base(name)[0][:3] for name in rigid.robots]
-            actors += [rigid.person(name).parts[0, :3] for name in rigid.people]
+            actors = [rigid.base_state(name)[0][:3] for name in rigid.robots]
+            actors += [rigid.human(name).part_poses[0, :3] for name in rigid.humans]
             bunches = lying.nearest(np.array(actors), ACTIVATION_BATCH)
-            lying.embody(bunches)
+            lying.activate(bunches)
             for bunch in bunches:
                 self._place_on_support([thing(Kind.BUNCH, bunch)])
 
     def apply_remote_cut(self, body: int) -> None:
         """Cut a body off because others have."""
-        self.physics.told_cut(body)
+        self.physics.apply_remote_cut(body)
         self._record_cut(body)
 
     def _ensure_body(self, number: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Of a bunch that hangs here still, or has no body: take it off, give it one."""
         kind, bunch = unthing(number)
-        if kind == Kind.BUNCH and bunch in self.physics.lying:
-            self.physics.lying.embody([bunch])
+        if kind == Kind.BUNCH and bunch in self.physics.dormant_bunches:
+            self.physics.dormant_bunches.activate([bunch])
         elif kind == Kind.BUNCH and self.physics.state.bunch_attached[bunch]:
-            self.physics.told_pick(bunch, pose, velocity)
+            self.physics.apply_remote_pick(bunch, pose, velocity)
             self._changed_trees.add(self._tree_of(bunch))
 
     def _hold_resting_objects(self) -> None:
         """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
-        moving = set(self.physics.riding.moving)
+        moving = set(self.physics.support_tracker.moving)
         pushed = {
             number
             for number in moving & self._resting.keys()
             if self._supporting_actor(number) not in self._local_actors
         }
         for name in self._local_actors if pushed else ():
-            pushed -= self.physics.riding.reached(name)
+            pushed -= self.physics.support_tracker.objects_moved_by(name)
         for number in sorted(pushed):
             self._place_on_support([number])
         for parent, riders in self._supported.items():
@@ -172,17 +176,17 @@ class ObjectSync:
 
     def _place_on_support(self, numbers: list[int]) -> None:
         """Put things of one parent where they lie, as far as they have bodies."""
-        riding = self.physics.riding
+        riding = self.physics.support_tracker
         numbers = [number for number in numbers if number in riding]
         if not numbers:
             return
         parent = self._resting[numbers[0]].parent
         relative = np.array([self._resting[number].pose for number in numbers])
-        there = riding.where(parent, relative)
+        there = riding.to_world(parent, relative)
         if there is not None:
-            riding.place_all(numbers, *there)
+            riding.set_states(numbers, *there)
             for number, pose in zip(numbers, relative, strict=True):
-                riding.settle(number, parent, pose)
+                riding.set_at_rest(number, parent, pose)
 
     def blend_tree(self, update: TreeUpdate, blend: float) -> None:
         """Move a tree towards what its owner says, and what was cut off it."""
@@ -200,8 +204,8 @@ class ObjectSync:
 
     def collect(self) -> None:
         """After the step: note what parted and what moves."""
-        self.physics.riding.update()
-        self._detachments = self.physics.partings
+        self.physics.support_tracker.update()
+        self._detachments = self.physics.detachments
         for parting in self._detachments:
             self._changed_trees.add(parting.tree)
             if parting.bunch < 0:
@@ -219,8 +223,10 @@ class ObjectSync:
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
         """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
-        riding = self.physics.riding
-        found = {number for number in riding.moving if self._supporting_actor(number) == name} | riding.reached(name)
+        riding = self.physics.support_tracker
+        found = {
+            number for number in riding.moving if self._supporting_actor(number) == name
+        } | riding.objects_moved_by(name)
         for number, actor in (*riding.touched, *self.physics.touched):
             other = thing_named(actor)
             if other in mine or (actor == name and is_tree(number)):
@@ -242,12 +248,12 @@ class ObjectSync:
     @property
     def moving(self) -> list[int]:
         """All that moves: trees that are not asleep, and what does not rest in its parent's frame."""
-        return [*self.physics.sleep.restless.tolist(), *self.physics.riding.moving]
+        return [*self.physics.sleep_monitor.restless.tolist(), *self.physics.support_tracker.moving]
 
     def read_state(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """State of a thing, as :meth:`Exchange.send` wants it."""
         if not is_tree(number):
-            return self.physics.riding.read(number)
+            return self.physics.support_tracker.object_state(number)
         here, state = self.physics.model.bodies_of(number), self.physics.state
         return state.joint_q[here], state.joint_qd[here]
 
@@ -273,7 +279,7 @@ class ObjectSync:
         """We have said that a thing of ours lies still: from now on it does, as for everybody else."""
         if fact is not None and not fact.moving and not is_tree(fact.thing):
             self._set_resting(fact.thing, fact)
-            self.physics.riding.settle(fact.thing, fact.parent, np.array(fact.pose))
+            self.physics.support_tracker.set_at_rest(fact.thing, fact.parent, np.array(fact.pose))
 
     # ------------------------------------------------------------------ inside
 

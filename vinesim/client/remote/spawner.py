@@ -8,9 +8,9 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from vinesim.client.humans import RemotePerson, spec_of
+from vinesim.client.humans import RemoteHuman, spec_of
 from vinesim.net.codec.messages import Hello, valid_name
-from vinesim.physics.rigid.rigid_world import Draft, Rigid
+from vinesim.physics.rigid.rigid_world import CompiledWorld, RigidWorld
 from vinesim.robot.description import description as descriptions
 from vinesim.robot.description.description import DescriptionError, RobotDescription
 from vinesim.robot.drives import RemoteRobot
@@ -18,7 +18,7 @@ from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
 
-Prepared = tuple[RobotDescription | None, Draft]
+Prepared = tuple[RobotDescription | None, CompiledWorld]
 """A robot's description, or None for a person, and the world with it."""
 
 
@@ -26,7 +26,7 @@ class RemoteSpawner:
     """Who is expected, and how far that is."""
 
     def __init__(
-        self, rigid: Rigid, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
+        self, rigid: RigidWorld, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
     ) -> None:
         """``own``: a description that needs not be read again, if any; without ``executor`` all is done at once."""
         self.rigid, self.own = rigid, own
@@ -46,7 +46,7 @@ class RemoteSpawner:
         self._expected.pop(name, None)
         self._coming.pop(name, None)
 
-    def spawn(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemotePerson | None:
+    def spawn(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemoteHuman | None:
         """The copy of whoever is expected, standing where ``update`` says; None as long as it is not ready.
 
         Who cannot be shown is named in the log and no more expected.
@@ -62,13 +62,13 @@ class RemoteSpawner:
             log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
             self.cancel(name)
             return None
-        if not self.rigid.admit(draft):
+        if not self.rigid.adopt(draft):
             return None  # somebody else came or went meanwhile: once more, from the next tick on
         self.cancel(name)
         if description is None or not isinstance(update, RobotUpdate):
-            return RemotePerson(self.rigid, name)
+            return RemoteHuman(self.rigid, name)
         other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, is_in_world=True)
-        self.rigid.place(name, update.base_q, update.position)
+        self.rigid.place_robot(name, update.base_q, update.position)
         return other
 
     def _start(self, work: Callable[[], Prepared]) -> concurrent.futures.Future[Prepared]:
@@ -83,11 +83,11 @@ class RemoteSpawner:
 
     def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
         if isinstance(update, HumanUpdate):
-            return None, self.rigid.prepare(spec_of(hello, update), copy=True)
+            return None, self.rigid.compile_with(spec_of(hello, update), is_remote=True)
         description = resolve_description(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
-        return description, self.rigid.prepare(description.to_spec(hello.name, hello.index, update.base_q))
+        return description, self.rigid.compile_with(description.to_spec(hello.name, hello.index, update.base_q))
 
 
 def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDescription:

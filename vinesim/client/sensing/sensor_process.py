@@ -110,20 +110,20 @@ class SensorProcess:
     def _every_tick(self, client: Client) -> None:
         self._listen()
         physics = client.physics
-        self._moved[physics.plants.awake] = self._moved[physics.stirred] = True
+        self._moved[physics.plants.awake] = self._moved[physics.remotely_posed] = True
         looks = self._figures["eyes"] and physics.tick % SNAPSHOT_PERIOD == 0
         truth = self._figures.get("truth", False) and physics.tick % 10 == 0
         trees = bodies = body_q = link_q = poses = links = None
         if looks or truth:
-            physics.refresh()
+            physics.update_kinematics()
             trees = np.flatnonzero(self._moved)
             bodies = physics.plants.bodies_of(trees)
             body_q = physics.state.body_q[bodies]
         if looks:
-            link_q = physics.link_q()
+            link_q = physics.visual_q()
             poses = {name: self.robot.frame_pose(frame) for name, frame in self._sensors.items()}
-            if physics.links() is not self._links:
-                links = physics.links()
+            if physics.visuals() is not self._links:
+                links = physics.visuals()
         letter = StepSnapshot(
             number=self._letters + 1, tick=physics.tick, time=physics.time,
             sample=self.robot.sample(physics.time, physics.contacts),
@@ -156,7 +156,7 @@ class SensorProcess:
     def _read(self, number: int, links_seen: bool) -> None:
         """A letter with a view was read: what moved until then, and rests since, needs no telling again."""
         if links_seen:
-            self._links = self.client.physics.links()
+            self._links = self.client.physics.visuals()
         told = [trees for n, trees in self._asked if n == number]
         self._asked = [(n, trees) for n, trees in self._asked if n > number]
         if told:

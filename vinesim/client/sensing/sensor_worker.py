@@ -23,7 +23,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, LidarScan, Link, RobotSample, View
+from vinesim.scene.values import CameraFrame, LidarScan, RigidVisual, RobotSample, Snapshot
 from vinesim.sensors.camera.sunlight import SunPath
 
 log = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ class StepSnapshot:
     body_q: np.ndarray | None
     trees: np.ndarray | None
     attached: np.ndarray
-    links: tuple[Link, ...] | None
+    links: tuple[RigidVisual, ...] | None
     link_q: np.ndarray | None
     poses: dict[str, np.ndarray] | None
     frame_score: float
@@ -99,7 +99,7 @@ class SensorWorker:
     def __init__(self, setup: SensorConfig, pipe: Connection, stack: contextlib.ExitStack) -> None:
         self.setup, self.pipe = setup, pipe
         self._state = State.at_rest(setup.model)
-        self._links: tuple[Link, ...] = ()
+        self._links: tuple[RigidVisual, ...] = ()
         self._kept: CameraFrame | None = None
         self._greatest = -1.0
         self._worth = 0.0
@@ -182,7 +182,7 @@ class SensorWorker:
             self._links = letter.links
         if letter.link_q is not None and len(letter.link_q) == len(self._links):
             self._state.bunch_attached[:] = np.unpackbits(letter.attached, count=len(self._bunch_names))
-            view = View(
+            view = Snapshot(
                 letter.time, letter.tick, self._state.body_q.copy(), self._state.bunch_attached.copy(), self._links,
                 letter.link_q, letter.trees,
             )  # fmt: skip

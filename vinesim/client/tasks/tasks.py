@@ -70,7 +70,7 @@ class DriveTo:
     def __call__(self, time: float) -> None:
         if self.is_done:
             return
-        base, _ = self.robot.rigid.base(self.robot.name)
+        base, _ = self.robot.rigid.base_state(self.robot.name)
         way = frames.rotate(frames.conjugate(base[3:]), np.append(self._place - base[:2], 0.0))
         distance = float(np.hypot(way[0], way[1]))
         if distance < self.POSITION_TOLERANCE or way[0] < 0.0:

@@ -19,7 +19,7 @@ from vinesim.kernels.contact import solver as kernels
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE, RigidGeoms
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene.model import Model
 from vinesim.scene.values import Contact
@@ -130,7 +130,7 @@ class ContactSolver:
         self,
         model: Model,
         plants: ArticulationSolver,
-        rigid: Rigid,
+        rigid: RigidWorld,
         *,
         capacity: int = 128,
         stiffness: float = CONTACT_STIFFNESS,
@@ -186,7 +186,7 @@ class ContactSolver:
             self._bound(fallen_asleep)
             self._bound_tree_blocks(np.unique(fallen_asleep // BLOCK))
         self._dof_held_before[:] = self._dof_held
-        np.subtract(self.rigid.data.qvel, self._dof_free, out=self._dof_held)
+        np.subtract(self.rigid.mj_data.qvel, self._dof_free, out=self._dof_held)
         self._dof_free[:] = self.rigid.velocity_free
         if self._standing_bound:
             self._bound_geoms(self._movable)
@@ -369,7 +369,7 @@ class ContactSolver:
     def _press(self) -> None:
         """Impulses of all contacts at once, and what they do to either side."""
         n, rows = self.count, 3 * self.count
-        self._group[:] = self.rigid.group
+        self._group[:] = self.rigid.islands
         self._indexing(1)
         touched, islands = int(self._tally[kernels.BODIES]), int(self._tally[kernels.ISLANDS])
         self.bodies = bodies = self._bodies[:touched].copy()
@@ -379,10 +379,10 @@ class ContactSolver:
         self._coupling(n)
 
         self._y[:touched, :, :touched] = self.plants.impulse_response(bodies)
-        bound = self._tally[kernels.BOUND] = self.rigid.bound(self._geoms.body[self._other[:n].clip(0)])
+        bound = self._tally[kernels.BOUND] = self.rigid.is_constrained(self._geoms.body[self._other[:n].clip(0)])
         self._answering(rows)
         if bound:
-            rigid_answer[:] = self.rigid.inverse(rigid_rows).T
+            rigid_answer[:] = self.rigid.impulse_response(rigid_rows).T
         self._assembling(rows)
         self._relaxing(islands)
         self.sweeps = int(self._sweeps[:islands].max())
@@ -461,7 +461,7 @@ class ContactSolver:
     def _renew(self) -> None:
         """Take over the rigid world after an actor came or went; contacts remember by the names of the geoms."""
         old = None if self._geoms is None else self._names
-        move, stand, d = self.rigid.geoms, self.rigid.standing, self.rigid.data
+        move, stand, d = self.rigid.geoms, self.rigid.static_geoms, self.rigid.mj_data
         both = {f.name: (getattr(move, f.name), getattr(stand, f.name)) for f in dataclasses.fields(move)}
         g = self._geoms = RigidGeoms(
             **{k: a + b if isinstance(a, tuple) else np.concatenate([a, b]) for k, (a, b) in both.items()}
@@ -481,7 +481,7 @@ class ContactSolver:
         self._geom_middle, self._geom_velocity = np.zeros((count, 3)), np.zeros((count, 3))
         self._geom_spin, self._geom_speed = np.zeros((count, 3)), np.zeros(count)
         self._geom_low, self._geom_high = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-        self._rigid_rows, self._rigid_answer = (np.zeros((3 * self.capacity, self.rigid.world.nv)) for _ in range(2))
+        self._rigid_rows, self._rigid_answer = (np.zeros((3 * self.capacity, self.rigid.mj_model.nv)) for _ in range(2))
         at = {name: i for i, name in enumerate(self._dof_names)}
         self._dof_names = self.rigid.dof_names
         same = np.array([at.get(name, -1) for name in self._dof_names], int)
@@ -491,10 +491,10 @@ class ContactSolver:
         self._dof_free[same >= 0] = free[same[same >= 0]]
         self._dof_held[same >= 0] = held[same[same >= 0]]
         self._dof_held_before[same >= 0] = held_before[same[same >= 0]]
-        self._group = np.zeros(self.rigid.world.ntree, np.int32)
-        self._dof_parent = self.rigid.world.dof_parentid
+        self._group = np.zeros(self.rigid.mj_model.ntree, np.int32)
+        self._dof_parent = self.rigid.mj_model.dof_parentid
         self._mujoco = {"xpos": d.geom_xpos, "xmat": d.geom_xmat, "cvel": d.cvel, "cdof": d.cdof, "com": d.subtree_com}
-        m = self.rigid.world
+        m = self.rigid.mj_model
         self._mujoco["sparse"] = (
             m.dof_treeid, m.tree_dofadr, m.tree_dofnum, m.M_rowadr, m.M_rownnz, m.M_colind
         )  # fmt: skip

@@ -14,8 +14,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.free_bunch import Loose
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.free_bunch import FreeBunch
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Contact, Parting
 
@@ -45,7 +45,7 @@ class Blade:
 class DetachmentMonitor:
     """Watches the peduncles of awake trees and the blades that close, and takes off what parts."""
 
-    def __init__(self, plants: ArticulationSolver, rigid: Rigid, contact_solver: ContactSolver) -> None:
+    def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver) -> None:
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
@@ -177,7 +177,7 @@ class DetachmentMonitor:
         start, end = (
             local[:, :3] + frames.rotate(local[:, 3:], at[of].astype(float)) for at in (shapes.start, shapes.end)
         )
-        loose = Loose(
+        loose = FreeBunch(
             mass=float(plants.body_mass[body]), com=plants.body_com[body].astype(float),
             inertia=plants.body_inertia[body].astype(float), product=plants.body_product[body].astype(float),
             start=start, end=end, radius=shapes.radius[of].astype(float),

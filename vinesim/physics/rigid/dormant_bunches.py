@@ -12,25 +12,27 @@ from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.detachment import STUB_MASS
-from vinesim.physics.rigid.free_bunch import Loose
-from vinesim.physics.rigid.rigid_world import Rigid
-from vinesim.physics.rigid.support_tracking import Riding
+from vinesim.physics.rigid.free_bunch import FreeBunch
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.physics.rigid.support_tracking import SupportTracker
 from vinesim.scene.ids import Organ
-from vinesim.scene.values import Link
+from vinesim.scene.values import RigidVisual
 
 NEAR = 2.5
 """[m] A bunch gets its body when an actor is so near on the ground plan: seconds before an arm reaches it."""
 
 
-class Lying:
+class DormantBunches:
     """Picked bunches without bodies, each at a pose in the frame of its parent."""
 
-    def __init__(self, plants: ArticulationSolver, rigid: Rigid, contact_solver: ContactSolver, riding: Riding) -> None:
+    def __init__(
+        self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver, riding: SupportTracker
+    ) -> None:
         self.plants, self.rigid, self.contact_solver, self.riding = plants, rigid, contact_solver, riding
-        self._loose: dict[int, Loose] = {}
+        self._loose: dict[int, FreeBunch] = {}
         self._parent: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
-        self._links: tuple[Link, ...] | None = ()
+        self._links: tuple[RigidVisual, ...] | None = ()
         self._groups: list[tuple[str, np.ndarray, np.ndarray]] = []
         shapes = contact_solver.capsules
         fruit = np.flatnonzero((plants.model.body_organ[shapes.body] == int(Organ.BUNCH)) & (shapes.level != 2))
@@ -43,7 +45,7 @@ class Lying:
     def __len__(self) -> int:
         return len(self._loose)
 
-    def lay(self, bunches: list[int], parents: list[str], poses: np.ndarray) -> None:
+    def add(self, bunches: list[int], parents: list[str], poses: np.ndarray) -> None:
         """Take bunches off their vines at once, wherever those are, and let them lie: ``poses`` [k, 7] in the frames
         of their parents. What lies already is moved.
         """
@@ -58,7 +60,7 @@ class Lying:
             for bunch, mass, com, inertia, product in rows:
                 of = self._shape[self._first[bunch] : self._first[bunch + 1]]
                 start, end, radius = (column[of].astype(float) for column in (shapes.start, shapes.end, shapes.radius))
-                self._loose[bunch] = Loose(float(mass), com, inertia, product, start, end, radius)
+                self._loose[bunch] = FreeBunch(float(mass), com, inertia, product, start, end, radius)
             plants.state.bunch_attached[new] = False
             plants.body_drag[bodies] = 0.0
             for body in bodies.tolist():
@@ -67,7 +69,7 @@ class Lying:
             self._parent[bunch], self._relative[bunch] = parent, np.asarray(pose, float)
         self._links = None
 
-    def embody(self, bunches: list[int]) -> None:
+    def activate(self, bunches: list[int]) -> None:
         """Give some bunches their bodies, where they lie."""
         if bunches:
             there = {bunch: self._where(bunch) for bunch in bunches}
@@ -77,32 +79,32 @@ class Lying:
             self._links = None
 
     def _where(self, bunch: int) -> tuple[np.ndarray, np.ndarray]:
-        there = self.riding.where(self._parent[bunch], self._relative[bunch])
+        there = self.riding.to_world(self._parent[bunch], self._relative[bunch])
         return (self._relative[bunch], np.zeros(6)) if there is None else there
 
     def nearest(self, actors: np.ndarray, most: int) -> list[int]:
         """At most so many bunches, nearest to one of some actors [k, 3] m, that are near enough to want a body."""
         if not self._loose or not len(actors):
             return []
-        away = np.linalg.norm(self.link_q()[:, None, :2] - actors[None, :, :2], axis=-1).min(1)
-        links = self.links()
+        away = np.linalg.norm(self.visual_q()[:, None, :2] - actors[None, :, :2], axis=-1).min(1)
+        links = self.visuals()
         return [links[i].index for i in np.argsort(away, kind="stable")[:most].tolist() if away[i] < NEAR]
 
-    def links(self) -> tuple[Link, ...]:
+    def visuals(self) -> tuple[RigidVisual, ...]:
         """As :meth:`Rigid.links`."""
         if self._links is None:
             order = sorted(self._loose)
-            self._links = tuple(Link(f"bunch/{i}", Organ.BUNCH, i, self._loose[i].shapes) for i in order)
+            self._links = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._loose[i].shapes) for i in order)
             parents = np.array([self._parent[i] for i in order])
             poses = np.array([self._relative[i] for i in order]).reshape(-1, 7)
             here = [(str(parent), np.flatnonzero(parents == parent)) for parent in np.unique(parents)]
             self._groups = [(parent, rows, poses[rows]) for parent, rows in here]
         return self._links
 
-    def link_q(self) -> np.ndarray:
+    def visual_q(self) -> np.ndarray:
         """Poses [link, 7] of :meth:`links`."""
-        pose = np.zeros((len(self.links()), 7))
+        pose = np.zeros((len(self.visuals()), 7))
         for parent, rows, relative in self._groups:
-            frame = self.riding.frame(parent)
+            frame = self.riding.support_state(parent)
             pose[rows] = relative if frame is None else frames.compose(frame[0], relative)
         return pose

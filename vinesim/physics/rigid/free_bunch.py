@@ -9,14 +9,14 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.static_world import ALL, FRICTION, LOOSE, SOLE
+from vinesim.physics.rigid.static_world import ALL_BITS, CRATE_FLOOR, FREE_BUNCH, FRICTION
 from vinesim.scene.values import Shape
 
-WAITING = 12
+POOL_SIZE = 12
 """Free bodies that wait asleep for bunches to come. Every compilation makes so many; when all are taken, the next bunch
 has to wait for one, some ten milliseconds.
 """
-LUMPS = 12
+MAX_GEOMS = 12
 """Shapes that a waiting body has room for."""
 ROLLING = 0.004
 """[m] Arm of the rolling resistance of a bunch: GUESSED, half the distance between two berries that it lies on is 10 mm
@@ -42,7 +42,7 @@ _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Loose:
+class FreeBunch:
     """A bunch that hangs on no vine: its weight and its round shapes, in the frame that it had as a plant's body."""
 
     mass: float
@@ -70,22 +70,22 @@ class Loose:
         )  # fmt: skip
 
 
-def name_of(slot: int) -> str:
+def slot_name(slot: int) -> str:
     """What MuJoCo calls the body that waits in a slot, and its joint."""
     return f"loose/{slot}"
 
 
-def wait(spec: mujoco.MjSpec, slot: int) -> None:
+def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
     """A free body that waits for a bunch: asleep, touched by nothing, its numbers of no meaning yet."""
     body = spec.worldbody.add_body(
-        name=name_of(slot), pos=_place_of(slot)[:3], mass=0.5, ipos=[0.05, 0.0, 0.0], inertia=[1e-3, 1e-3, 1e-3],
+        name=slot_name(slot), pos=_place_of(slot)[:3], mass=0.5, ipos=[0.05, 0.0, 0.0], inertia=[1e-3, 1e-3, 1e-3],
         explicitinertial=True, sleep=mujoco.mjtSleepPolicy.mjSLEEP_INIT,
     )  # fmt: skip
-    body.add_freejoint(name=name_of(slot))
-    for _ in range(LUMPS):
+    body.add_freejoint(name=slot_name(slot))
+    for _ in range(MAX_GEOMS):
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0.05, 0.0, 0.0], mass=0.0, contype=LOOSE,
-            conaffinity=ALL & ~SOLE,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0.05, 0.0, 0.0], mass=0.0, contype=FREE_BUNCH,
+            conaffinity=ALL_BITS & ~CRATE_FLOOR,
         )  # fmt: skip  # MuJoCo makes no bounding volumes for what nothing touches: that comes after compiling
 
 
@@ -95,21 +95,21 @@ def _place_of(slot: int) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=256)  # every compilation asks anew
-def alone(loose: Loose) -> mujoco.MjModel:
+def compile_alone(loose: FreeBunch) -> mujoco.MjModel:
     """A bunch in a world of its own."""
     spec = mujoco.MjSpec()
-    drop(spec, loose)
+    add_free_bunch(spec, loose)
     return spec.compile()
 
 
-def drop(spec: mujoco.MjSpec, loose: Loose) -> None:
+def add_free_bunch(spec: mujoco.MjSpec, loose: FreeBunch) -> None:
     """A bunch as a free body of round shapes.
 
     Harder than MuJoCo's own ``solimp`` it would be held a few micrometres deep, and a hand that moves would lose touch
     for a tick: fingers that hold with 25 N then are 3 mm further, and the bunch falls.
     """
-    if not 0 < len(loose.radius) <= LUMPS:
-        raise ValueError(f"a bunch of {len(loose.radius)} shapes; a loose one has 1 to {LUMPS}")
+    if not 0 < len(loose.radius) <= MAX_GEOMS:
+        raise ValueError(f"a bunch of {len(loose.radius)} shapes; a loose one has 1 to {MAX_GEOMS}")
     yz, zx, xy = loose.product
     body = spec.worldbody.add_body(
         mass=loose.mass, ipos=loose.com, fullinertia=[*loose.inertia, xy, zx, yz], explicitinertial=True
@@ -120,27 +120,27 @@ def drop(spec: mujoco.MjSpec, loose: Loose) -> None:
         if (start != end).any():
             kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
         body.add_geom(
-            type=kind, size=[float(radius), 0, 0], mass=0.0, contype=LOOSE, conaffinity=ALL & ~SOLE, condim=6,
+            type=kind, size=[float(radius), 0, 0], mass=0.0, contype=FREE_BUNCH, conaffinity=ALL_BITS & ~CRATE_FLOOR, condim=6,
             friction=[FRICTION, 0.005, ROLLING], priority=1, solref=SOFT, solimp=[0.99, 0.999, 0.001, 0.5, 2],
             **place,
         )  # fmt: skip
-    for _ in range(LUMPS - len(loose.radius)):
+    for _ in range(MAX_GEOMS - len(loose.radius)):
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=loose.start[0], mass=0.0, contype=LOOSE,
-            conaffinity=ALL & ~SOLE,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=loose.start[0], mass=0.0, contype=FREE_BUNCH,
+            conaffinity=ALL_BITS & ~CRATE_FLOOR,
         )  # fmt: skip
 
 
-def embody(world: mujoco.MjModel, slot: int, bunch: Loose, derived: mujoco.MjModel) -> None:
+def activate(world: mujoco.MjModel, slot: int, bunch: FreeBunch, derived: mujoco.MjModel) -> None:
     """Give a waiting body the weight and shapes of a bunch, with all constants that MuJoCo derives from them.
 
     ``mj_setConst`` would derive some of them, but neither bounding volumes nor the bits by which whole bodies are
     sorted out; so they are copied from what was ``derived`` for the bunch :func:`alone`.
     """
-    body = world.body(name_of(slot)).id
+    body = world.body(slot_name(slot)).id
     for name in OF_BODY:
         getattr(world, name)[body] = getattr(derived, name)[1]
-    geoms = slice(world.body_geomadr[body], world.body_geomadr[body] + LUMPS)
+    geoms = slice(world.body_geomadr[body], world.body_geomadr[body] + MAX_GEOMS)
     for name in OF_GEOM:
         getattr(world, name)[geoms] = getattr(derived, name)
     spare = slice(geoms.start + len(bunch.radius), geoms.stop)
@@ -154,9 +154,9 @@ def embody(world: mujoco.MjModel, slot: int, bunch: Loose, derived: mujoco.MjMod
     world.bvh_nodeid[volumes] = np.where(derived.bvh_nodeid >= 0, derived.bvh_nodeid + geoms.start, -1)
 
 
-def untouch(world: mujoco.MjModel, slot: int) -> None:
+def disable_collision(world: mujoco.MjModel, slot: int) -> None:
     """Let nothing touch a waiting body."""
-    body = world.body(name_of(slot)).id
-    geoms = slice(world.body_geomadr[body], world.body_geomadr[body] + LUMPS)
+    body = world.body(slot_name(slot)).id
+    geoms = slice(world.body_geomadr[body], world.body_geomadr[body] + MAX_GEOMS)
     world.body_contype[body] = world.body_conaffinity[body] = 0
     world.geom_contype[geoms] = world.geom_conaffinity[geoms] = 0

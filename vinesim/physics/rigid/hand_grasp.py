@@ -14,8 +14,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.human_body import FINGERS, THICK, Hand, Person
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.human_body import FINGERS, THICK, HandBody, HumanBody
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import Contact, Haptic, Parting
 
 GRASP = 0.03
@@ -44,10 +44,10 @@ class _Grip:
     """Which bunch the body is, -1 if it is none."""
 
 
-class Holding:
+class GraspManager:
     """What the hands of all people hold, and what their controllers feel of it."""
 
-    def __init__(self, plants: ArticulationSolver, rigid: Rigid, contact_solver: ContactSolver) -> None:
+    def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver) -> None:
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the last tick, by person and hand."""
@@ -58,7 +58,7 @@ class Holding:
         self._known: dict[tuple[str, str], int] = {}
 
     @property
-    def trees(self) -> np.ndarray:
+    def held_trees(self) -> np.ndarray:
         """Trees that somebody holds, sorted [k]."""
         if not self._grips:
             return _NOBODY
@@ -66,79 +66,79 @@ class Holding:
 
     # ------------------------------------------------------------------ the tick
 
-    def begin(self) -> None:
+    def begin_step(self) -> None:
         """Before a tick: close and open hands, and pull at the plants that are held."""
         for person, hand in self._hands():
             key = person.spec.name, hand.side
-            if key in self._grips and not hand.rides:  # its person left and came back
+            if key in self._grips and not hand.on_plant:  # its person left and came back
                 self._drop(key)
             if not hand.closed:
                 self._waiting[key] = PATIENCE
-                if hand.holds is not None:
-                    self.let_go(*key)
-            elif hand.holds is None and self._waiting.get(key, PATIENCE) > 0:
+                if hand.held is not None:
+                    self.release(*key)
+            elif hand.held is None and self._waiting.get(key, PATIENCE) > 0:
                 self._waiting[key] = self._waiting.get(key, PATIENCE) - 1
                 self._close(person, hand)
             if key in self._grips:
                 self._pull(person, hand, self._grips[key])
         if self._grips:
-            self.plants.wake(self.trees)
+            self.plants.wake(self.held_trees)
 
-    def end(self, partings: tuple[Parting, ...]) -> None:
+    def end_step(self, partings: tuple[Parting, ...]) -> None:
         """After a tick: keep bunches that left their vines, put hands where what they hold is, tell what is felt."""
         gone = {parting.body: parting.bunch for parting in partings if parting.bunch >= 0}
         contacts, haptics = [], []
         if self._grips:
-            self.plants.forward_kinematics(self.trees)
+            self.plants.forward_kinematics(self.held_trees)
         for person, hand in self._hands():
             key = person.spec.name, hand.side
             if (grip := self._grips.get(key)) is not None:
                 if grip.body in gone:
                     self._drop(key)
-                    self.rigid.let_go(*key)
-                    self.rigid.hold(*key, f"bunch/{gone[grip.body]}", "bunch")
+                    self.rigid.release(*key)
+                    self.rigid.grasp(*key, f"bunch/{gone[grip.body]}", "bunch")
                 elif not self._torn(grip):
                     contacts.append(self._ride(person, hand, grip))
                 else:
-                    self.let_go(*key)
+                    self.release(*key)
             haptics += self._vibrate(person, hand)
         self.contacts, self.haptics = tuple(contacts), tuple(haptics)
 
-    def let_go(self, name: str, side: str) -> None:
+    def release(self, name: str, side: str) -> None:
         """Open a hand, whatever it holds."""
         self._drop((name, side))
-        self.rigid.let_go(name, side)
+        self.rigid.release(name, side)
 
-    def forget(self, name: str) -> None:
+    def remove_ties_of(self, name: str) -> None:
         """Take all ties off that a person who leaves holds."""
         for key in [key for key in self._grips if key[0] == name]:
             self._drop(key)
 
     # ------------------------------------------------------------------ inside
 
-    def _hands(self) -> list[tuple[Person, Hand]]:
-        people = (self.rigid.person(name) for name in self.rigid.people)
-        return [(person, hand) for person in people if not person.copy for hand in person.hands]
+    def _hands(self) -> list[tuple[HumanBody, HandBody]]:
+        people = (self.rigid.human(name) for name in self.rigid.humans)
+        return [(person, hand) for person in people if not person.is_remote for hand in person.hands]
 
-    def _close(self, person: Person, hand: Hand) -> None:
+    def _close(self, person: HumanBody, hand: HandBody) -> None:
         """Take what is nearest to the hand, if anything is near enough."""
         key = person.spec.name, hand.side
-        palm = self.rigid.hand(*key).pose
-        rigid = self.rigid.near_hand(*key, GRASP)
+        palm = self.rigid.hand_sample(*key).pose
+        rigid = self.rigid.nearest_to_hand(*key, GRASP)
         plant = self.contact_solver.nearest_body(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
         if plant is not None and (rigid is None or plant[0] - THICK < rigid[0]):
             body = plant[1]
             self.plants.wake(self.plants.model.body_tree[body])
             pose = self.plants.state.body_q[body].astype(float)
-            hand.grip = frames.compose(frames.inverse(pose), palm)
+            hand.grasp_pose = frames.compose(frames.inverse(pose), palm)
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
-            tie = self.plants.add_tie(body, hand.grip[:3], person.spec.stiffness, person.damping)
-            self._grips[key] = _Grip(body, tie, hand.grip[:3].copy(), next(iter(bunch.tolist()), -1))
-            self.rigid.ride(*key, body)
+            tie = self.plants.add_tie(body, hand.grasp_pose[:3], person.spec.stiffness, person.damping)
+            self._grips[key] = _Grip(body, tie, hand.grasp_pose[:3].copy(), next(iter(bunch.tolist()), -1))
+            self.rigid.grasp_plant(*key, body)
         elif rigid is not None:
-            self.rigid.hold(*key, *rigid[1:])
+            self.rigid.grasp(*key, *rigid[1:])
 
-    def _pull(self, person: Person, hand: Hand, grip: _Grip) -> None:
+    def _pull(self, person: HumanBody, hand: HandBody, grip: _Grip) -> None:
         """Set the far end of the spring: no further from the plant than the hand is strong."""
         spec, at = person.spec, self._point(grip)
         pull = person.controller(hand)[:3] + person.damping / spec.stiffness * person.speed(hand, self.rigid.dt) - at
@@ -149,15 +149,15 @@ class Holding:
         pose = self.plants.state.body_q[grip.body].astype(float)
         return pose[:3] + frames.rotate(pose[3:], grip.point)
 
-    def _ride(self, person: Person, hand: Hand, grip: _Grip) -> Contact:
+    def _ride(self, person: HumanBody, hand: HandBody, grip: _Grip) -> Contact:
         """Put a hand where the plant is that it holds, and say with what force it holds it."""
         plants = self.plants
         pose, motion = plants.state.body_q[grip.body].astype(float), plants.state.body_qd[grip.body].astype(float)
-        self.rigid.put_hand(person.spec.name, hand.side, frames.compose(pose, hand.grip))
+        self.rigid.place_hand(person.spec.name, hand.side, frames.compose(pose, hand.grasp_pose))
         at = self._point(grip)
         speed = motion[:3] + frames.cross(motion[3:], at - pose[:3])
         hand.force = plants.tie_stiffness[grip.tie] * (plants.tie_anchor[grip.tie] - at) - person.damping * speed
-        hand.free = 0
+        hand.steps_since_contact = 0
         return Contact(person.spec.name, hand.link, grip.body, at, -hand.force, 0.0)
 
     def _torn(self, grip: _Grip) -> bool:
@@ -169,11 +169,11 @@ class Holding:
         if grip is not None:
             self.plants.remove_tie(grip.body, grip.tie)
 
-    def _vibrate(self, person: Person, hand: Hand) -> list[Haptic]:
+    def _vibrate(self, person: HumanBody, hand: HandBody) -> list[Haptic]:
         """A pulse when a touch begins, then as strong as the force."""
         key = person.spec.name, hand.side
-        if hand.free > 0:
-            if hand.free >= PULSE:
+        if hand.steps_since_contact > 0:
+            if hand.steps_since_contact >= PULSE:
                 self._known.pop(key, None)
             return []
         since = self._known[key] = self._known.get(key, -1) + 1

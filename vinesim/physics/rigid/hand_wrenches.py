@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.human_body import Person
+from vinesim.physics.rigid.human_body import HumanBody
 
 
-def of_hands(
-    m: mujoco.MjModel, d: mujoco.MjData, person: Person, links: Mapping[int, tuple[str, str]]
+def hand_wrenches(
+    m: mujoco.MjModel, d: mujoco.MjData, person: HumanBody, links: Mapping[int, tuple[str, str]]
 ) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
     """Wrenches of the last tick by robot and link, and which hands gave one (left, right).
 

@@ -22,7 +22,7 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels import human_posture as kernels
 from vinesim.kernels.launch import bind_launch
-from vinesim.physics.rigid.static_world import ALL, GROUND, GUEST, ROUGH
+from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROUGH
 from vinesim.scene import appearance
 from vinesim.scene.appearance import PHALANGES
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
@@ -48,7 +48,7 @@ not in MuJoCo (a leg would run centimetres into what it kicks), and are so heavy
 """
 THICK = 0.012
 """[m] Half of a hand's thickness. A free hand that goes further in a tick looks first for what is in its way."""
-ROUSED = -1 - mujoco.mjMINAWAKE
+WAKE_COUNTER = -1 - mujoco.mjMINAWAKE
 """What MuJoCo counts up in ``tree_asleep`` of who has just been woken: so many ticks must pass before he may sleep."""
 HAND = 0.13
 """[m] From the middle of the palm to the tips of the fingers."""
@@ -61,11 +61,11 @@ FASTEST = 5.0
 SKIN = (0.85, 0.62, 0.5, 1.0)
 CLOTH = (0.98, 0.47, 0.16, 1.0)
 
-PARTS = (
+BODY_PARTS = (
     "head", "chest", "hips", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot",
 )  # fmt: skip
 """What of a person is kinematic, in the order of :func:`posture`."""
-LIMBS = (
+VISUAL_PARTS = (
     "neck", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm",
     *(f"{side}_{finger}_{k + 1}" for side in SIDES for finger in appearance.FINGERS for k in range(PHALANGES)),
 )  # fmt: skip
@@ -93,7 +93,7 @@ class HumanError(ValueError):
 # ---------------------------------------------------------------------- what of a body touches, and where it is
 
 
-def standing(root: np.ndarray, height: float = 1.75) -> HumanPose:
+def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
     """Somebody who stands on ``root`` [7] and holds the hands out in front of the hips, palms down."""
 
     def at(x: float, y: float, z: float) -> np.ndarray:
@@ -108,7 +108,7 @@ def standing(root: np.ndarray, height: float = 1.75) -> HumanPose:
 
 
 @functools.cache
-def figure(height: float) -> tuple[Shape, ...]:
+def body_shapes(height: float) -> tuple[Shape, ...]:
     """One shape for each of :data:`PARTS`, in its frame: x along a limb, origin where it begins."""
 
     def limb(share: float, radius: float) -> Shape:
@@ -150,8 +150,8 @@ class _Motion:
     """Kernels about one person, bound to their arrays."""
 
     def __init__(self, height: float) -> None:
-        points, poses = len(POINT_NAMES) - 3, len(PARTS) + 2 * len(SIDES)
-        self._tracked, self._parts = np.zeros((points, 7)), np.zeros((len(PARTS), 7))
+        points, poses = len(POINT_NAMES) - 3, len(BODY_PARTS) + 2 * len(SIDES)
+        self._tracked, self._parts = np.zeros((points, 7)), np.zeros((len(BODY_PARTS), 7))
         self._start, self._goal = np.zeros((poses, 7)), np.zeros((poses, 7))
         self._apart = np.zeros((3, poses, 3))
 
@@ -168,7 +168,7 @@ class _Motion:
         )
         looks = appearance.load_human_model(height)
         self._held, self._closed = np.zeros((4, 7)), np.zeros(2 * len(appearance.FINGERS))
-        self._limbs, limbs = np.zeros((len(LIMBS), 7)), looks.limbs
+        self._limbs, limbs = np.zeros((len(VISUAL_PARTS), 7)), looks.limbs
         bones = [np.ascontiguousarray(table) for table in (looks.root, looks.length, looks.bent)]
         self._hang = bind_launch(
             kernels.pose_arms_and_fingers,
@@ -206,21 +206,21 @@ class _Motion:
 
 
 @dataclasses.dataclass(eq=False)
-class Hand:
+class HandBody:
     """One hand: where it is wanted, what it holds, and where its numbers lie in MuJoCo's arrays."""
 
     side: str
     closed: bool = False
     busy: bool = False
     """Of a copy: it touches nothing, for at home it pushes a robot or holds something."""
-    free: int = LINGER
+    steps_since_contact: int = LINGER
     """[tick] since the last touch."""
     force: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
-    holds: tuple[str, str] | None = None
+    held: tuple[str, str] | None = None
     """Actor and link."""
-    grip: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(7))
+    grasp_pose: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(7))
     """[7] of the hand in what it holds."""
-    rides: bool = False
+    on_plant: bool = False
     """On a plant, to which it gives its force: see :mod:`vinesim.physics.rigid.hand_grasp`."""
     body: int = -1
     weld: int = -1
@@ -233,19 +233,19 @@ class Hand:
         return f"{self.side}_hand"
 
 
-class Person:
+class HumanBody:
     """One person in MuJoCo's world: two hands that are free bodies, and a kinematic body."""
 
-    def __init__(self, spec: HumanSpec, bit: int, *, copy: bool = False) -> None:
-        """``copy``: another client moves the person, and says what the hands hold and how they push robots."""
+    def __init__(self, spec: HumanSpec, bit: int, *, is_remote: bool = False) -> None:
+        """``is_remote``: another client moves the person, and says what the hands hold and how they push robots."""
         for name in ("height", "stiffness", "force"):
             value = getattr(spec, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise HumanError(f"human {spec.name!r}: {name} is {value}; give a number above 0")
-        self.spec, self.bit, self.copy = spec, bit, copy
+        self.spec, self.bit, self.is_remote = spec, bit, is_remote
         self.damping = 2.0 * math.sqrt(spec.stiffness * MASS)
         """[N s/m] of the hand against its controller: an empty hand comes back without swinging over."""
-        self.hands = tuple(Hand(side) for side in SIDES)
+        self.hands = tuple(HandBody(side) for side in SIDES)
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
         """MuJoCo's bodies of :data:`PARTS`."""
@@ -259,13 +259,13 @@ class Person:
         self._before = self._now
 
     @property
-    def parts(self) -> np.ndarray:
+    def part_poses(self) -> np.ndarray:
         """Poses [part, 7] of :data:`PARTS`."""
-        return self._now[: len(PARTS)]
+        return self._now[: len(BODY_PARTS)]
 
-    def controller(self, hand: Hand) -> np.ndarray:
+    def controller(self, hand: HandBody) -> np.ndarray:
         """Pose [7] that a hand is wanted at."""
-        return self._now[len(PARTS) + self.hands.index(hand)]
+        return self._now[len(BODY_PARTS) + self.hands.index(hand)]
 
     def move(self, pose: HumanPose) -> None:
         """Take over where the tracked points are: the body is there at once, the hands try to be."""
@@ -281,20 +281,20 @@ class Person:
         self._now = np.concatenate([self._motion.posture(pose), [pose.left, pose.right]])
         """Poses of :data:`PARTS`, then of both controllers."""
         for hand in self.hands:
-            hand.closed = bool(getattr(pose, f"{hand.side}_closed")) and not self.copy
-            hand.busy = bool(getattr(pose, f"{hand.side}_busy")) and self.copy
+            hand.closed = bool(getattr(pose, f"{hand.side}_closed")) and not self.is_remote
+            hand.busy = bool(getattr(pose, f"{hand.side}_busy")) and self.is_remote
 
     def limbs(self, hands: np.ndarray) -> np.ndarray:
         """Poses [limb, 7] of :data:`LIMBS`, with the hands [2, 7] where they are."""
-        chest, head = self.parts[PARTS.index("chest")], self.parts[PARTS.index("head")]
+        chest, head = self.part_poses[BODY_PARTS.index("chest")], self.part_poses[BODY_PARTS.index("head")]
         return self._motion.limbs(chest, head, hands, self._fingers)
 
-    def speed(self, hand: Hand, dt: float) -> np.ndarray:
+    def speed(self, hand: HandBody, dt: float) -> np.ndarray:
         """Velocity [3] of a controller in this tick, m/s."""
-        at = len(PARTS) + self.hands.index(hand)
+        at = len(BODY_PARTS) + self.hands.index(hand)
         return (self._now[at, :3] - self._before[at, :3]) / dt
 
-    def hand(self, side: str) -> Hand:
+    def hand(self, side: str) -> HandBody:
         """The left or the right hand."""
         if side not in SIDES:
             raise HumanError(f"human {self.spec.name!r} has no {side!r} hand; it has: {', '.join(SIDES)}")
@@ -305,9 +305,9 @@ class Person:
     def attach(self, spec: mujoco.MjSpec, robots: int) -> None:
         """Add the person's bodies; ``robots``: the bits of all robots."""
         name, me = self.spec.name, 1 << self.bit
-        meets = ALL & ~me & ~GUEST if self.copy else ALL & ~me
-        self._hand_bits = (GUEST, meets & ~robots) if self.copy else (me, meets)
-        for part, shape, pose in zip(PARTS, figure(self.spec.height), self.parts, strict=True):
+        meets = ALL_BITS & ~me & ~REMOTE_HAND if self.is_remote else ALL_BITS & ~me
+        self._hand_bits = (REMOTE_HAND, meets & ~robots) if self.is_remote else (me, meets)
+        for part, shape, pose in zip(BODY_PARTS, body_shapes(self.spec.height), self.part_poses, strict=True):
             body = spec.worldbody.add_body(
                 name=f"{name}/{part}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=HEAVY, ipos=np.zeros(3),
                 inertia=[HEAVY] * 3, explicitinertial=True, gravcomp=1.0, sleep=mujoco.mjtSleepPolicy.mjSLEEP_NEVER,
@@ -332,11 +332,11 @@ class Person:
     def locate(self, m: mujoco.MjModel) -> None:
         """Find the person's numbers in a world that was compiled anew."""
         name = self.spec.name
-        self.part_bodies = np.array([m.body(f"{name}/{part}").id for part in PARTS], int)
-        joints = [m.joint(f"{name}/{part}") for part in PARTS]
+        self.part_bodies = np.array([m.body(f"{name}/{part}").id for part in BODY_PARTS], int)
+        joints = [m.joint(f"{name}/{part}") for part in BODY_PARTS]
         self._part_q = np.array([j.qposadr[0] for j in joints])[:, None] + np.arange(7)
         self.part_dofs = np.array([j.dofadr[0] for j in joints])[:, None] + np.arange(6)
-        self.bodies = dict(zip(PARTS, self.part_bodies.tolist(), strict=True))
+        self.bodies = dict(zip(BODY_PARTS, self.part_bodies.tolist(), strict=True))
         for hand in self.hands:
             joint = m.joint(f"{name}/{hand.link}")
             hand.body = self.bodies[hand.link] = m.body(f"{name}/{hand.link}").id
@@ -352,8 +352,8 @@ class Person:
             self._appear(d)
         at = d.qpos[self._hand_q]
         at[:, 3:] = frames.from_wxyz(at[:, 3:])
-        parts, start = len(PARTS), self._before[: len(PARTS)]
-        held = np.array([[hand.free < LINGER] for hand in self.hands])
+        parts, start = len(BODY_PARTS), self._before[: len(BODY_PARTS)]
+        held = np.array([[hand.steps_since_contact < LINGER] for hand in self.hands])
         goal = np.where(held, self._now[parts:], self._before[parts:])
         way, turn, within = self._motion.apart((self._before, at), (self._now, goal))
         speed = way[:parts] / dt
@@ -364,9 +364,9 @@ class Person:
         steps, turns, offsets, angles = way[parts:-2], turn[parts:-2], way[-2:], turn[-2:]
         for hand, here, offset, angle, step, spin in zip(self.hands, at, offsets, angles, steps, turns, strict=True):
             velocity = d.qvel[hand.v]
-            if hand.rides:
+            if hand.on_plant:
                 velocity[:] = d.xfrc_applied[hand.body] = 0.0
-            elif hand.free < LINGER:
+            elif hand.steps_since_contact < LINGER:
                 turning = frames.rotate(here[3:], velocity[3:])
                 force = self.spec.stiffness * offset + self.damping * (step / dt - velocity[:3])
                 moment = TURN * angle + TURN_DAMPING * (spin / dt - turning)
@@ -382,13 +382,15 @@ class Person:
         """Be elsewhere all at once, hands too, but for those that hold something."""
         self._before = self._now
         for hand in self.hands:
-            if hand.holds is None:
+            if hand.held is None:
                 at = self.controller(hand)
                 d.qpos[hand.q] = np.concatenate([at[:3], frames.to_wxyz(at[3:])])
                 d.qvel[hand.v] = 0.0
-                hand.free = LINGER
+                hand.steps_since_contact = LINGER
 
-    def _look(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand, at: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def _look(
+        self, m: mujoco.MjModel, d: mujoco.MjData, hand: HandBody, at: np.ndarray, step: np.ndarray
+    ) -> np.ndarray:
         """A step [3] m of a fast free hand, shortened if something is in its way."""
         length = float(np.linalg.norm(step))
         if length < THICK or hand.busy:
@@ -406,54 +408,56 @@ class Person:
     def feel(self, d: mujoco.MjData) -> None:
         """After a tick: with what force the hands met the world, held it, or were held."""
         self._before = self._now
-        self._place(d, self.parts)
+        self._place(d, self.part_poses)
         for hand in self.hands:
-            if not hand.rides:
+            if not hand.on_plant:
                 felt = d.qfrc_constraint[hand.v] + d.qfrc_applied[hand.v]
                 hand.force = -felt[:3]
-                hand.free = 0 if hand.holds is not None or felt.any() else hand.free + 1
+                hand.steps_since_contact = 0 if hand.held is not None or felt.any() else hand.steps_since_contact + 1
 
     def _place(self, d: mujoco.MjData, parts: np.ndarray) -> None:
         d.qpos[self._part_q[:, :3]] = parts[:, :3]
         d.qpos[self._part_q[:, 3:]] = frames.to_wxyz(parts[:, 3:])
 
-    def sample(self, hand: Hand, d: mujoco.MjData) -> HandSample:
+    def sample(self, hand: HandBody, d: mujoco.MjData) -> HandSample:
         """What is known of a hand."""
         pose = np.concatenate([d.qpos[hand.q][:3], frames.from_wxyz(d.qpos[hand.q][3:])])
-        return HandSample(pose, self.controller(hand).copy(), hand.force.copy(), hand.free == 0, hand.holds)
+        return HandSample(
+            pose, self.controller(hand).copy(), hand.force.copy(), hand.steps_since_contact == 0, hand.held
+        )
 
     # ------------------------------------------------------------------ holding
 
-    def grasp(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand, body: int | None) -> None:
-        """Weld a hand to a MuJoCo body at ``hand.grip``; None: it only stops touching, and rides on a plant.
+    def grasp(self, m: mujoco.MjModel, d: mujoco.MjData, hand: HandBody, body: int | None) -> None:
+        """Weld a hand to a MuJoCo body at ``hand.grasp_pose``; None: it only stops touching, and rides on a plant.
 
         A hand that holds meets nothing: what it holds does.
         """
-        hand.rides, hand.free = body is None, 0
+        hand.on_plant, hand.steps_since_contact = body is None, 0
         d.eq_active[hand.weld] = body is not None
         if body is not None:
             m.eq_obj2id[hand.weld] = body
-            m.eq_data[hand.weld, :3], m.eq_data[hand.weld, 3:6] = hand.grip[:3], 0.0
-            m.eq_data[hand.weld, 6:10] = frames.to_wxyz(frames.conjugate(hand.grip[3:]))
+            m.eq_data[hand.weld, :3], m.eq_data[hand.weld, 3:6] = hand.grasp_pose[:3], 0.0
+            m.eq_data[hand.weld, 6:10] = frames.to_wxyz(frames.conjugate(hand.grasp_pose[3:]))
             m.eq_data[hand.weld, 10] = 1.0
-            rouse(m, d, body)
+            wake_body(m, d, body)
         self._touchable(m, hand, yes=False)
 
-    def release(self, m: mujoco.MjModel, d: mujoco.MjData, hand: Hand) -> None:
+    def release(self, m: mujoco.MjModel, d: mujoco.MjData, hand: HandBody) -> None:
         """Open a hand; it hangs on its spring a little longer and then returns to its controller."""
-        hand.holds, hand.rides, hand.free = None, False, 0
+        hand.held, hand.on_plant, hand.steps_since_contact = None, False, 0
         if d.eq_active[hand.weld]:
-            rouse(m, d, m.eq_obj2id[hand.weld])
+            wake_body(m, d, m.eq_obj2id[hand.weld])
         d.eq_active[hand.weld] = 0
         self._touchable(m, hand, yes=True)
 
     def excuse(self, m: mujoco.MjModel) -> None:
         """Let nothing touch the hands that are busy elsewhere."""
         for hand in self.hands:
-            if hand.holds is None:
+            if hand.held is None:
                 self._touchable(m, hand, yes=not hand.busy)
 
-    def _touchable(self, m: mujoco.MjModel, hand: Hand, *, yes: bool) -> None:
+    def _touchable(self, m: mujoco.MjModel, hand: HandBody, *, yes: bool) -> None:
         geoms = slice(m.body_geomadr[hand.body], m.body_geomadr[hand.body] + m.body_geomnum[hand.body])
         bit, meets = self._hand_bits if yes else (0, 0)
         m.geom_contype[geoms] = m.body_contype[hand.body] = bit
@@ -469,7 +473,7 @@ def _add(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int]) -> None:
     )  # fmt: skip
 
 
-def rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
+def wake_body(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
     """Wake a body: MuJoCo does when the two arrays that it keeps of sleep disagree.
 
     One that is awake but still, as what is held is, would fall asleep in the very tick in which it is let go.
@@ -478,7 +482,7 @@ def rouse(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
     if tree >= 0:
         d.tree_awake[tree] = 1
         if d.tree_asleep[tree] < 0:
-            d.tree_asleep[tree] = ROUSED
+            d.tree_asleep[tree] = WAKE_COUNTER
 
 
 def _far(a: np.ndarray, b: np.ndarray) -> bool:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from vinesim.physics.rigid.human_body import ROUSED
+from vinesim.physics.rigid.human_body import WAKE_COUNTER
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 _INIT, _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_INIT), int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
-OF_DOFS = (
+DOF_ARRAYS = (
     "qvel", "qacc", "qacc_smooth", "qacc_warmstart", "qfrc_smooth", "qfrc_applied", "qfrc_gravcomp",
     "qfrc_actuator",
 )  # fmt: skip
 """What MuJoCo keeps of every degree of freedom from one tick to the next."""
 
 
-def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+def compile_without_contacts(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compile without contacts: MuJoCo tries a step, in which all robots would stand on one another at the origin."""
     spec.option.disableflags |= _CONSTRAINT
     world = spec.compile()
@@ -25,20 +25,20 @@ def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return world
 
 
-def names(m: mujoco.MjModel, of: np.ndarray) -> list[str]:
+def object_names(m: mujoco.MjModel, of: np.ndarray) -> list[str]:
     """Names of all joints, bodies or the like, ``of`` being MuJoCo's ``name_jntadr``, ``name_bodyadr`` and so on."""
     text = m.names
     return [text[at : text.index(b"\0", at)].decode() for at in of.tolist()]
 
 
-def carried(
+def transfer_state(
     old: mujoco.MjModel, old_data: mujoco.MjData, old_contact: np.ndarray, new: mujoco.MjModel, parked: set[str]
 ) -> tuple[mujoco.MjData, np.ndarray]:
     """State and contact efforts [dof] of a new world: all joints, bodies and sleepers of the old, bit by bit.
 
     ``parked`` names joints that only seem to be the same ones.
     """
-    pairs = _pairs(names(new, new.name_jntadr), names(old, old.name_jntadr), parked)
+    pairs = _pairs(object_names(new, new.name_jntadr), object_names(old, old.name_jntadr), parked)
     to, source = np.array(pairs, int).reshape(-1, 2).T
     asleep = _sleepers(old, old_data, new, pairs)
     leaning = _leaning(old, old_data, source)
@@ -56,15 +56,15 @@ def carried(
     contact = np.zeros(new.nv)
     data.time = old_data.time
     data.qpos[to_q], contact[to_v] = old_data.qpos[from_q], old_contact[from_v]
-    for name in OF_DOFS:
+    for name in DOF_ARRAYS:
         getattr(data, name)[to_v] = getattr(old_data, name)[from_v]
     trees = set(zip(new.dof_treeid[to_v].tolist(), old.dof_treeid[from_v].tolist(), strict=True))
     for tree, was in sorted(trees):
         if tree in asleep:
             data.tree_asleep[tree] = asleep[tree]
         elif old_data.tree_asleep[was] < 0:
-            data.tree_asleep[tree] = ROUSED if was in leaning else old_data.tree_asleep[was]
-    bodies = _pairs(names(new, new.name_bodyadr), names(old, old.name_bodyadr), parked)
+            data.tree_asleep[tree] = WAKE_COUNTER if was in leaning else old_data.tree_asleep[was]
+    bodies = _pairs(object_names(new, new.name_bodyadr), object_names(old, old.name_bodyadr), parked)
     to, source = np.array(bodies, int).reshape(-1, 2).T
     data.xfrc_applied[to] = old_data.xfrc_applied[source]
     to, source = new.body_mocapid[to], old.body_mocapid[source]

@@ -14,7 +14,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.rigid import recompile
-from vinesim.physics.rigid.static_world import ALL, GROUND, GUEST, ROUGH
+from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROUGH
 from vinesim.physics.rigid.urdf import RobotError, check, shapes_of, touchable
 from vinesim.scene.values import RobotSpec
 
@@ -29,7 +29,7 @@ _PLANAR = ("x", "y", "yaw")
 
 
 @dataclasses.dataclass
-class Felt:
+class LinkSensor:
     """What a link felt in a tick, as MuJoCo tells it, with its places at the start of that tick."""
 
     inner: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
@@ -64,7 +64,7 @@ class RobotBody:
         try:
             self._parsed = _parsed(spec, 1 << bit)
         except ValueError as error:
-            raise unfit(spec, error) from error
+            raise build_error(spec, error) from error
         self.shapes = shapes_of(spec.urdf)
         self.stiffness = np.array([d.stiffness for d in spec.drives], float)
         self.damping = np.array([d.damping for d in spec.drives], float)
@@ -97,9 +97,9 @@ class RobotBody:
         """Where the drives' own inertias lie in MuJoCo's sparse mass matrix."""
         self.base_q = self.base_v = self.base_actuator = np.zeros(0, int)
         self.bodies: dict[str, int] = {}
-        self.felt: dict[str, Felt] = {}
+        self.link_sensors: dict[str, LinkSensor] = {}
         """What links with sensors felt in the last tick."""
-        self.afar: dict[str, np.ndarray] = {}
+        self.remote_wrenches: dict[str, np.ndarray] = {}
         """Wrenches [6] on links by people whom other clients move: see :meth:`Rigid.bear`."""
 
     # ------------------------------------------------------------------ in MuJoCo
@@ -132,7 +132,7 @@ class RobotBody:
         self.base_q = np.array([j.qposadr[0] for j in planar], int)
         self.base_v = np.array([j.dofadr[0] for j in planar], int)
         self.base_actuator = np.array([m.actuator(f"{name}:{axis}").id for axis in _PLANAR], int)
-        names = recompile.names(m, m.name_bodyadr)
+        names = recompile.object_names(m, m.name_bodyadr)
         self.bodies = {n.removeprefix(name + "/"): i for i, n in enumerate(names) if n.startswith(name + "/")}
         self._set_gains(m)
 
@@ -185,7 +185,7 @@ class RobotBody:
         self.base_velocity[:] = c * base_qd[0] + s * base_qd[1], c * base_qd[1] - s * base_qd[0], base_qd[5]
         self.give = FOLLOW_GIVE
 
-    def tune(
+    def set_gains(
         self,
         m: mujoco.MjModel,
         d: mujoco.MjData,
@@ -205,20 +205,20 @@ class RobotBody:
         self._set_gains(m)
         self.control[:] = given + self.stiffness * q + self.soon * v
 
-    def bear(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
+    def set_remote_wrenches(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
         """Feel other ``wrenches`` from afar than before; :class:`RobotError` if there is no such link."""
         if unknown := sorted(wrenches.keys() - self.bodies.keys()):
             raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, a link that it has not")
-        for link in self.afar.keys() - wrenches.keys():
+        for link in self.remote_wrenches.keys() - wrenches.keys():
             d.xfrc_applied[self.bodies[link]] = 0.0
         for link, wrench in wrenches.items():
             d.xfrc_applied[self.bodies[link]] = wrench
-        self.afar = wrenches
+        self.remote_wrenches = wrenches
 
     def effort_from_afar(self, m: mujoco.MjModel, d: mujoco.MjData) -> np.ndarray:
         """[dof] generalised force of the wrenches from afar."""
         total = np.zeros(m.nv)
-        for link, wrench in self.afar.items():
+        for link, wrench in self.remote_wrenches.items():
             body = self.bodies[link]
             mujoco.mj_applyFT(m, d, wrench[:3], wrench[3:], d.xipos[body], body, total)
         return total
@@ -228,7 +228,7 @@ class RobotBody:
     def _set_gains(self, m: mujoco.MjModel) -> None:
         """Turn gains and limits into MuJoCo's constants."""
         dt = m.opt.timestep
-        soon, late = split(self.stiffness, self.damping, m.dof_damping[self.v], m.dof_armature[self.v], dt)
+        soon, late = split_damping(self.stiffness, self.damping, m.dof_damping[self.v], m.dof_armature[self.v], dt)
         self.soon = np.where(self.exact, soon, self.damping)
         self.late = np.where(self.exact, late, 0.0)
         m.actuator_biasprm[self.actuator, 1] = -self.stiffness
@@ -250,7 +250,7 @@ def _parsed(given: RobotSpec, bit: int) -> mujoco.MjSpec:
     """A robot without base and servos, as its URDF says; its shapes carry the collision ``bit``."""
     child = mujoco.MjSpec.from_string(touchable(given.urdf, frozenset(drive.joint for drive in given.drives)))
     for geom in child.geoms:
-        geom.contype, geom.conaffinity = bit, ALL & ~bit & ~GROUND & ~GUEST
+        geom.contype, geom.conaffinity = bit, ALL_BITS & ~bit & ~GROUND & ~REMOTE_HAND
         geom.friction = ROUGH
     for body in child.bodies[1:]:
         body.gravcomp = 1.0
@@ -285,7 +285,7 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
     )  # fmt: skip
 
 
-def split(
+def split_damping(
     stiffness: np.ndarray, damping: np.ndarray, friction: np.ndarray, rotor: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """How a servo's damping is split so that the joint swings as asked: parts [joint] at the tick's end and start.
@@ -303,6 +303,6 @@ def split(
     return np.maximum(asked, needed) - late - friction - dt * stiffness, late
 
 
-def unfit(spec: RobotSpec, error: ValueError) -> RobotError:
+def build_error(spec: RobotSpec, error: ValueError) -> RobotError:
     """What MuJoCo says against a robot, in one line."""
     return RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {' '.join(str(error).split())}")

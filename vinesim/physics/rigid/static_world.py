@@ -17,7 +17,7 @@ ROUGH = [FRICTION, 0.005, 0.0001]
 """The same as MuJoCo wants it: sliding, and its own spinning and rolling, which count in contacts that ask for them."""
 CRATE_WALL = 0.012
 """Thickness of a picking box's bottom and walls [m]."""
-BED = 0.08
+CRATE_BED_DEPTH = 0.08
 """[m] How far down a crate's bottom goes on for bunches alone. One that falls a metre is four centimetres deeper
 after a tick: in the middle of a bottom as thin as it looks, it would be pushed out below.
 """
@@ -25,13 +25,13 @@ after a tick: in the middle of a bottom as thin as it looks, it would be pushed 
 # what stands, what lies about, and one bit for each actor, so that a robot never meets itself; loose bunches meet the
 # thick bed of a crate where all others meet its thin sole; hands of people whom other clients move are guests, whom
 # robots do not meet: with what force they push robots is their own clients' to say
-GROUND, FIXED, BOX, SOLE, LOOSE, GUEST = (1 << bit for bit in range(6))
+GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
 FIRST_ACTOR, LAST_ACTOR = 6, 30
 """Positions of the bits of robots and people."""
-ALL = (1 << (LAST_ACTOR + 1)) - 1
+ALL_BITS = (1 << (LAST_ACTOR + 1)) - 1
 
 
-def furnished(model: Model, parameters: PhysicsParameters) -> mujoco.MjSpec:
+def build_static_world(model: Model, parameters: PhysicsParameters) -> mujoco.MjSpec:
     """Ground, poles, trunks and boxes."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -48,7 +48,7 @@ def furnished(model: Model, parameters: PhysicsParameters) -> mujoco.MjSpec:
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=GROUND,
-        conaffinity=BOX | SOLE | LOOSE,
+        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH,
         friction=ROUGH,
     )  # fmt: skip
     thickness = model.fixed_radius.mean(1)
@@ -61,23 +61,23 @@ def furnished(model: Model, parameters: PhysicsParameters) -> mujoco.MjSpec:
     for box, pose in enumerate(model.box_pose.astype(float)):
         body = spec.worldbody.add_body(name=f"box/{box}", pos=pose[:3], quat=frames.to_wxyz(frames.normalize(pose[3:])))
         body.add_freejoint(name=f"box/{box}")
-        walls = crate(model.box_size[box])
+        walls = crate_shapes(model.box_size[box])
         volume = [float(np.prod(wall.size)) for wall in walls]
         for wall, share in zip(walls, volume, strict=True):
             sole = wall is walls[0]
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX, size=wall.size, pos=wall.pose[:3], friction=ROUGH,
-                mass=float(model.box_mass[box]) * share / sum(volume), contype=SOLE if sole else BOX,
-                conaffinity=ALL & ~LOOSE if sole else ALL,
+                mass=float(model.box_mass[box]) * share / sum(volume), contype=CRATE_FLOOR if sole else BOX,
+                conaffinity=ALL_BITS & ~FREE_BUNCH if sole else ALL_BITS,
             )  # fmt: skip
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=[*walls[0].size[:2], BED / 2], pos=[0.0, 0.0, CRATE_WALL - BED / 2],
-            friction=ROUGH, mass=0.0, contype=0, conaffinity=LOOSE,
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=[*walls[0].size[:2], CRATE_BED_DEPTH / 2], pos=[0.0, 0.0, CRATE_WALL - CRATE_BED_DEPTH / 2],
+            friction=ROUGH, mass=0.0, contype=0, conaffinity=FREE_BUNCH,
         )  # fmt: skip
     return spec
 
 
-def crate(size: np.ndarray) -> tuple[Shape, ...]:
+def crate_shapes(size: np.ndarray) -> tuple[Shape, ...]:
     """Bottom and four walls of an open box of outer ``size`` [3] m, origin in the middle of its underside."""
     length, width, height = (float(s) / 2 for s in size)
     t = CRATE_WALL / 2

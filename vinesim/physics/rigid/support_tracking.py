@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.human_body import rouse
-from vinesim.physics.rigid.rigid_world import Rigid
+from vinesim.physics.rigid.human_body import wake_body
+from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Kind, thing, thing_named
 
 STILL = 0.005, float(np.radians(1.0))
@@ -37,12 +37,12 @@ _STANDS, _BOX, _LINK, _BUNCH, _PERSON = range(5)
 _NONE = -1
 
 
-class Riding:
+class SupportTracker:
     """Boxes and loose bunches as the network sees them: poses, velocities, parents and rest."""
 
-    def __init__(self, rigid: Rigid) -> None:
+    def __init__(self, rigid: RigidWorld) -> None:
         self.rigid = rigid
-        self.things = np.zeros(0, np.int64)
+        self.object_ids = np.zeros(0, np.int64)
         """[n] :func:`vinesim.scene.ids.thing`: boxes, then loose bunches."""
         self._generation = -1
         self._parent = np.zeros(0, np.int64)
@@ -59,7 +59,7 @@ class Riding:
     def update(self) -> None:
         """After a tick: who is still, who is not, and on what."""
         self._keep_up()
-        d = self.rigid.data
+        d = self.rigid.mj_data
         self._still += 1
         speed = d.qvel[self._v[:, None] + np.arange(3)]
         self._calm = np.where((speed * speed).sum(1) > JERK * JERK, 0, self._calm + 1)
@@ -71,7 +71,7 @@ class Riding:
         if len(awake) == 0:
             return
         if (self._kind[self._parent[awake]] == _LINK).any():
-            self.rigid.refresh()
+            self.rigid.update_kinematics()
         pose = self._poses(awake)
         relative = self._relative(pose, self._parent[awake])
         out = _apart(relative, self._anchor[awake], bands[awake])
@@ -79,13 +79,13 @@ class Riding:
         if len(loose) == 0:
             return
         parent = self._parent[loose].copy()
-        inside = np.zeros(len(self.things), bool)
+        inside = np.zeros(len(self.object_ids), bool)
         inside[awake] = ~out
         self._parent[loose] = self._supports(loose, inside)
         changed = loose[self._parent[loose] != parent]
         anew = np.union1d(awake[out], changed)
         if len(anew):
-            self.rigid.refresh()
+            self.rigid.update_kinematics()
             self._anchor[anew] = self._relative(self._poses(anew), self._parent[anew])
             self._still[anew] = 0
 
@@ -93,7 +93,7 @@ class Riding:
     def moving(self) -> list[int]:
         """Things that are not at rest in their parent's frame."""
         self._keep_up()
-        return self.things[self._still < PATIENCE].tolist()
+        return self.object_ids[self._still < PATIENCE].tolist()
 
     @property
     def touched(self) -> list[tuple[int, str]]:
@@ -103,7 +103,7 @@ class Riding:
             self._touched = self._list_touched()
         return self._touched
 
-    def reached(self, actor: str) -> set[int]:
+    def objects_moved_by(self, actor: str) -> set[int]:
         """Things that move and that an actor touches, itself or through others that it touches: boxes, bunches."""
         self._keep_up()
         moves = self._still < PATIENCE
@@ -111,17 +111,17 @@ class Riding:
             return set()
         bodies = [body for body, (owner, _) in self.rigid.owners.items() if owner == actor]
         row, other = self._pairs.T
-        touched = np.zeros(len(self.things), bool)
+        touched = np.zeros(len(self.object_ids), bool)
         touched[row[np.isin(other, bodies)]] = True
-        for hand in self.rigid.person(actor).hands if actor in self.rigid.people else ():
-            held = None if hand.holds is None else thing_named(hand.holds[0])
+        for hand in self.rigid.human(actor).hands if actor in self.rigid.humans else ():
+            held = None if hand.held is None else thing_named(hand.held[0])
             if held in self._at:
                 touched[self._at[held]] = True
         on = self._row[other]
         while True:
             more = row[(on >= 0) & touched[on] & ~touched[row]]
             if not len(more):
-                return set(self.things[touched & moves].tolist())
+                return set(self.object_ids[touched & moves].tolist())
             touched[more] = True
 
     def _list_touched(self) -> list[tuple[int, str]]:
@@ -129,10 +129,10 @@ class Riding:
         for row, body in self._pairs[self._still[self._pairs[:, 0]] < PATIENCE].tolist():
             owner = self.rigid.owners.get(body)
             if owner is not None:
-                found.add((int(self.things[row]), owner[0]))
-        for name in self.rigid.people:
-            for hand in self.rigid.person(name).hands:
-                held = None if hand.holds is None else thing_named(hand.holds[0])
+                found.add((int(self.object_ids[row]), owner[0]))
+        for name in self.rigid.humans:
+            for hand in self.rigid.human(name).hands:
+                held = None if hand.held is None else thing_named(hand.held[0])
                 if held in self._at and self._still[self._at[held]] < PATIENCE:
                     found.add((held, name))
         return sorted(found)
@@ -143,41 +143,41 @@ class Riding:
         self._keep_up()
         return thing in self._at
 
-    def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
+    def object_state(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (of its origin, angular; world axes)."""
-        row, d = self._row_of(thing), self.rigid.data
+        row, d = self._row_of(thing), self.rigid.mj_data
         pose = self._poses(np.array([row]))[0]
         v = d.qvel[self._v[row] : self._v[row] + 6]
         return pose, np.concatenate([v[:3], frames.rotate(pose[3:], v[3:])])
 
-    def lies(self, thing: int) -> tuple[str, np.ndarray]:
+    def pose_on_support(self, thing: int) -> tuple[str, np.ndarray]:
         """Its parent, and its pose [7] in that frame."""
         row = self._row_of(thing)
-        self.rigid.refresh()
+        self.rigid.update_kinematics()
         at = np.array([row])
         return self._name(int(self._parent[row])), self._relative(self._poses(at), self._parent[at])[0]
 
-    def frame(self, parent: str) -> tuple[np.ndarray, np.ndarray] | None:
+    def support_state(self, parent: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Pose [7] and velocity [6] of a parent; None if it is not here."""
         if parent == GROUND:
             return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
         self._keep_up()
         box = thing_named(parent)
         if box is not None:
-            return self.read(box) if box in self._at else None
+            return self.object_state(box) if box in self._at else None
         body = self._body_named.get(parent)
         if body is None:
             return None
-        m, d = self.rigid.world, self.rigid.data
-        self.rigid.refresh()
+        m, d = self.rigid.mj_model, self.rigid.mj_data
+        self.rigid.update_kinematics()
         twist = np.zeros(6)
         mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
         pose = np.concatenate([d.xpos[body], frames.from_wxyz(d.xquat[body])])
         return pose, np.concatenate([twist[3:], twist[:3]])
 
-    def where(self, parent: str, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def to_world(self, parent: str, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """World poses [..., 7] and velocities [..., 6] of what is still in a parent's frame; None if that is gone."""
-        frame = self.frame(parent)
+        frame = self.support_state(parent)
         if frame is None:
             return None
         pose = frames.compose(frame[0], relative)
@@ -185,36 +185,36 @@ class Riding:
         velocity[..., :3] += frames.cross(velocity[..., 3:], pose[..., :3] - frame[0][:3])
         return pose, velocity
 
-    def place(self, thing: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+    def set_state(self, thing: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put one thing somewhere: pose [7], velocity [6] in world axes."""
-        self.place_all([thing], np.asarray(pose, float)[None], np.asarray(velocity, float)[None])
+        self.set_states([thing], np.asarray(pose, float)[None], np.asarray(velocity, float)[None])
 
-    def place_all(self, things: list[int], pose: np.ndarray, velocity: np.ndarray) -> None:
+    def set_states(self, things: list[int], pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put things [k] somewhere: poses [k, 7], velocities [k, 6] in world axes."""
-        rows, d = np.array([self._row_of(thing) for thing in things]), self.rigid.data
+        rows, d = np.array([self._row_of(thing) for thing in things]), self.rigid.mj_data
         turn = frames.normalize(pose[:, 3:])
         d.qpos[self._q[rows][:, None] + np.arange(7)] = np.concatenate([pose[:, :3], frames.to_wxyz(turn)], -1)
         spin = frames.rotate(frames.conjugate(turn), velocity[:, 3:])
         d.qvel[self._v[rows][:, None] + np.arange(6)] = np.concatenate([velocity[:, :3], spin], -1)
         for body in self._body[rows].tolist():
-            rouse(self.rigid.world, d, body)
-        self.rigid.stale()
+            wake_body(self.rigid.mj_model, d, body)
+        self.rigid.invalidate_kinematics()
 
-    def pull_all(self, things: list[int], pose: np.ndarray, velocity: np.ndarray, blend: np.ndarray) -> None:
+    def blend_towards(self, things: list[int], pose: np.ndarray, velocity: np.ndarray, blend: np.ndarray) -> None:
         """Move things [k] by ``blend`` [k] of the way towards poses [k, 7]; as fast as ``velocity`` [k, 6] at once."""
         here = self._poses(np.array([self._row_of(thing) for thing in things]))
         far = np.linalg.norm(pose[:, :3] - here[:, :3], axis=1) > FAR
         there = pose.copy()
         there[(here[:, 3:] * pose[:, 3:]).sum(1) < 0.0, 3:] *= -1.0
-        self.place_all(things, here + np.where(far, 1.0, blend)[:, None] * (there - here), velocity)
+        self.set_states(things, here + np.where(far, 1.0, blend)[:, None] * (there - here), velocity)
 
-    def settle(self, thing: int, parent: str, relative: np.ndarray) -> None:
+    def set_at_rest(self, thing: int, parent: str, relative: np.ndarray) -> None:
         """Take it for at rest in a parent's frame, as others say it is."""
         row = self._row_of(thing)
         self._parent[row] = self._body_of(parent)
         self._anchor[row], self._still[row] = relative, PATIENCE
 
-    def unsettle(self, things: list[int]) -> None:
+    def set_moving(self, things: list[int]) -> None:
         """Take things for moving, as others say they do."""
         rows = [self._row_of(thing) for thing in things]  # first: what has just come renews the rows
         self._still[rows] = 0
@@ -231,7 +231,7 @@ class Riding:
         return self._at[thing]
 
     def _poses(self, rows: np.ndarray) -> np.ndarray:
-        pose = self.rigid.data.qpos[self._q[rows][:, None] + np.arange(7)]
+        pose = self.rigid.mj_data.qpos[self._q[rows][:, None] + np.arange(7)]
         pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
         return pose
 
@@ -240,7 +240,7 @@ class Riding:
         moves = np.flatnonzero(parent)
         if len(moves) == 0:
             return pose
-        d, relative = self.rigid.data, pose.copy()
+        d, relative = self.rigid.mj_data, pose.copy()
         frame = np.concatenate([d.xpos[parent[moves]], frames.from_wxyz(d.xquat[parent[moves]])], -1)
         row = self._row[parent[moves]]
         free = np.flatnonzero(row >= 0)  # boxes know where they are without being asked anew
@@ -257,7 +257,7 @@ class Riding:
 
     def _touching(self) -> np.ndarray:
         """(row, MuJoCo body) of all contacts of the last tick [k, 2], each seen from both sides."""
-        m, d = self.rigid.world, self.rigid.data
+        m, d = self.rigid.mj_model, self.rigid.mj_data
         if d.ncon == 0:
             return np.zeros((0, 2), np.int64)
         pairs = m.geom_bodyid[d.contact.geom[d.contact.efc_address >= 0]].astype(np.int64)
@@ -269,7 +269,7 @@ class Riding:
 
     def _supports(self, rows: np.ndarray, inside: np.ndarray) -> np.ndarray:
         """On what these rows [k] ride now: MuJoCo bodies [k]; ``inside`` [n] are those still within their band."""
-        count = len(self.things)
+        count = len(self.object_ids)
         row, other = self._pairs.T
         kind = self._kind[other]
         best = np.full((3, count), np.iinfo(np.int64).max)
@@ -290,15 +290,15 @@ class Riding:
             found[leaning[helped]] = found[on[helped]]
         touches = np.zeros(count, bool)
         touches[row[np.where(self._kind[other] == _STANDS, 0, other) == self._parent[row]]] = True
-        asleep = self.rigid.data.tree_asleep[self._tree] >= 0  # of these MuJoCo tells no contacts
+        asleep = self.rigid.mj_data.tree_asleep[self._tree] >= 0  # of these MuJoCo tells no contacts
         keep = (inside & (touches | (found == _NONE))) | asleep
         return np.where(keep, self._parent, np.where(found == _NONE, 0, found))[rows]
 
     def _renew(self) -> None:
         """Find everything in the world as it is now; parents keep their names, not their numbers."""
         rigid = self.rigid
-        m = rigid.world
-        rigid.refresh()
+        m = rigid.mj_model
+        rigid.update_kinematics()
         names = self._parent_names() if self._at else []
         known = {
             number: (names[row], self._anchor[row], self._still[row], self._calm[row])
@@ -306,12 +306,12 @@ class Riding:
         }
         self._generation = rigid.generation
         boxes = [thing(Kind.BOX, i) for i in range(len(rigid.model.box_mass))]
-        bunches = [thing(Kind.BUNCH, i) for i in rigid.loose]
-        self.things = np.array(sorted(boxes + bunches), np.int64)
-        self._at = {number: row for row, number in enumerate(self.things.tolist())}
+        bunches = [thing(Kind.BUNCH, i) for i in rigid.free_bunches]
+        self.object_ids = np.array(sorted(boxes + bunches), np.int64)
+        self._at = {number: row for row, number in enumerate(self.object_ids.tolist())}
         self._kind = np.full(m.nbody, _STANDS)
         self._row = np.full(m.nbody, -1)
-        self._body = np.zeros(len(self.things), np.int64)
+        self._body = np.zeros(len(self.object_ids), np.int64)
         self._body_named: dict[str, int] = {GROUND: 0}
         for body, (actor, link) in rigid.owners.items():
             number = thing_named(actor)
@@ -326,12 +326,12 @@ class Riding:
         joint = m.body_jntadr[self._body]
         self._q, self._v = m.jnt_qposadr[joint], m.jnt_dofadr[joint]
         self._tree = m.body_treeid[self._body]
-        self._parent = np.zeros(len(self.things), np.int64)
-        self._anchor = self._poses(np.arange(len(self.things)))
-        self._still = np.where(self.things >= thing(Kind.BOX, 0), PATIENCE, 0)
+        self._parent = np.zeros(len(self.object_ids), np.int64)
+        self._anchor = self._poses(np.arange(len(self.object_ids)))
+        self._still = np.where(self.object_ids >= thing(Kind.BOX, 0), PATIENCE, 0)
         self._calm = self._still.copy()
         self._pairs, self._touched = np.zeros((0, 2), np.int64), None
-        self._bands_before = np.tile(STILL, (len(self.things), 1))
+        self._bands_before = np.tile(STILL, (len(self.object_ids), 1))
         for number, (parent, anchor, still, calm) in known.items():
             if number in self._at:
                 row = self._at[number]

@@ -165,7 +165,9 @@ class TrajectoryController:
         )
         if trajectory.times[0] > 0.0:  # from where they are, or should be
             by_servo = np.isin(self.robot.interface[active], (CommandInterface.POSITION, CommandInterface.VELOCITY))
-            here = np.where(by_servo, self.robot.setpoint[active], self.robot.rigid.read(self.robot.name)[0][active])
+            here = np.where(
+                by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active]
+            )
             self._knot_times = np.concatenate([[0.0], self._knot_times])
             self._knot_positions = np.concatenate([here[None], self._knot_positions])
             if self._knot_velocities is not None:
@@ -225,7 +227,7 @@ class TrajectoryController:
         run, elapsed = self.active_goal, time - self.active_goal.start_time
         if elapsed < 0.0:
             return
-        position, velocity, _, _ = self.robot.rigid.read(self.robot.name)
+        position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         wanted, rate = self._sample(elapsed)
         self._desired[self._order], self._desired_velocity[self._order] = wanted, rate
         error, slip = wanted - position[self._active], rate - velocity[self._active]
@@ -252,7 +254,7 @@ class TrajectoryController:
 
     def state(self, time: float) -> ControllerState:
         """Where the joints should be and are."""
-        position, velocity, _, _ = self.robot.rigid.read(self.robot.name)
+        position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         return ControllerState(
             time, self.joints, self._desired.copy(), self._desired_velocity.copy(), position[self.indices],
             velocity[self.indices],
@@ -279,7 +281,7 @@ class TrajectoryController:
         self._hold()
 
     def _hold(self) -> None:
-        position = self.robot.rigid.read(self.robot.name)[0][self._active]
+        position = self.robot.rigid.joint_measurements(self.robot.name)[0][self._active]
         self.robot.command_position(position, self._active)
         self._desired[self._order], self._desired_velocity[self._order] = position, 0.0
         self.active_goal = None

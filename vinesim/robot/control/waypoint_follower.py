@@ -46,7 +46,7 @@ class WaypointFollower:
         """Command the base for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
         if self.is_done:
             return
-        pose, _ = self.robot.rigid.base(self.robot.name)
+        pose, _ = self.robot.rigid.base_state(self.robot.name)
         here, yaw = pose[:2], 2.0 * math.atan2(pose[5], pose[6])
         self._detect_stall(time, here, yaw)
         linear = angular = 0.0
@@ -84,7 +84,7 @@ class WaypointFollower:
     def _turn_towards(self, course: float, yaw: float) -> float:
         """Rate of turn [rad/s] towards a heading; takes note when it is reached."""
         error = _wrap_angle(course - yaw)
-        rate = float(self.robot.rigid.base(self.robot.name)[1][5])
+        rate = float(self.robot.rigid.base_state(self.robot.name)[1][5])
         if abs(error) < HEADING_TOLERANCE and abs(rate) < 0.02:
             if self._leg < len(self.points):
                 self._turning = False

@@ -126,7 +126,7 @@ class PickBunch(Task):
     def box_pose(self) -> np.ndarray:
         """Where the box is [7]: the middle of its underside."""
         rigid = self.physics.rigid
-        return rigid.link_q()[[link.name for link in rigid.links()].index(f"box/{self.plan.box}")]
+        return rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{self.plan.box}")]
 
     @property
     def in_box(self) -> bool:
@@ -166,7 +166,7 @@ class PickBunch(Task):
         stiffness = np.array([self.robot.description.drives[i].stiffness for i in self._fingers])
         end, firm = self.time + 4.0, 0
         while firm < 30:
-            position, _, _, contact = rigid.read(name)
+            position, _, _, contact = rigid.joint_measurements(name)
             here, felt = position[self._fingers], np.abs(contact[self._fingers])
             firm = firm + 1 if (felt > MIN_GRASP_FORCE).all() else 0
             if self.time > end:
@@ -209,7 +209,7 @@ class PickBunch(Task):
         self._tool_z = along
         yield from self._move_hand("turn", lambda: over, down, patience=6.0)
         yield from self._move_hand("lower", lambda: low, down, speed=0.15, patience=8.0, near=0.03)
-        opening = self.robot.rigid.read(self.robot.name)[0][self._fingers].sum()
+        opening = self.robot.rigid.joint_measurements(self.robot.name)[0][self._fingers].sum()
         self._open_gripper(float(opening) + RELEASE_OPENING)
         yield from self.wait(0.8, "let go")
         yield from self._move_hand("rise", lambda: over, down, speed=0.2, patience=8.0, near=0.05)
@@ -254,7 +254,7 @@ class PickBunch(Task):
         self.robot.command_gripper(self.arm.gripper, min(opening, widest))
 
     def _base_pose(self) -> np.ndarray:
-        return self.robot.rigid.base(self.robot.name)[0]
+        return self.robot.rigid.base_state(self.robot.name)[0]
 
     def _base_to_world(self, point: np.ndarray) -> np.ndarray:
         """A point [3] given for the left arm in the base's axes, in the world."""

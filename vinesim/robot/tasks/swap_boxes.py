@@ -77,7 +77,7 @@ class SwapBoxes(Task):
     def box_pose(self, box: int) -> np.ndarray:
         """Where a box is [7]: the middle of its underside."""
         rigid = self.physics.rigid
-        return rigid.link_q()[[link.name for link in rigid.links()].index(f"box/{box}")]
+        return rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{box}")]
 
     # ------------------------------------------------------------------ the job
 
@@ -108,7 +108,7 @@ class SwapBoxes(Task):
         yield from self._align_clamp(phase, end, self.box_pose(box))
         self.robot.command_position(np.zeros(len(fingers)), fingers)
         yield from self.wait(1.5, phase)
-        felt = np.abs(self.robot.rigid.read(self.robot.name)[3][fingers])
+        felt = np.abs(self.robot.rigid.joint_measurements(self.robot.name)[3][fingers])
         if (felt < MIN_CLAMP_FORCE).any():
             raise TaskFailed(f"the {end} paddles feel {felt.min():.0f} N: nothing between them")
         low = float(self.box_pose(box)[2])
@@ -122,7 +122,7 @@ class SwapBoxes(Task):
         """Put the box of a clamp down where the other one stood, and go back to where there is room."""
         phase, here = "leave the empty box", self._base_pose()[:2].copy()
         yield from self._align_clamp(phase, end, self._target_pose)
-        down = float(self.robot.rigid.read(self.robot.name)[0][self._lift_index(end)])
+        down = float(self.robot.rigid.joint_measurements(self.robot.name)[0][self._lift_index(end)])
         yield from self._move_lift(
             phase, end, down - float(self.box_pose(box)[2] - self._target_pose[2]) + RELEASE_HEIGHT
         )
@@ -174,7 +174,7 @@ class SwapBoxes(Task):
         index = self.robot.description.joint_indices(f"lift_{end}")
         self.robot.command_position([height], index)
         until = self.time + 6.0
-        while abs(self.robot.rigid.read(self.robot.name)[0][index[0]] - height) > 0.003:
+        while abs(self.robot.rigid.joint_measurements(self.robot.name)[0][index[0]] - height) > 0.003:
             if self.time > until:
                 raise TaskFailed(f"the {end} lift does not come to {height:.2f} m")
             yield phase
@@ -183,7 +183,7 @@ class SwapBoxes(Task):
         return int(self.robot.description.joint_indices(f"lift_{end}")[0])
 
     def _base_pose(self) -> np.ndarray:
-        return self.robot.rigid.base(self.robot.name)[0]
+        return self.robot.rigid.base_state(self.robot.name)[0]
 
     def _away_from(self, box: int, place: np.ndarray, pose: np.ndarray | None = None) -> float:
         """Heading [rad] of a base at ``place`` [2] that looks straight away from a box."""
@@ -194,7 +194,7 @@ class SwapBoxes(Task):
         """The loose bunches that lie in a box."""
         rigid, size = self.physics.rigid, self.physics.model.box_size[box].astype(float)
         back, found = frames.inverse(self.box_pose(box)), []
-        for bunch in rigid.loose:
+        for bunch in rigid.free_bunches:
             middle = frames.pose([0.5 * float(self.physics.model.bunch_length[bunch]), 0.0, 0.0])
             at = frames.compose(back, frames.compose(rigid.bunch_pose(bunch), middle))[:3]
             if (np.abs(at[:2]) < 0.5 * size[:2]).all() and 0.0 < at[2] < 2.0 * size[2]:

@@ -23,7 +23,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
-from vinesim.scene.values import CameraInfo, View
+from vinesim.scene.values import CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
@@ -78,7 +78,7 @@ class SnapshotSource(Protocol):
         """All that decides what happens, as JSON."""
         ...
 
-    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[View, np.ndarray, dict[str, Any]] | None:
+    def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
         """What there is, near which point [2] m of the ground to look, and a record of it; None if nothing happens.
 
         It follows from the model and the random numbers alone. ``actors`` of the record are what
@@ -130,7 +130,7 @@ class VineyardRenderer:
         self.model = generate(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
-        self.still: View = rest_snapshot(self.model)
+        self.still: Snapshot = rest_snapshot(self.model)
         self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
         self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer)
         self.primitives.update(self.still)
@@ -180,7 +180,7 @@ class VineyardRenderer:
         with _atomic_file(_record_path(folder, image)) as part:
             formats.write_json(part, record)
 
-    def _pose_scene(self, image: int) -> tuple[View, np.ndarray | None, dict[str, Any]]:
+    def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
         """What there is in an image, drawn; whatever was there in the image before leaves no trace."""
         every = np.arange(len(self.model.tree_first))
         self.primitives.update(self.still, every)
@@ -192,7 +192,7 @@ class VineyardRenderer:
         return happens
 
     def _choose_view(
-        self, rng: np.random.Generator, view: View, near: np.ndarray | None, actors: list[tuple[float, float]]
+        self, rng: np.random.Generator, view: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
     ) -> truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 

@@ -10,7 +10,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, CameraInfo, View
+from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
 from vinesim.sensors.scene.primitives import Primitives
@@ -115,7 +115,7 @@ def overview_pose(model: Model) -> np.ndarray:
 
 def render_overview(
     model: Model,
-    view: View,
+    view: Snapshot,
     out: str | pathlib.Path | None = None,
     *,
     pose: np.ndarray | None = None,

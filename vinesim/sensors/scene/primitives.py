@@ -17,7 +17,7 @@ from vinesim.kernels.shading import materials, shadow_maps
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import Link, View
+from vinesim.scene.values import RigidVisual, Snapshot
 from vinesim.sensors.camera import renderers
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches, bunch_bodies, cane_batch, leaf_batches
@@ -66,7 +66,7 @@ class Primitives:
         batches += [b for b in around if b is not None]
         self._fixed_batches = [b for b in batches if len(b)] or [placeholder_batch(bodies)]
         self._tree_count = trees
-        self._links: tuple[Link, ...] = ()
+        self._links: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
         self._moved = np.zeros(0, np.int64)
@@ -104,7 +104,7 @@ class Primitives:
 
     # -- building
 
-    def _build(self, links: tuple[Link, ...]) -> None:
+    def _build(self, links: tuple[RigidVisual, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
         moving = rigid_batches(
             self.model, links, self._static_carrier + 1, 0, self._picked_bunch_shapes(links), self._ripeness
@@ -209,7 +209,7 @@ class Primitives:
         self.plant_count = total - sum(len(b) for b in moving)
         self.layout_version += 1
 
-    def _picked_bunch_shapes(self, links: tuple[Link, ...]) -> dict[int, np.ndarray]:
+    def _picked_bunch_shapes(self, links: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
         """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
         picked = {}
         for bunch in (link.index for link in links if link.organ == Organ.BUNCH):
@@ -268,15 +268,15 @@ class Primitives:
 
     # -- following the world
 
-    def update(self, view: View, moved: np.ndarray | None = None) -> np.ndarray:
+    def update(self, view: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
         """Take over the poses of ``view``; returns the clusters that moved.
 
         ``moved`` are the trees that may have moved since the last call (default: those of the view and of the view
         before). Whoever skips views must gather it from all of them.
         """
-        if view.links is not self._links:
+        if view.visuals is not self._links:
             self._body_q = view.body_q
-            self._build(view.links)
+            self._build(view.visuals)
             everything = True
         else:
             everything = False
@@ -288,20 +288,20 @@ class Primitives:
             shown[:] = (self._cluster_bunch < 0) | self._attached[self._cluster_bunch]
             if self.device != "cpu":
                 self.clusters.shown.assign(shown)
-        trees = np.union1d(view.moved if moved is None else moved, self._moved).astype(np.int64)
-        self._moved = np.asarray(view.moved, np.int64)
+        trees = np.union1d(view.moved_trees if moved is None else moved, self._moved).astype(np.int64)
+        self._moved = np.asarray(view.moved_trees, np.int64)
         if everything:
             dirty = np.arange(len(self.cluster_first))
         else:
             dirty = self._tree_clusters(trees)
             if len(changed):
                 dirty = np.union1d(dirty, np.flatnonzero(np.isin(self._cluster_bunch, changed)))
-            link_q = np.asarray(view.link_q, np.float32).reshape(-1, 7)
+            link_q = np.asarray(view.visual_q, np.float32).reshape(-1, 7)
             if len(self.rigid_clusters) and not np.array_equal(self._poses[self._static_carrier + 1 :], link_q):
                 dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
             self._poses[: self._static_carrier] = view.body_q
-            self._poses[self._static_carrier + 1 :] = np.asarray(view.link_q, np.float32).reshape(-1, 7)
+            self._poses[self._static_carrier + 1 :] = np.asarray(view.visual_q, np.float32).reshape(-1, 7)
             self._pose(dirty)
         return dirty
 
@@ -330,14 +330,14 @@ class Primitives:
         self.cluster_version[dirty] = self.pose_version
 
 
-def rest_snapshot(model: Model, links: tuple[Link, ...] = (), link_q: np.ndarray | None = None) -> View:
+def rest_snapshot(model: Model, links: tuple[RigidVisual, ...] = (), link_q: np.ndarray | None = None) -> Snapshot:
     """A view of the vineyard at rest, for pictures and tests without physics."""
-    return View(
+    return Snapshot(
         time=0.0,
         tick=0,
         body_q=State.at_rest(model).body_q,
         bunch_attached=np.ones(len(model.bunch_body), bool),
-        links=links,
-        link_q=np.zeros((0, 7)) if link_q is None else np.asarray(link_q, float),
-        moved=np.zeros(0, np.int64),
+        visuals=links,
+        visual_q=np.zeros((0, 7)) if link_q is None else np.asarray(link_q, float),
+        moved_trees=np.zeros(0, np.int64),
     )

@@ -12,7 +12,7 @@ from vinesim.kernels.shading import materials
 from vinesim.scene.appearance import smooth_normals
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.values import Link, Mesh, Shape
+from vinesim.scene.values import Mesh, RigidVisual, Shape
 from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches
 from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, make_batch
 
@@ -39,7 +39,7 @@ _NORMAL_LEVELS = 2047
 
 def rigid_batches(
     model: Model,
-    links: tuple[Link, ...],
+    links: tuple[RigidVisual, ...],
     first: int,
     groups: int,
     shape: dict[int, np.ndarray],

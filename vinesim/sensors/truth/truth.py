@@ -16,7 +16,7 @@ from vinesim import frames
 from vinesim.kernels.raster.primitives import FAR
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, CameraInfo, View
+from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
 from vinesim.sensors.scene.primitive_batches import CONE, SPHEROID
@@ -186,7 +186,7 @@ class BunchTruth:
 
 
 def bunch_truths(
-    primitives: Primitives, view: View, seen: PixelBuffers, caster: RayCaster | None = None
+    primitives: Primitives, view: Snapshot, seen: PixelBuffers, caster: RayCaster | None = None
 ) -> tuple[BunchTruth, ...]:
     """Every bunch of which some pixel would be seen if it were alone, by index.
 
@@ -201,7 +201,7 @@ def bunch_truths(
     fruit = fruit[primitives.clusters_shown()[fruit]]
     count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
     posed = [getattr(primitives.shapes, k).numpy() for k in "ab"]
-    loose = {one.index: k for k, one in enumerate(view.links) if one.organ == Organ.BUNCH}
+    loose = {one.index: k for k, one in enumerate(view.visuals) if one.organ == Organ.BUNCH}
     cuts = {
         int(bunch): cut_point(model, view.body_q, int(bunch))
         for bunch in np.unique(named[fruit] % LABEL_STRIDE)
@@ -225,7 +225,7 @@ def bunch_truths(
             ]
         )
         attached = bool(view.bunch_attached[bunch])
-        turn = (view.body_q[model.bunch_body[bunch]] if attached else view.link_q[loose[bunch]])[3:]
+        turn = (view.body_q[model.bunch_body[bunch]] if attached else view.visual_q[loose[bunch]])[3:]
         frame, size = _box_around(
             *(p[parts] for p in posed), np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
         )
