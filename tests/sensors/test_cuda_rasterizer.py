@@ -6,9 +6,9 @@ import pytest
 from tests.sensors.test_camera_raster import VIEWPOINTS
 from tests.support import sensor_scenes
 from vinesim.kernels.raster import camera_raster
-from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
-from vinesim.sensors.camera.cuda_rasterizer import CudaRasterizer
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.cuda_rasterizer import CudaRasterizer
 
 CLOSE_TO_A_SOLID = ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62])
 

@@ -8,12 +8,12 @@ import pytest
 from tests.sensors.test_camera_raster import VIEWPOINTS
 from tests.support import sensor_scenes
 from vinesim.kernels.raster import camera_raster
-from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitive_batches import KINDS
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.primitive_arrays import KINDS
 
 pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
-taichi_rasterizer = pytest.importorskip("vinesim.sensors.camera.taichi_rasterizer")
+taichi_rasterizer = pytest.importorskip("vinesim.sensors.raster.taichi_rasterizer")
 NEAR_PLANE = {
     "through the canopy, a solid beside the lens": ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62]),
     "a leaf through the pinhole": ([1.1, 0.2, 1.97], [1.4, 0.5, 1.9]),

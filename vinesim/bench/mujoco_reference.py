@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.contact_solver import plant_capsules
+from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.robot_body import RobotBody

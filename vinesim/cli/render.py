@@ -35,11 +35,11 @@ def run(
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
     from vinesim.scene.spec import load_scene, with_seed
-    from vinesim.sensors.camera import renderers
     from vinesim.sensors.camera.camera import Camera, CameraSpec
     from vinesim.sensors.export import annotations as formats
     from vinesim.sensors.export import images as picture
     from vinesim.sensors.export.dataset import resized_intrinsics
+    from vinesim.sensors.raster import renderers
     from vinesim.sensors.scene.primitives import Primitives
     from vinesim.sensors.scene.ray_caster import enclosing_primitive
     from vinesim.sensors.truth import truth

@@ -47,7 +47,7 @@ def run(
         raise UsageError(f"--tls {tls} without a server: give --connect tls/HOST:7447")
 
     from vinesim.physics.plants.device_buffers import find_device
-    from vinesim.sensors.camera import renderers
+    from vinesim.sensors.raster import renderers
 
     find_device(device)  # refused before anything is built
     renderers.check_renderer(renderer)

@@ -29,7 +29,7 @@ def run(
     from vinesim.net.transport.zenoh_bus import ZenohBus
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
-    from vinesim.sensors.camera import renderers
+    from vinesim.sensors.raster import renderers
 
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")

@@ -82,3 +82,19 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
         actor=tuple(actor for actor, _ in names),
         link=tuple(link for _, link in names),
     )
+
+
+def concatenate(first: RigidGeoms, second: RigidGeoms) -> RigidGeoms:
+    """The geoms of one list, then those of another."""
+    both = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in dataclasses.fields(RigidGeoms)}
+    return RigidGeoms(**{k: a + b if isinstance(a, tuple) else np.concatenate([a, b]) for k, (a, b) in both.items()})
+
+
+def persistent_names(geoms: RigidGeoms) -> list[tuple[str, str, int]]:
+    """[geom] a name that outlives a recompilation: actor, link and the geom's number on that link."""
+    seen: dict[tuple[str, str], int] = {}
+    names = []
+    for actor, link in zip(geoms.actor, geoms.link, strict=True):
+        number = seen[actor, link] = seen.get((actor, link), -1) + 1
+        names.append((actor, link, number))
+    return names

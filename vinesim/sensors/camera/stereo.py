@@ -8,8 +8,7 @@ edges grow.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import cv2
 import msgspec
@@ -20,7 +19,8 @@ from vinesim.kernels.raster import camera_raster
 from vinesim.kernels.sensing import stereo_depth
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraInfo
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer
+from vinesim.sensors.raster.primitive_arrays import PosedPrimitives
 
 
 class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -54,15 +54,6 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Grey level from which on a window is overexposed."""
 
 
-class DepthRenderer(Protocol):
-    """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.CameraRasterizer`)."""
-
-    depth: wp.array
-
-    def draw(self, primitives: Primitives, lens: camera_raster.Pinhole) -> None:
-        """Fill ``depth`` [pixel] m."""
-
-
 class Stereo:
     """The depth sensor of one camera: its second view, and its luck."""
 
@@ -71,10 +62,9 @@ class Stereo:
         spec: StereoSpec,
         info: CameraInfo,
         reach: tuple[float, float],
-        depth_renderer: Callable[[int, int, str], DepthRenderer],
         device: str = "cpu",
     ) -> None:
-        """``reach``: nearest and farthest depth [m]; ``depth_renderer`` makes what draws a view of some width and height."""
+        """``reach``: nearest and farthest depth [m]."""
         self.info, self.device = info, device
         s = self._parameters = stereo_depth.Stereo()
         s.baseline, s.focal_baseline = spec.baseline.value, spec.focal.value * spec.baseline.value
@@ -95,7 +85,7 @@ class Stereo:
         self._rows = int(np.ceil(info.height * focal / info.fy)) + 1
         self._centre = -edge * focal, info.cy / info.fy * focal
         self._focal = focal
-        self._second = depth_renderer(self._columns, self._rows, device)
+        self._second = CameraRasterizer(self._columns, self._rows, device)
         self._window = max(1, round(spec.window.value))
         cells = int(np.ceil(info.height * s.scale)), int(np.ceil(info.width * s.scale))
         self._noise = wp.empty((2, *cells), dtype=float, device=device)
@@ -103,7 +93,7 @@ class Stereo:
 
     def measure(
         self,
-        primitives: Primitives,
+        primitives: PosedPrimitives,
         lens: camera_raster.Pinhole,
         depth: np.ndarray,
         rgb: np.ndarray,

@@ -13,7 +13,7 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels.raster import camera_raster, lidar_raster
 from vinesim.kernels.raster import primitives as shapes
-from vinesim.sensors.camera.camera import MAX_DEPTH
+from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 from vinesim.sensors.scene.primitives import Primitives
 
 

@@ -7,8 +7,8 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.raster import camera_raster, ray_cast
-from vinesim.sensors.camera.camera import MAX_DEPTH
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID
+from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
+from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 
 

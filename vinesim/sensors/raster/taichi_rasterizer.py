@@ -13,7 +13,6 @@ import contextlib
 import functools
 import io
 import os
-from typing import TYPE_CHECKING
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # standard output belongs to the command
 
@@ -24,10 +23,16 @@ from taichi.math import clamp, cross, dot, length, vec2, vec3, vec4
 
 from vinesim.kernels.raster import camera_raster
 from vinesim.kernels.raster import primitives as shapes
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
-
-if TYPE_CHECKING:
-    from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.raster.primitive_arrays import (
+    BOX,
+    CONE,
+    CYLINDER,
+    ELLIPSOID,
+    LEAF,
+    SPHEROID,
+    TRIANGLE,
+    PosedPrimitives,
+)
 
 FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.NEAR_DEPTH)
 EMPTY, SMOOTH_SIZE, TEXELS = (
@@ -485,7 +490,7 @@ class TaichiRasterizer:
         self._pixels: list = []
 
     def rasterize(
-        self, primitives: "Primitives", lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
+        self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
@@ -503,7 +508,7 @@ class TaichiRasterizer:
             _draw_kernel(number, KEY)(*tables, *clusters_of, eye, *_CORES, pixels, self._number)
 
     def _rasterize_on_gpu(
-        self, primitives: "Primitives", lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
+        self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
         """On a GPU: depths, then numbers; what has not moved stays there."""
         if self._of != (primitives, primitives.pose_version):
@@ -545,7 +550,7 @@ def _pinhole_values(lens: camera_raster.Pinhole) -> np.ndarray:
     return np.concatenate([np.array(lens.eye), np.array(lens.rotation).ravel(), others]).astype(np.float32)
 
 
-def _visible_clusters(primitives: "Primitives", lens: camera_raster.Pinhole) -> np.ndarray:
+def _visible_clusters(primitives: PosedPrimitives, lens: camera_raster.Pinhole) -> np.ndarray:
     """Clusters of which a pixel may see something, near ones first [k]."""
     ball = primitives.ball.numpy()
     r = ball[:, 3]

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import warp as wp
 
 from vinesim.kernels.raster import camera_raster, cuda_raster
-
-if TYPE_CHECKING:
-    from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.raster.primitive_arrays import PosedPrimitives
 
 _LISTS = int(cuda_raster.TILE_LISTS)
 
@@ -43,7 +39,7 @@ class CudaRasterizer:
         self._all = wp.empty(0, dtype=wp.int32, device=device)
 
     def rasterize(
-        self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
+        self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         if len(self._all) != len(primitives.cluster_first):
