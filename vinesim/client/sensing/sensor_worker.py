@@ -20,6 +20,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.sensing.latest_value import LatestValue, poller
 from vinesim.robot.description.description import RobotDescription
+from vinesim.ros.names import ros_name
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -120,7 +121,7 @@ class SensorWorker:
         fixed = [(p, c, q) for (p, c), q in zip(description.fixed_frames, description.fixed_poses, strict=True)]
         node = stack.enter_context(
             Node(
-                setup.name.replace("-", "_").replace(".", "_"), description.urdf, namespace=setup.namespace,
+                ros_name(setup.name), description.urdf, namespace=setup.namespace,
                 static_transforms=fixed, cameras=[m.name for m in description.cameras],
                 lidars=[m.name for m in description.lidars], base=description.base,
                 clock=setup.clock,
