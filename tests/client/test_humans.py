@@ -17,7 +17,8 @@ from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch
 from vinesim.net.codec import human as poses
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.human_body import BODY_PARTS, standing_pose
-from vinesim.robot.description.description import RobotDescription, load_description
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label

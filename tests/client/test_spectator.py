@@ -22,7 +22,7 @@ from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_file import NotARecording, Recording, Tape, read
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 

@@ -10,8 +10,8 @@ from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.tasks import LookAt, RosCommandHandler, UnknownTask, plan_task
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.robot.description.description import load_description as load_robot
-from vinesim.robot.drives import Robot
+from vinesim.robot.description.loader import load_description as load_robot
+from vinesim.robot.drives.robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes
 from vinesim.robot.tasks.task import Task

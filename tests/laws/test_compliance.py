@@ -13,8 +13,9 @@ import pytest
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.robot.description.description import RobotDescription, load_description
-from vinesim.robot.drives import Robot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.robot import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
 

@@ -21,8 +21,8 @@ from vinesim.client.client import Client as RobotClient
 from vinesim.client.tasks.start_poses import start_pose
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import load_description
-from vinesim.robot.drives import Robot
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.robot import Robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene

@@ -14,7 +14,7 @@ from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, start_pose
 from vinesim.client.tasks.tasks import LookAt
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene

@@ -11,7 +11,7 @@ from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.client.tasks.tasks import DriveTo, LookAt, plan_task, validate_task_name
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.robot.tasks.task import Task
 from vinesim.ros.names import ros_name

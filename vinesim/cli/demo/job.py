@@ -12,7 +12,7 @@ from vinesim.cli.demo.processes import START_TIMEOUT, process_group
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.tasks.tasks import UnknownTask
-from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.ros import ros_setup
 from vinesim.scene.spec import load_scene, with_seed
 

@@ -14,7 +14,7 @@ from vinesim.cli.demo.processes import REPORT_TIMEOUT, START_TIMEOUT, process_gr
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import push_summary, push_table, write_summary
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.ros import ros_setup
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed

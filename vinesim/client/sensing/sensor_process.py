@@ -22,7 +22,7 @@ from vinesim.client.sensing.latest_value import LatestValue, poller
 from vinesim.client.sensing.sensor_worker import SensorConfig, StepSnapshot, run_sensor_worker
 from vinesim.client.tasks.tasks import RosCommandHandler
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.drives import Robot
+from vinesim.robot.drives.robot import Robot
 from vinesim.ros import ros_setup
 from vinesim.ros.commands.types import Command
 from vinesim.scene.model import Model

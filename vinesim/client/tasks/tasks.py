@@ -12,7 +12,8 @@ from vinesim import frames
 from vinesim.client.tasks import pick_planning, swap_planning
 from vinesim.physics.step import Physics
 from vinesim.robot.control.trajectory_controller import Trajectory, TrajectoryController
-from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.drives.robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task

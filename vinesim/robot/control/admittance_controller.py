@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.drives.robot import Robot
 from vinesim.scene.values import RobotSample
 
 JACOBIAN_DAMPING = 0.05

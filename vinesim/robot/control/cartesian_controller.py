@@ -17,7 +17,8 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.drives.robot import Robot
 
 POSITION_GAIN = 5.0
 """Share of an error that is taken out per second [1/s]; well below the servos' bandwidth."""

@@ -18,7 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vinesim.robot.drives import CommandError, CommandInterface, Robot
+from vinesim.robot.drives.commands import CommandError, CommandInterface
+from vinesim.robot.drives.robot import Robot
 
 
 class Outcome(enum.IntEnum):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vinesim.robot.drives import Robot
+from vinesim.robot.drives.robot import Robot
 
 POSITION_TOLERANCE = 0.01
 """This near is there [m]."""

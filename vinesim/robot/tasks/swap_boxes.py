@@ -23,7 +23,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.robot.control.waypoint_follower import WaypointFollower
-from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.drives.robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
 
 LIFT_HEIGHT = 0.15
