@@ -7,7 +7,7 @@ import pytest
 
 from tests.sensors.test_camera_raster import VIEWPOINTS
 from tests.support import sensor_scenes
-from vinesim.kernels.raster import camera_raster
+from vinesim.kernels.raster.pinhole import EMPTY_KEY, PRIMITIVE_MASK
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import KINDS
@@ -88,7 +88,7 @@ def test_some_clusters_alone(scene, raster) -> None:
         scene, pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys
     )
     keys = seen.keys.numpy()
-    numbers = keys[keys < int(camera_raster.EMPTY_KEY)] & int(camera_raster.PRIMITIVE_MASK)
+    numbers = keys[keys < int(EMPTY_KEY)] & int(PRIMITIVE_MASK)
     owner = np.repeat(np.arange(len(scene.cluster_first)), scene.cluster_size)
     assert len(numbers) > 100
     assert np.isin(owner[numbers], some).all()

@@ -18,8 +18,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import camera_raster, lidar_raster
-from vinesim.kernels.raster import primitives as shapes
+from vinesim.kernels.raster import camera_raster, camera_raster_plants, lidar_raster, pose_clusters
 from vinesim.kernels.sensing import lidar_echoes, stereo_depth
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.scene.model import Model
@@ -37,7 +36,16 @@ _MAX_PENDING_POSES = 1024
 
 def load_kernels() -> None:
     """Compile what pictures and scans need, or read it from the cache, before anybody waits for one."""
-    for module in (lidar_echoes, deferred, shadow_maps, shapes, stereo_depth, lidar_raster, camera_raster):
+    for module in (
+        pose_clusters,
+        camera_raster,
+        camera_raster_plants,
+        lidar_raster,
+        deferred,
+        shadow_maps,
+        stereo_depth,
+        lidar_echoes,
+    ):
         wp.load_module(module, device="cpu")
 
 

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import camera_raster
+from vinesim.kernels.raster.pinhole import NEAR_DEPTH, Pinhole
 from vinesim.kernels.sensing import stereo_depth
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraInfo
@@ -94,7 +94,7 @@ class Stereo:
     def measure(
         self,
         primitives: PosedPrimitives,
-        lens: camera_raster.Pinhole,
+        lens: Pinhole,
         depth: np.ndarray,
         rgb: np.ndarray,
         rng: np.random.Generator,
@@ -125,9 +125,9 @@ class Stereo:
         )
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
 
-    def _second_pinhole(self, lens: camera_raster.Pinhole) -> camera_raster.Pinhole:
+    def _second_pinhole(self, lens: Pinhole) -> Pinhole:
         """The second imager: parallel to the first, a baseline to its right."""
-        other = camera_raster.Pinhole()
+        other = Pinhole()
         turn = np.array(lens.rotation).reshape(3, 3)
         other.eye = wp.vec3(*map(float, np.array(lens.eye) + self._parameters.baseline * turn[0]))
         other.rotation = lens.rotation
@@ -136,7 +136,7 @@ class Stereo:
         other.width, other.height, other.max_depth = self._columns, self._rows, lens.max_depth
         wide = max(other.cx, other.width - other.cx) / other.fx
         high = max(other.cy, other.height - other.cy) / other.fy
-        other.near_radius = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
+        other.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
         return other
 
     def _correlated_noise(self, rng: np.random.Generator) -> np.ndarray:

@@ -8,8 +8,9 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.raster import camera_raster
+from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster import primitives as shapes
+from vinesim.kernels.raster.pinhole import EMPTY_KEY, NEAR_DEPTH, Pinhole
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.raster.primitive_arrays import (
@@ -26,11 +27,11 @@ from vinesim.sensors.raster.primitive_arrays import (
 MAX_DEPTH = 500.0
 """Nothing is drawn beyond this depth [m]."""
 _KERNELS = (
-    (camera_raster.raster_cones, (CONE,)),
-    (camera_raster.raster_spheroids, (SPHEROID,)),
+    (camera_raster_plants.raster_cones, (CONE,)),
+    (camera_raster_plants.raster_spheroids, (SPHEROID,)),
     (camera_raster.raster_triangles, (TRIANGLE,)),
     (camera_raster.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
-    (camera_raster.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
+    (camera_raster_plants.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
 )
 _KERNEL_OF_KIND = np.array(
     [next(i for i, (_, kinds) in enumerate(_KERNELS) if kind in kinds) for kind in range(TRIANGLE + 1)]
@@ -38,7 +39,7 @@ _KERNEL_OF_KIND = np.array(
 """Which of these draws a kind."""
 
 
-def pinhole(info: CameraInfo, pose: np.ndarray) -> camera_raster.Pinhole:
+def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
     """Intrinsics and pose [7] of the optical frame as kernels need them."""
     if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
         raise ValueError(
@@ -47,14 +48,14 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> camera_raster.Pinhole:
     pose = np.asarray(pose, float)
     if not np.isfinite(pose).all():
         raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
-    lens = camera_raster.Pinhole()
+    lens = Pinhole()
     lens.eye = wp.vec3(*map(float, pose[:3]))
     lens.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
     lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
     lens.width, lens.height, lens.max_depth = int(info.width), int(info.height), MAX_DEPTH
     wide = max(info.cx, info.width - info.cx) / info.fx
     high = max(info.cy, info.height - info.cy) / info.fy
-    lens.near_radius = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
+    lens.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
     return lens
 
 
@@ -87,7 +88,7 @@ class CameraRasterizer:
     def draw(
         self,
         primitives: PosedPrimitives,
-        lens: camera_raster.Pinhole,
+        lens: Pinhole,
         nearest: float = 0.0,
         farthest: float = MAX_DEPTH,
     ) -> None:
@@ -117,7 +118,7 @@ class CameraRasterizer:
             device=self.device,
         )
 
-    def cluster_distances(self, primitives: PosedPrimitives, lens: camera_raster.Pinhole) -> np.ndarray:
+    def cluster_distances(self, primitives: PosedPrimitives, lens: Pinhole) -> np.ndarray:
         """How near each cluster may come to the eye [cluster] m; :data:`shapes.FAR` if no pixel can see it."""
         clusters = len(primitives.cluster_first)
         if len(self._distance) != clusters:
@@ -131,17 +132,17 @@ class CameraRasterizer:
         )
         return self._distance.numpy()
 
-    def coverage(self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, clusters: np.ndarray) -> np.ndarray:
+    def coverage(self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray) -> np.ndarray:
         """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
         if primitives.rasterizer is None:
             self._rasterize(primitives, lens, clusters)
         else:
             primitives.rasterizer.rasterize(primitives, lens, clusters, self.keys)
-        return self.keys.numpy().reshape(self.height, self.width) < int(camera_raster.EMPTY_KEY)
+        return self.keys.numpy().reshape(self.height, self.width) < int(EMPTY_KEY)
 
-    def _rasterize(self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, seen: np.ndarray) -> None:
+    def _rasterize(self, primitives: PosedPrimitives, lens: Pinhole, seen: np.ndarray) -> None:
         """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
-        self._keys.fill(int(camera_raster.EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
+        self._keys.fill(int(EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
         stage = _KERNEL_OF_KIND[kind]

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.raster import primitives
-from vinesim.kernels.raster.camera_raster import Pinhole
+from vinesim.kernels.raster.pinhole import Pinhole
 
 CONE, SPHEROID, LEAF, BOX, ELLIPSOID, CYLINDER, TRIANGLE = (
     int(k)

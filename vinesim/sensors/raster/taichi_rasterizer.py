@@ -1,45 +1,26 @@
-"""The rasteriser once more, in Taichi: for all cores of a CPU, and for GPUs that Warp cannot use (Vulkan, Metal).
+"""The camera rasteriser in Taichi: for all cores of a CPU, and for GPUs that Warp cannot use (Vulkan, Metal).
 
-It reads the arrays that kernels/raster/primitives.py describes and finds the same primitive in every pixel. Each kind is three
-functions: ``place`` carries a primitive into the optical frame, ``outline`` bounds its picture by a box and two strips
-``low <= x - slope y <= high``, ``hit`` meets it with the ray of a pixel.
+It reads the arrays of :mod:`vinesim.kernels.raster.primitives` and finds the same primitive in every pixel. A GPU here
+may have no 64-bit atomics; there depth and number are found one after the other, in two passes.
 
-A GPU here may have no 64-bit atomics. There depth and number are found one after the other, in two passes.
-
-Only this module knows Taichi. No postponed annotations: Taichi needs real ones.
+Only this module and :mod:`vinesim.sensors.raster.taichi_primitives` know Taichi. No postponed annotations: Taichi needs
+real ones.
 """
 
 import contextlib
 import functools
 import io
-import os
-
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # standard output belongs to the command
 
 import numpy as np
 import taichi as ti
 import warp as wp
-from taichi.math import clamp, cross, dot, length, vec2, vec3, vec4
+from taichi.math import clamp, vec2, vec3, vec4
 
-from vinesim.kernels.raster import camera_raster
-from vinesim.kernels.raster import primitives as shapes
-from vinesim.sensors.raster.primitive_arrays import (
-    BOX,
-    CONE,
-    CYLINDER,
-    ELLIPSOID,
-    LEAF,
-    SPHEROID,
-    TRIANGLE,
-    PosedPrimitives,
-)
+from vinesim.kernels.raster import pinhole
+from vinesim.sensors.raster.primitive_arrays import PosedPrimitives
+from vinesim.sensors.raster.taichi_primitives import KERNEL_FUNCTIONS, Lens, mat3
 
-FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.NEAR_DEPTH)
-EMPTY, SMOOTH_SIZE, TEXELS = (
-    int(camera_raster.EMPTY_KEY),
-    float(camera_raster.SMOOTH_SIZE),
-    float(shapes.OUTLINE_TEXELS),
-)
+EMPTY_KEY, SMOOTH_SIZE = int(pinhole.EMPTY_KEY), float(pinhole.SMOOTH_SIZE)
 _NO_PRIMITIVE = 2**31 - 1
 _INEXACT = 2**30
 """Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
@@ -49,357 +30,7 @@ core of a CPU, idle ones counted: so 8 clusters, few enough that no core is left
 KEY, DEPTH, NUMBER = range(3)
 """What a pass draws: depth and number in one; depth alone; the number of what lies at that depth."""
 
-mat3 = ti.types.matrix(3, 3, ti.f32)
 Table = ti.types.ndarray(dtype=vec4, ndim=1)
-Placed = ti.types.struct(a=vec4, b=vec4, c=vec4, d=vec4)
-"""A primitive in the optical frame; boxes and ellipsoids keep two axes in b and c, with a half size beside each."""
-Lens = ti.types.struct(
-    eye=vec3, rotation=mat3, focal=vec2, centre=vec2, size=vec2, max_depth=ti.f32, near_radius=ti.f32
-)
-Bound = ti.types.struct(box=vec4, rising=vec3, falling=vec3, depth=ti.f32)
-"""Box: lowest and highest x, lowest and highest y [pixel]; strips: slope, low, high; no point of it is nearer [m]."""
-EMPTY_BOUNDS, UNBOUNDED_STRIP = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND), vec3(0.0, -UNBOUND, UNBOUND)
-
-
-# ------------------------------------------------------------------------------------------------- bounds
-
-
-@ti.func
-def tangents(x, z, r):
-    """Both tangents (x / z) from the origin to a circle; unbound, with the right sign, beyond +-90 degrees."""
-    out = vec2(-UNBOUND, UNBOUND)
-    free = x * x + z * z - r * r
-    if free > 0.0:
-        t = ti.sqrt(free)
-        tiny = 1.0e-6 * t
-        low, high = vec2(x * t - z * r, z * t + x * r), vec2(x * t + z * r, z * t - x * r)
-        out[0] = ti.select(low[1] > tiny, low[0] / ti.max(low[1], tiny), ti.select(low[0] < 0.0, -UNBOUND, UNBOUND))
-        out[1] = ti.select(high[1] > tiny, high[0] / ti.max(high[1], tiny), ti.select(high[0] < 0.0, -UNBOUND, UNBOUND))
-    return out
-
-
-@ti.func
-def ball(lens, p, r):
-    """Box around the picture of a sphere."""
-    h, v = tangents(p[0], p[2], r) * lens.focal[0] + lens.centre[0], tangents(p[1], p[2], r) * lens.focal[1]
-    return vec4(h[0], h[1], v[0] + lens.centre[1], v[1] + lens.centre[1])
-
-
-@ti.func
-def pixel_of(lens, p):
-    return p.xy / p[2] * lens.focal + lens.centre
-
-
-@ti.func
-def widened(box, q):
-    return vec4(ti.min(box[0], q[0]), ti.max(box[1], q[0]), ti.min(box[2], q[1]), ti.max(box[3], q[1]))
-
-
-@ti.func
-def leaf_outline(s, hull: ti.template(), lens):
-    size, p, rib, up = s.a[3], s.a.xyz, s.b.xyz, s.c.xyz
-    side = cross(rib, up)
-    reach = s.d.xyz * vec3(0.9, 1.1, 0.95)
-    levels = vec2(ti.min(reach, 0.0).sum(), ti.max(reach, 0.0).sum())
-    depth, box, turned = FAR, EMPTY_BOUNDS, EMPTY_BOUNDS
-    for n in ti.static(range(16)):
-        u, v = hull[int(s.b[3]), n // 2, 0], hull[int(s.b[3]), n // 2, 1]
-        q = p + (side * u + rib * v + up * levels[n % 2]) * size
-        depth = ti.min(depth, q[2])
-        q[2] = ti.max(q[2], 0.01)
-        at = pixel_of(lens, q)
-        box, turned = widened(box, at), widened(turned, vec2(at[0] - at[1], at[0] + at[1]))
-    if depth < CLOSE:
-        turned = vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
-        box = ball(lens, p + rib * (0.25 * size), 1.45 * size)
-        if p[2] < -1.6 * size:
-            box = EMPTY_BOUNDS
-    return Bound(box=box, rising=vec3(1.0, turned[0], turned[1]), falling=vec3(-1.0, turned[2], turned[3]), depth=depth)
-
-
-@ti.func
-def cone_outline(s, hull: ti.template(), lens):
-    a, b, r = s.a.xyz, s.b.xyz, ti.max(s.a[3], s.b[3])
-    box, strip = EMPTY_BOUNDS, UNBOUNDED_STRIP
-    if ti.max(a[2], b[2]) > -r:
-        # what comes closer than CLOSE may be cut there if its axis stays clear of all that is so close and in view
-        axis, cut, start, end, clear = b - a, CLOSE - r, a, b, True
-        if ti.min(a[2], b[2]) < cut:
-            clear = length(a + axis * clamp(-dot(a, axis) / dot(axis, axis), 0.0, 1.0)) - r > lens.near_radius
-            if a[2] < cut and b[2] > cut:
-                start = a + axis * ((cut - a[2]) / axis[2])
-            if b[2] < cut and a[2] > cut:
-                end = a + axis * ((cut - a[2]) / axis[2])
-        box = vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
-        if clear:
-            f, g = ball(lens, start, r), ball(lens, end, r)
-            box = vec4(ti.min(f[0], g[0]), ti.max(f[1], g[1]), ti.min(f[2], g[2]), ti.max(f[3], g[3]))
-            rise = 0.5 * (g[2] + g[3] - f[2] - f[3])
-            if ti.min(start[2], end[2]) - r > 0.01 and ti.abs(rise) > 2.0:
-                slope = 0.5 * (g[0] + g[1] - f[0] - f[1]) / rise
-                middle = 0.5 * (f[0] + f[1] - slope * (f[2] + f[3]))
-                half = 0.5 * (ti.max(f[1] - f[0], g[1] - g[0]) + ti.abs(slope) * ti.max(f[3] - f[2], g[3] - g[2]))
-                strip = vec3(slope, middle - half, middle + half)
-    return Bound(box=box, rising=strip, falling=UNBOUNDED_STRIP, depth=ti.min(a[2], b[2]) - r)
-
-
-@ti.func
-def ball_outline(lens, centre, r):
-    box = EMPTY_BOUNDS
-    if centre[2] > -r:
-        box = ball(lens, centre, r)
-    return Bound(box=box, rising=UNBOUNDED_STRIP, falling=UNBOUNDED_STRIP, depth=centre[2] - r)
-
-
-@ti.func
-def spheroid_outline(s, hull: ti.template(), lens):
-    return ball_outline(lens, s.a.xyz, s.a[3] * ti.max(s.b[3], 1.0))
-
-
-@ti.func
-def ellipsoid_outline(s, hull: ti.template(), lens):
-    return ball_outline(lens, s.a.xyz, ti.max(s.a[3], s.b[3], s.c[3]))
-
-
-@ti.func
-def cylinder_outline(s, hull: ti.template(), lens):
-    return ball_outline(lens, (s.a.xyz + s.b.xyz) * 0.5, length(vec2(length(s.b.xyz - s.a.xyz) * 0.5, s.a[3])))
-
-
-@ti.func
-def box_outline(s, hull: ti.template(), lens):
-    o = ball_outline(lens, s.a.xyz, length(vec3(s.a[3], s.b[3], s.c[3])))
-    if o.depth > CLOSE:
-        o.box = EMPTY_BOUNDS
-        x, y, z = s.b.xyz * s.a[3], s.c.xyz * s.b[3], cross(s.b.xyz, s.c.xyz) * s.c[3]
-        for n in ti.static(range(8)):
-            corner = x * (n % 2 * 2 - 1) + y * (n // 2 % 2 * 2 - 1) + z * (n // 4 * 2 - 1)
-            o.box = widened(o.box, pixel_of(lens, s.a.xyz + corner))
-    return o
-
-
-@ti.func
-def triangle_outline(s, hull: ti.template(), lens):
-    a, b, c = s.a.xyz, s.b.xyz, s.c.xyz
-    depth, box = ti.min(a[2], b[2], c[2]), EMPTY_BOUNDS
-    if dot(a, cross(b - a, c - a)) < 0.0 and ti.max(a[2], b[2], c[2]) > 0.0:
-        if depth > CLOSE:
-            box = widened(widened(widened(box, pixel_of(lens, a)), pixel_of(lens, b)), pixel_of(lens, c))
-        else:
-            middle = (a + b + c) / 3.0
-            box = ball(lens, middle, ti.max(length(a - middle), length(b - middle), length(c - middle)) * 1.001)
-    return Bound(box=box, rising=UNBOUNDED_STRIP, falling=UNBOUNDED_STRIP, depth=depth)
-
-
-# --------------------------------------------------------------------------------------------------- rays
-
-
-@ti.func
-def hit_ball(centre, r, d):
-    """First hit of a ray from the origin with a sphere that does not hold the origin."""
-    dd = dot(d, d)
-    along = dot(d, centre) / dd
-    miss = centre - d * along
-    h = (r * r - dot(miss, miss)) / dd
-    t = FAR
-    if h >= 0.0:
-        t = along - ti.sqrt(h)
-    return ti.select(t > 0.0, t, FAR)
-
-
-@ti.func
-def squeezed(v, axis, k):
-    return v + axis * (k * dot(v, axis))
-
-
-@ti.func
-def hit_spheroid(s, outlines: ti.template(), d, smooth):
-    k = 1.0 / s.b[3] - 1.0
-    return hit_ball(squeezed(s.a.xyz, s.b.xyz, k), s.a[3], squeezed(d, s.b.xyz, k))
-
-
-@ti.func
-def in_box_frame(s, v):
-    return vec3(dot(v, s.b.xyz), dot(v, s.c.xyz), dot(v, cross(s.b.xyz, s.c.xyz)))
-
-
-@ti.func
-def hit_ellipsoid(s, outlines: ti.template(), d, smooth):
-    half = vec3(s.a[3], s.b[3], s.c[3])
-    return hit_ball(in_box_frame(s, s.a.xyz) / half, 1.0, in_box_frame(s, d) / half)
-
-
-@ti.func
-def hit_box(s, outlines: ti.template(), d, smooth):
-    ray = in_box_frame(s, d)
-    m = 1.0 / ti.select(ti.abs(ray) > 1.0e-12, ray, 1.0e-12)
-    n, k = m * in_box_frame(s, s.a.xyz), ti.abs(m) * vec3(s.a[3], s.b[3], s.c[3])
-    near, far = (n - k).max(), (n + k).min()
-    return ti.select(near <= far and near > 0.0, near, FAR)
-
-
-@ti.func
-def hit_cone(s, outlines: ti.template(), d, smooth):
-    """The hull of two spheres, measured from the foot of the perpendicular onto the axis' middle."""
-    a, b, ra, rb = s.a.xyz, s.b.xyz, s.a[3], s.b[3]
-    ba, slope, dd = b - a, ra - rb, dot(d, d)
-    shift = dot((a + b) * 0.5, d) / dd
-    oa, ob = d * shift - a, d * shift - b
-    m0, m1, m2, m3, m5 = dot(ba, ba), dot(ba, oa), dot(ba, d), dot(d, oa), dot(oa, oa)
-    d2 = m0 - slope * slope
-    k2 = d2 * dd - m2 * m2
-    k1 = d2 * m3 - m1 * m2 + m2 * slope * ra
-    k0 = d2 * m5 - m1 * m1 + m1 * slope * ra * 2.0 - m0 * ra * ra
-    h = k1 * k1 - k0 * k2
-    best, side = FAR, False
-    if d2 > 0.0 and h >= 0.0:
-        root = ti.sqrt(h)
-        if k2 > 0.0:
-            t = (-root - k1) / k2
-            y = m1 - ra * slope + t * m2
-            if y > 0.0 and y < d2:
-                best, side = t + shift, True
-        elif k2 < 0.0:  # steeper than the slope: either root may be the first hit
-            for sign in ti.static((1.0, -1.0)):
-                t = (sign * root - k1) / k2
-                y = m1 - ra * slope + t * m2
-                if y > 0.0 and y < d2 and t + shift > 0.0:
-                    best = ti.min(best, t + shift)
-    if not side:
-        h1 = m3 * m3 - dd * (m5 - ra * ra)
-        if h1 > 0.0:
-            best = (-m3 - ti.sqrt(h1)) / dd + shift
-        m6 = dot(ob, d)
-        h2 = m6 * m6 - dd * (dot(ob, ob) - rb * rb)
-        if h2 > 0.0:
-            best = ti.min(best, (-m6 - ti.sqrt(h2)) / dd + shift)
-    return ti.select(best > 0.0, best, FAR)
-
-
-@ti.func
-def hit_cylinder(s, outlines: ti.template(), d, smooth):
-    a, b, r = s.a.xyz, s.b.xyz, s.a[3]
-    ba = b - a
-    length2, m = dot(ba, ba), dot(ba, d)
-    shift = dot((a + b) * 0.5, d) / dot(d, d)
-    oa = d * shift - a
-    n = dot(ba, oa)
-    k2 = length2 * dot(d, d) - m * m
-    k1 = length2 * dot(oa, d) - n * m
-    h = k1 * k1 - k2 * (length2 * dot(oa, oa) - n * n - r * r * length2)
-    best = FAR
-    if k2 > 1.0e-12 * length2 and h >= 0.0:
-        t = (-k1 - ti.sqrt(h)) / k2
-        y = n + t * m
-        if t + shift > 0.0 and y > 0.0 and y < length2:
-            best = t + shift
-    if m != 0.0:
-        end = ti.select(m > 0.0, 0.0, length2)
-        t = (end - n) / m
-        p = oa + d * t - ba * (end / length2)
-        if t + shift > 0.0 and t + shift < best and dot(p, p) <= r * r:
-            best = t + shift
-    return best
-
-
-@ti.func
-def hit_triangle(s, outlines: ti.template(), d, smooth):
-    p, q, r = s.a.xyz, s.b.xyz, s.c.xyz
-    u, v, w = dot(d, cross(r, q)), dot(d, cross(p, r)), dot(d, cross(q, p))
-    slack = -1.0e-6 * (ti.abs(u) + ti.abs(v) + ti.abs(w))
-    t = FAR
-    if u >= slack and v >= slack and w >= slack and u + v + w > 0.0:
-        n = cross(q - p, r - p)
-        t = dot(p, n) / dot(d, n)
-    return ti.select(t > 0.0, t, FAR)
-
-
-@ti.func
-def on_blade(outlines: ti.template(), number, u, v, smooth):
-    x, y = (u + 1.0) * TEXELS - 0.5, (v + 0.75) * TEXELS - 0.5
-    i, j = clamp(int(x), 0, 254), clamp(int(y), 0, 254)
-    inside = int(outlines[number, j, i]) > 0
-    if smooth:
-        fx, fy = x - i, y - j
-        low = outlines[number, j, i] * (1.0 - fx) + outlines[number, j, i + 1] * fx
-        high = outlines[number, j + 1, i] * (1.0 - fx) + outlines[number, j + 1, i + 1] * fx
-        inside = low * (1.0 - fy) + high * fy > 0.0
-    return inside
-
-
-@ti.func
-def hit_leaf(s, outlines: ti.template(), ray, smooth):
-    """Two half surfaces w = a u^2 + b v^2 + c |u| in the leaf's own frame and unit, hinged at u = 0."""
-    rib, up, bend = s.b.xyz, s.c.xyz, s.d
-    side, per = cross(rib, up), 1.0 / s.a[3]
-    o = vec3(dot(s.a.xyz, side), dot(s.a.xyz, rib), dot(s.a.xyz, up)) * -per
-    d = vec3(dot(ray, side), dot(ray, rib), dot(ray, up)) * per
-    q2 = -(bend[0] * d[0] * d[0] + bend[1] * d[1] * d[1])
-    linear = d[2] - 2.0 * (bend[0] * o[0] * d[0] + bend[1] * o[1] * d[1])
-    constant = o[2] - bend[0] * o[0] * o[0] - bend[1] * o[1] * o[1]
-    best = FAR
-    for sign in ti.static((1.0, -1.0)):
-        q1 = linear - bend[2] * sign * d[0]
-        q0 = constant - bend[2] * sign * o[0]
-        h = q1 * q1 - 4.0 * q2 * q0
-        if h >= 0.0:
-            root = ti.sqrt(h)
-            q = -0.5 * (q1 + ti.select(q1 > 0.0, root, -root))
-            for k in ti.static(range(2)):
-                top, bottom = (q0, q) if ti.static(k == 0) else (q, q2)
-                if bottom != 0.0:
-                    t = top / bottom
-                    u, v = o[0] + t * d[0], o[1] + t * d[1]
-                    nearer = t > 0.0 and t < best and sign * u >= -1.0e-5
-                    if nearer and u < 0.99 and u > -0.99 and v > -0.74 and v < 1.24:
-                        best = ti.select(on_blade(outlines, int(s.b[3]), u, v, smooth), t, best)
-    return best
-
-
-# ------------------------------------------------------------------------------------------------- places
-
-
-@ti.func
-def point(lens, v):
-    return vec4(lens.rotation @ (v.xyz - lens.eye), v[3])
-
-
-@ti.func
-def arrow(lens, v):
-    return vec4(lens.rotation @ v.xyz, v[3])
-
-
-@ti.func
-def place_blade(lens, a, b, c, d):
-    """Leaves and spheroids: a point and directions."""
-    return Placed(a=point(lens, a), b=arrow(lens, b), c=arrow(lens, c), d=d)
-
-
-@ti.func
-def place_points(lens, a, b, c, d):
-    return Placed(a=point(lens, a), b=point(lens, b), c=point(lens, c), d=d)
-
-
-@ti.func
-def place_box(lens, a, b, c, d):
-    x, y, z, w = b[0], b[1], b[2], b[3]
-    first = vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w))
-    second = vec3(2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w))
-    return Placed(a=point(lens, a), b=arrow(lens, vec4(first, c[0])), c=arrow(lens, vec4(second, c[1])), d=d)
-
-
-_KINDS = {
-    CONE: (place_points, cone_outline, hit_cone),
-    SPHEROID: (place_blade, spheroid_outline, hit_spheroid),
-    TRIANGLE: (place_points, triangle_outline, hit_triangle),
-    BOX: (place_box, box_outline, hit_box),
-    ELLIPSOID: (place_box, ellipsoid_outline, hit_ellipsoid),
-    CYLINDER: (place_points, cylinder_outline, hit_cylinder),
-    LEAF: (place_blade, leaf_outline, hit_leaf),  # last: the dearest test, so most of it is hidden by then
-}
-
-
-# ------------------------------------------------------------------------------------------------ drawing
 
 
 @ti.func
@@ -422,7 +53,7 @@ def _draw_kernel(kind: int, phase: int):
 
     One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster.
     """
-    place, outline, hit = _KINDS[kind]
+    place, outline, hit = KERNEL_FUNCTIONS[kind]
 
     @ti.kernel
     def draw(
@@ -490,25 +121,25 @@ class TaichiRasterizer:
         self._pixels: list = []
 
     def rasterize(
-        self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
+        self, primitives: PosedPrimitives, lens: pinhole.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
         kind = primitives.cluster_kind[which]
-        mine = {number: which[kind == number] for number in _KINDS}
+        mine = {number: which[kind == number] for number in KERNEL_FUNCTIONS}
         mine = {number: these for number, these in mine.items() if len(these)}
         if self._gpu:
             self._rasterize_on_gpu(primitives, lens, mine, keys.numpy())
             return
         s, eye, pixels = primitives.shapes, _pinhole_values(lens), keys.numpy()
         tables = [t.numpy() for t in (s.a, s.b, s.c, s.d, s.outline, s.hull)]
-        pixels.fill(EMPTY)
+        pixels.fill(EMPTY_KEY)
         for number, these in mine.items():
             clusters_of = primitives.cluster_first, primitives.cluster_size, these
             _draw_kernel(number, KEY)(*tables, *clusters_of, eye, *_CORES, pixels, self._number)
 
     def _rasterize_on_gpu(
-        self, primitives: PosedPrimitives, lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
+        self, primitives: PosedPrimitives, lens: pinhole.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
         """On a GPU: depths, then numbers; what has not moved stays there."""
         if self._of != (primitives, primitives.pose_version):
@@ -530,7 +161,7 @@ class TaichiRasterizer:
                 clusters_of = primitives.cluster_first, primitives.cluster_size, these
                 _draw_kernel(number, phase)(*self._tables, *clusters_of, eye, *_GPU, *self._pixels)
         depth, number = (array.to_numpy().astype(np.int64) for array in self._pixels)
-        keys[:] = np.where(number == _NO_PRIMITIVE, EMPTY, (depth << 32) | (number & (_INEXACT - 1)))
+        keys[:] = np.where(number == _NO_PRIMITIVE, EMPTY_KEY, (depth << 32) | (number & (_INEXACT - 1)))
 
 
 @functools.cache
@@ -544,13 +175,13 @@ def _start(gpu: bool) -> None:
         ti.sync()
 
 
-def _pinhole_values(lens: camera_raster.Pinhole) -> np.ndarray:
+def _pinhole_values(lens: pinhole.Pinhole) -> np.ndarray:
     """What :func:`lens_of` reads."""
     others = lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.max_depth, lens.near_radius
     return np.concatenate([np.array(lens.eye), np.array(lens.rotation).ravel(), others]).astype(np.float32)
 
 
-def _visible_clusters(primitives: PosedPrimitives, lens: camera_raster.Pinhole) -> np.ndarray:
+def _visible_clusters(primitives: PosedPrimitives, lens: pinhole.Pinhole) -> np.ndarray:
     """Clusters of which a pixel may see something, near ones first [k]."""
     ball = primitives.ball.numpy()
     r = ball[:, 3]

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.raster import primitives
+from vinesim.kernels.raster import pose_clusters, primitives
 from vinesim.kernels.shading import materials
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -276,7 +276,7 @@ class Primitives:
     def _pose(self, dirty: np.ndarray) -> None:
         self._pose_array.assign(self._poses)
         wp.launch(
-            primitives.pose_clusters,
+            pose_clusters.pose_clusters,
             len(dirty),
             inputs=[
                 self._local,
