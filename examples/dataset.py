@@ -14,7 +14,8 @@ for seed in range(count):
     scene = vinesim.load_scene("demo", seed=seed)
     simulation = vinesim.Simulation(scene)
     eye = np.array([rng.uniform(0.5, 2.5), -1.0, rng.uniform(1.2, 1.5)])
-    frame = camera.render(simulation, vinesim.look_at(eye, eye + [0.0, 1.5, rng.uniform(0.0, 0.4)]))
+    target = eye + np.array([0.0, 1.5, rng.uniform(0.0, 0.4)])
+    frame = camera.render(simulation, vinesim.look_at(eye, target))
     mask = np.where(frame.organs == vinesim.Organ.BUNCH, frame.instances + 1, 0)  # 0 is no bunch
     np.savez_compressed(f"picture_{seed:03d}.npz", rgb=frame.rgb, depth=frame.depth, bunch=mask)
     bunches += len(np.unique(mask)) - 1
