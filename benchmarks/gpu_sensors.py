@@ -27,9 +27,10 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import RigidVisual, Shape, Snapshot
-from vinesim.sensors.camera.camera import MAX_DEPTH, Camera, CameraSpec, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH, pinhole
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 

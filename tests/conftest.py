@@ -14,7 +14,26 @@ SKIPS_FAIL = bool(os.environ.get("CI"))
 """In CI everything that tests need is installed, so a skip hides a missing part. Tests marked ``gpu`` may be skipped."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+SLOW = (
+    "tests/cli/test_", "tests/laws/", "tests/story/", "tests/bench/", "tests/client/test_humans.py",
+    "tests/client/test_randomizer.py", "tests/net/test_exchange.py", "tests/net/test_faults.py",
+    "tests/net/test_replication_laws.py", "tests/net/test_wire.py", "tests/robot/test_pick.py",
+    "tests/robot/test_push.py", "tests/robot/test_swap_boxes.py", "tests/scene/test_vineyard.py",
+    "tests/sensors/test_camera_raster.py", "tests/sensors/test_cuda_rasterizer.py", "tests/sensors/test_dataset.py",
+    "tests/sensors/test_taichi_rasterizer.py", "tests/test_examples.py",
+)  # fmt: skip
+"""Files and folders that ``make check`` leaves out: each takes more than some ten seconds."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
+    for item in items:
+        if item.nodeid.startswith(SLOW):
+            item.add_marker("slow")
+        fixtures = item._fixtureinfo.name2fixturedefs.values()
+        if any(one.scope in ("module", "class") for found in fixtures for one in found):
+            # tests that share such a fixture run in one process, which sets it up once
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.split("::")[0]))
     from vinesim.ros import ros_setup
 
     reason = ros_setup.unavailable_reason()

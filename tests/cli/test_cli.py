@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -15,10 +16,13 @@ from vinesim.net.server.admission import Plan
 from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
+TIMEOUT = 300.0
+"""Longest run of a command [s]; reached only by a failure."""
+
 
 def vinesim(*arguments, cwd=None):
     return subprocess.run(
-        [sys.executable, "-m", "vinesim.cli", *arguments], capture_output=True, text=True, timeout=120, cwd=cwd
+        [sys.executable, "-m", "vinesim.cli", *arguments], capture_output=True, text=True, timeout=TIMEOUT, cwd=cwd
     )
 
 
@@ -130,7 +134,7 @@ def test_two_actors_with_one_name():
             refused(vinesim(*arguments, "--seconds", "1"), 4, "twin")
         finally:
             first.terminate()
-            first.communicate(timeout=30)
+            first.communicate(timeout=TIMEOUT)
         assert first.returncode == 0
 
 
@@ -149,7 +153,7 @@ def serving(*arguments):
 
 
 def test_the_server_says_who_is_there_and_ends_cleanly(tmp_path):
-    with serving("--listen", "tcp/127.0.0.1:0", "--status", "json", "--keep", str(tmp_path / "kept")) as (
+    with serving("--listen", "tcp/127.0.0.1:0", "--status", "json", "--state-dir", str(tmp_path / "kept")) as (
         process,
         line,
     ):
@@ -161,19 +165,24 @@ def test_the_server_says_who_is_there_and_ends_cleanly(tmp_path):
             while (figures := json.loads(process.stdout.readline()))["actors"] != ["vineyard/ada"]:
                 assert process.poll() is None
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=TIMEOUT) == 0
         assert process.stderr.read() == ""
     with serving("--listen", "tcp/127.0.0.1:0", "--listen", "udp/127.0.0.1:0", "--status", "text") as (process, line):
         assert line.startswith("listening on tcp/127.0.0.1:")
         assert "udp/127.0.0.1:" in line
         assert process.stdout.readline().startswith("nobody: 0 links")
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=TIMEOUT) == 0
 
 
 def test_a_journal_that_is_none_is_left_alone(tmp_path):
     (tmp_path / "vineyard.facts").write_text("notes on grapes")
-    refused(vinesim("server", "--listen", "tcp/127.0.0.1:0", "--keep", str(tmp_path)), 4, "vineyard.facts", "--keep")
+    refused(
+        vinesim("server", "--listen", "tcp/127.0.0.1:0", "--state-dir", str(tmp_path)),
+        4,
+        "vineyard.facts",
+        "--state-dir",
+    )
     assert (tmp_path / "vineyard.facts").read_text() == "notes on grapes"
 
 
@@ -214,10 +223,14 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["client", "--role", "spectator", "--status", "xml"], ["xml", "json"]),
         (["client", "--role", "tractor"], ["tractor", "robot"]),
         (["client", "--push", "99999", "--no-ros"], ["99999"]),
+        (["client", "--walk", "1", "2"], ["--walk", "human", "not of robot"]),
+        (["client", "--role", "human", "--push", "3"], ["--push", "robot", "not of human"]),
+        (["client", "--role", "human", "--tls", "certs"], ["--tls certs", "--connect tls/HOST:7447"]),
+        (["client", "--role", "spectator", "--no-ros"], ["--no-ros", "robot", "not of spectator"]),
         (["client", "--tls", "certs", "--no-ros"], ["--tls certs", "--connect tls/HOST:7447"]),
         (["server", "--listen", "7447"], ["'7447'", "tcp/HOST:PORT"]),
         (["server", "--listen", "tls/0.0.0.0:7447"], ["tls/0.0.0.0:7447", "--tls DIR"]),
-        (["server", "--connect", "tcp/127.0.0.1:1", "--keep", "kept"], ["only carries", "--keep"]),
+        (["server", "--connect", "tcp/127.0.0.1:1", "--state-dir", "kept"], ["only carries", "--state-dir"]),
         (["server", "--status", "xml"], ["xml", "json"]),
         (["server", "--quota", "0", "1"], ["--quota", "above zero"]),
         (["server", "--seed", "3"], ["--seed 3", "--scene"]),
@@ -249,3 +262,42 @@ def test_a_person_joins_and_goes(tmp_path):
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["name"].startswith("human-")
     assert report["time"] == pytest.approx(1.0)
+
+
+def status_when(process, condition):
+    """The first status line of a client for which ``condition`` holds."""
+    watchdog = threading.Timer(TIMEOUT, process.kill)
+    watchdog.start()
+    try:
+        for line in process.stdout:
+            if condition(status := json.loads(line)):
+                return status
+    finally:
+        watchdog.cancel()
+    return pytest.fail(f"the client ended before that: {process.stderr.read()}")
+
+
+def test_three_roles_join_one_server_each_in_its_own_process():
+    """F06, F50: robot and human see each other, the spectator sees both, and has no body itself."""
+    with Server("tcp/127.0.0.1:0") as server, contextlib.ExitStack() as stack:
+        common = ["client", "--connect", server.endpoint, "--status", "json"]
+        clients = {}
+        for name, role, more in (
+            ("picker", "robot", ["--no-ros"]),
+            ("eva", "human", ["--spawn", "1"]),
+            ("guest", "spectator", []),
+        ):
+            command = [sys.executable, "-m", "vinesim.cli", *common, "--role", role, "--name", name, *more]
+            clients[name] = stack.enter_context(
+                subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            )
+            stack.callback(clients[name].kill)
+        seen = {"picker": ["eva"], "eva": ["picker"], "guest": ["eva", "picker"]}
+        for name, others in seen.items():
+            status_when(clients[name], lambda status, others=others: status["others"] == others)
+        assert sorted(server.figures()["actors"]) == ["vineyard/eva", "vineyard/guest", "vineyard/picker"]
+        for client in clients.values():
+            client.send_signal(signal.SIGINT)
+        for client in clients.values():
+            _, errors = client.communicate(timeout=TIMEOUT)
+            assert client.returncode == 0, errors

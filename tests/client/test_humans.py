@@ -19,7 +19,8 @@ from vinesim.net.codec import human as poses
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
-from vinesim.robot.description.description import RobotDescription, load_description
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label

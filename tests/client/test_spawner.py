@@ -13,7 +13,8 @@ from vinesim import frames
 from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription, load_description
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 

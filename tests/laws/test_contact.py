@@ -1,4 +1,4 @@
-"""Laws of touching, against the same scenes wholly in MuJoCo and against what was predicted."""
+"""Laws of contact, against the same scenes wholly in MuJoCo and against what was predicted."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from vinesim import frames
 from vinesim.bench.mujoco_reference import MujocoScene
-from vinesim.physics.contact.contact_solver import CONTACT_STIFFNESS, ContactSolver
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
@@ -23,12 +23,6 @@ def middle_of(pose: np.ndarray) -> np.ndarray:
 
 def force_on(physics: Physics, link: str) -> np.ndarray:
     return sum((c.force for c in physics.contacts if c.link == link), np.zeros(3))
-
-
-def with_contacts(physics: Physics, **options) -> Physics:
-    """The same physics, its contacts made with other options."""
-    ContactSolver.__init__(physics.contact_solver, physics.model, physics.plants, physics.rigid, **options)
-    return physics
 
 
 def ramp(t: float, start: float, end: float) -> float:
@@ -63,42 +57,42 @@ def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def held():
-    """Close, lift, move, pull, let go: ours and the oracle's bunch, finger forces and efforts, tick by tick."""
+    """Close, lift, move, pull, let go: ours and the reference's bunch, finger forces and efforts, tick by tick."""
     model, body, middle = bunch_scene()
-    ours, oracle = Physics(model), MujocoScene(model, [gripper(middle)])
+    ours, reference = Physics(model), MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
-    rows = {key: [] for key in ("ours", "oracle", "force", "oracle_force", "effort", "oracle_effort")}
+    rows = {key: [] for key in ("ours", "reference", "force", "reference_force", "effort", "reference_effort")}
     for tick in range(800):
         target, pull = grasp(0.01 * tick)
-        for rigid in (ours.rigid, oracle.rigid):
+        for rigid in (ours.rigid, reference.rigid):
             rigid.command("grip", target)
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, pull]))
         ours.step()
-        oracle.step()
+        reference.step()
         rows["ours"].append(middle_of(ours.snapshot().body_q[body]))
-        rows["oracle"].append(middle_of(oracle.body_pose(body)))
+        rows["reference"].append(middle_of(reference.body_pose(body)))
         rows["force"].append([force_on(ours, finger) for finger in FINGERS])
-        rows["oracle_force"].append([oracle.contact_force_on(finger) for finger in FINGERS])
+        rows["reference_force"].append([reference.contact_force_on(finger) for finger in FINGERS])
         rows["effort"].append(ours.rigid.joint_measurements("grip")[2])
-        rows["oracle_effort"].append(oracle.rigid.joint_measurements("grip")[2])
+        rows["reference_effort"].append(reference.rigid.joint_measurements("grip")[2])
     return {key: np.array(value) for key, value in rows.items()} | {"physics": ours, "body": body}
 
 
-def test_held_bunch_is_where_the_oracle_has_it(held):
-    off = np.linalg.norm(held["ours"] - held["oracle"], axis=1)
-    lifted = held["oracle"][290, 2] - held["oracle"][140, 2]
+def test_held_bunch_is_where_the_reference_has_it(held):
+    off = np.linalg.norm(held["ours"] - held["reference"], axis=1)
+    lifted = held["reference"][290, 2] - held["reference"][140, 2]
     assert lifted > 0.095
     assert off[:640].max() < 1e-3
 
 
-def test_held_bunch_presses_the_fingers_as_the_oracle_does(held):
+def test_held_bunch_presses_the_fingers_as_the_reference_does(held):
     for start, end in ((120, 150), (250, 300), (400, 450), (500, 590)):
         mine = held["force"][start:end].mean(0)
-        theirs = held["oracle_force"][start:end].mean(0)
+        theirs = held["reference_force"][start:end].mean(0)
         np.testing.assert_allclose(mine[:, 1], theirs[:, 1], rtol=0.01)
         assert mine[:, 2].sum() == pytest.approx(theirs[:, 2].sum(), abs=0.05)
         np.testing.assert_allclose(
-            held["effort"][start:end].mean(0), held["oracle_effort"][start:end].mean(0), atol=0.05
+            held["effort"][start:end].mean(0), held["reference_effort"][start:end].mean(0), atol=0.05
         )
 
 
@@ -141,35 +135,35 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
     model, _, middle = bunch_scene()
     physics = Physics(model)
     physics.add_robot(gripper(middle))
-    rigid, touching = physics.rigid, physics.contact_solver
+    rigid, solver = physics.rigid, physics.contact_solver
     plant_error = rigid_error = 0.0
     pressed = 0
     for tick in range(400):
         rigid.command("grip", grasp(0.01 * tick)[0])
         rigid.predict()
-        touching.wake_near_trees()
+        solver.wake_near_trees()
         physics.plants.predict()
         start = physics.state.body_q.copy()
-        touching.solve()
+        solver.solve()
         free = rigid.velocity_free
-        if touching.count:
+        if solver.count:
             pressed += 1
-            response = physics.plants.impulse_response(touching.bodies)
-            rows = slice(0, len(touching.bodies))
-            pushed = np.einsum("uitj,tj->ui", response[rows], touching.wrenches) * physics.dt
-            predicted = physics.plants.velocity_free[touching.bodies] + pushed
-            free = free + rigid.impulse_response(touching.rigid_force[None])[:, 0] * physics.dt
+            response = physics.plants.impulse_response(solver.bodies)
+            rows = slice(0, len(solver.bodies))
+            pushed = np.einsum("uitj,tj->ui", response[rows], solver.wrenches) * physics.dt
+            predicted = physics.plants.velocity_free[solver.bodies] + pushed
+            free = free + rigid.impulse_response(solver.rigid_force[None])[:, 0] * physics.dt
             on_plants, on_robot = (
-                touching.wrenches[:, :3].sum(0),
-                sum((c.force for c in touching.contacts), np.zeros(3)),
+                solver.wrenches[:, :3].sum(0),
+                sum((c.force for c in solver.contacts), np.zeros(3)),
             )
             np.testing.assert_allclose(on_plants, -on_robot, atol=1e-9)
             base = rigid.robot("grip").base_v[:2]
-            np.testing.assert_allclose(touching.rigid_force[base], on_robot[:2], atol=1e-9)
+            np.testing.assert_allclose(solver.rigid_force[base], on_robot[:2], atol=1e-9)
         physics._commit()
-        rigid.integrate(touching.rigid_force)
-        if touching.count:
-            plant_error = max(plant_error, np.abs(realised(physics, start)[touching.bodies] - predicted).max())
+        rigid.integrate(solver.rigid_force)
+        if solver.count:
+            plant_error = max(plant_error, np.abs(realised(physics, start)[solver.bodies] - predicted).max())
         rigid_error = max(rigid_error, np.abs(rigid.mj_data.qvel - free).max())
     assert pressed > 200
     assert plant_error < 1e-4
@@ -177,16 +171,16 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
 
 
 def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, give: float | None = None):
-    """A bar of 3 kg goes through five canes, coasting or (with damping) driven: ours, and the oracle in substeps.
+    """A bar of 3 kg goes through five canes, coasting or (with damping) driven: ours, and the reference in substeps.
 
     Returns our physics, force on the bar along y [N] tick by tick, ours and theirs [tick, 2], trees that were met.
     """
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005) for i in range(5)])
     spec = bar((0.7, -0.08, 0.95), damping=damping)
-    ours, oracle = Physics(model), MujocoScene(model, [spec], dt=0.01 / substeps, contact_time_constant=give)
-    ours.contact_solver.plant_plant_contacts = False  # in the oracle canes pass through each other
+    ours, reference = Physics(model), MujocoScene(model, [spec], dt=0.01 / substeps, contact_time_constant=give)
+    ours.contact_solver.plant_plant_contacts = False  # in the reference canes pass through each other
     ours.add_robot(spec)
-    for rigid in (ours.rigid, oracle.rigid):
+    for rigid in (ours.rigid, reference.rigid):
         rigid.command("bar", np.zeros(1), np.array([speed]))
         rigid.mj_data.qvel[rigid.robot("bar").v] = speed
     force, met = [], set()
@@ -195,8 +189,8 @@ def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, g
         ours.step()
         on_bar, theirs = force_on(ours, "bar"), np.zeros(3)
         for _ in range(substeps):
-            oracle.step()
-            theirs += oracle.contact_force_on("bar") / substeps
+            reference.step()
+            theirs += reference.contact_force_on("bar") / substeps
         force.append((on_bar[1], theirs[1]))
         met.update(tree for tree, _ in ours.touched)
         np.testing.assert_allclose(ours.contact_solver.wrenches[:, :3].sum(0), -on_bar, atol=1e-9)
@@ -210,7 +204,7 @@ def peaks(force: np.ndarray) -> np.ndarray:
     return np.abs(force[:-2] + force[1:-1] + force[2:]).max(0) / 3.0
 
 
-def test_a_coasting_bar_is_thrown_back_as_the_oracle_says():
+def test_a_coasting_bar_is_thrown_back_as_the_reference_says():
     _, force, _ = sweep(0.5, 3.0, 0.0)
     impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
     assert impulse[0] == pytest.approx(impulse[1], rel=0.02)
@@ -219,9 +213,9 @@ def test_a_coasting_bar_is_thrown_back_as_the_oracle_says():
 
 @pytest.mark.parametrize("speed", [0.25, 0.5, 1.0, 2.0, 3.0])
 def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
-    """Impulse and peak are the oracle's, every cane is met, none is passed through, all swing back to where they hung.
+    """Impulse and peak are the reference's, every cane is met, none is passed through, all swing back to where they hung.
 
-    At 3 m/s the bar goes 3 cm a tick, five times a cane's radius. The oracle takes 1 ms, where it has converged: with
+    At 3 m/s the bar goes 3 cm a tick, five times a cane's radius. The reference takes 1 ms, where it has converged: with
     0.25 ms and contacts ten times as stiff its impulse changes by 1.7 % at 3 m/s, by 0.4 % at 0.5 m/s.
     """
     ours, force, met = sweep(speed, 2.0 / speed, 200.0)
@@ -247,29 +241,29 @@ def test_a_fast_sweep_agrees_with_hard_contacts_in_quarters_of_a_millisecond():
 def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
     model, body, middle = bunch_scene()
     spec = gripper(middle, effort=effort)
-    ours, oracle = Physics(model, detachment=False), MujocoScene(model, [spec])
+    ours, reference = Physics(model, detachment=False), MujocoScene(model, [spec])
     ours.add_robot(spec)
     held, force, off = [], [], 0.0
     for tick in range(450):
         t = 0.01 * tick
         grip = 0.05 * ramp(t, 0.3, 0.8)
-        for rigid in (ours.rigid, oracle.rigid):
+        for rigid in (ours.rigid, reference.rigid):
             rigid.command("grip", np.array([0.0, 0.05 * ramp(t, 1.0, 2.0), grip, grip]))
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, -pull * ramp(t, 2.5, 3.0)]))
         ours.step()
-        oracle.step()
+        reference.step()
         mine = middle_of(ours.snapshot().body_q[body])
         held.append(mine - ours.rigid.link_pose("grip", "left")[:3])
-        force.append([[world.contact_force_on(f) if world is oracle else force_on(ours, f) for f in FINGERS]
-                      for world in (ours, oracle)])  # fmt: skip
-        off = max(off, float(np.linalg.norm(mine - middle_of(oracle.body_pose(body)))))
+        force.append([[world.contact_force_on(f) if world is reference else force_on(ours, f) for f in FINGERS]
+                      for world in (ours, reference)])  # fmt: skip
+        off = max(off, float(np.linalg.norm(mine - middle_of(reference.body_pose(body)))))
     held, force = np.array(held), np.array(force)
     assert np.linalg.norm(held[440:].mean(0) - held[240:250].mean(0)) < 5e-5
     assert off < 1e-3
     np.testing.assert_allclose(force[400:, 0, :, 1].mean(0), force[400:, 1, :, 1].mean(0), rtol=0.01)
     np.testing.assert_allclose(
         ours.rigid.joint_measurements("grip")[2][2:],
-        oracle.rigid.joint_measurements("grip")[2][2:],
+        reference.rigid.joint_measurements("grip")[2][2:],
         rtol=0.01,
         atol=0.01 * effort,
     )
@@ -278,19 +272,19 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
 def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
     model, body, middle = bunch_scene()
     spec = gripper(middle, mimic=True)
-    ours, oracle = Physics(model), MujocoScene(model, [spec])
+    ours, reference = Physics(model), MujocoScene(model, [spec])
     ours.add_robot(spec)
     force, off = [], 0.0
     for tick in range(450):
         t = 0.01 * tick
-        for rigid in (ours.rigid, oracle.rigid):
+        for rigid in (ours.rigid, reference.rigid):
             rigid.command("grip", np.array([0.0, 0.05 * ramp(t, 1.0, 2.0), 0.05 * ramp(t, 0.3, 0.8)]))
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, -20.0 * ramp(t, 2.5, 3.0)]))
         ours.step()
-        oracle.step()
-        force.append([[force_on(ours, f)[1], oracle.contact_force_on(f)[1]] for f in FINGERS])
+        reference.step()
+        force.append([[force_on(ours, f)[1], reference.contact_force_on(f)[1]] for f in FINGERS])
         off = max(
-            off, float(np.linalg.norm(middle_of(ours.snapshot().body_q[body]) - middle_of(oracle.body_pose(body))))
+            off, float(np.linalg.norm(middle_of(ours.snapshot().body_q[body]) - middle_of(reference.body_pose(body))))
         )
     force = np.array(force)
     for phase in (slice(150, 240), slice(400, 450)):
@@ -320,7 +314,7 @@ def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
         force.append([force_on(ours, finger) for finger in FINGERS])
     held, force = np.array(held), np.array(force)
     closed = 4000.0 * (0.074 - (0.085 - 0.01 - 0.006))
-    expected = closed / (1.0 + 4000.0 / (2.0 * CONTACT_STIFFNESS))
+    expected = closed / (1.0 + 4000.0 / (2.0 * ours.parameters.contact_stiffness))
     np.testing.assert_allclose(force[110:119, 0, 1], expected, rtol=0.01)
     np.testing.assert_allclose(force[110:119, 1, 1], -expected, rtol=0.01)
     assert ours.snapshot().body_q[body, 2] - home[body, 2] > 0.08
@@ -346,7 +340,7 @@ def test_thirty_kilograms_press_on_pieces_of_half_a_gram(servo, stiffness):
         Drive("along", servo, 2.0 * np.sqrt(servo * 31.0), 1e4, 5.0, -5.0, 5.0),
         Drive("press", servo, 2.0 * np.sqrt(servo * 30.0), 1e4, 5.0, -5.0, 5.0),
     )
-    physics = with_contacts(Physics(model), stiffness=stiffness)
+    physics = Physics(model, parameters=PhysicsParameters(contact_stiffness=stiffness))
     physics.add_robot(probe((0.5, 0.0, 1.04), mass=30.0, drives=drives))
     force = []
     for tick in range(150):
@@ -364,9 +358,8 @@ def test_thirty_kilograms_press_on_pieces_of_half_a_gram(servo, stiffness):
 @pytest.mark.parametrize("speed", [0.5, 3.0])
 def test_contact_without_damping_gives_no_energy(stiffness, speed):
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005, beta=0.0) for i in range(5)])
-    physics = with_contacts(Physics(model), stiffness=stiffness, plant_plant_contacts=False)
-    physics.contact_solver.damping = 0.0
-    physics.contact_solver._record()
+    physics = Physics(model, parameters=PhysicsParameters(contact_stiffness=stiffness, contact_damping_time=0.0))
+    physics.contact_solver.plant_plant_contacts = False
     physics.add_robot(bar((0.7, -0.08, 0.95)))
     drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = speed
@@ -412,22 +405,22 @@ def test_what_rests_on_a_cane_weighs_what_it_weighs(places):
     np.testing.assert_allclose(np.array(force)[-50:], 3.0, rtol=1e-3)
 
 
-def test_what_is_dragged_along_a_cane_rubs_as_the_oracle_says():
+def test_what_is_dragged_along_a_cane_rubs_as_the_reference_says():
     """Mean force over three pieces within 1 %; from tick to tick it is smooth but for the corners between pieces."""
     model, spec = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)]), probe((0.5, 0.0, 1.03))
-    ours, oracle = Physics(model), MujocoScene(model, [spec], dt=0.0005, contact_time_constant=0.004)
+    ours, reference = Physics(model), MujocoScene(model, [spec], dt=0.0005, contact_time_constant=0.004)
     ours.add_robot(spec)
     force = []
     for tick in range(1000):
-        for rigid in (ours.rigid, oracle.rigid):
+        for rigid in (ours.rigid, reference.rigid):
             rigid.apply_wrench("probe", "rod", np.array([0.0, 0.0, -3.0]))
             if tick > 600:
                 rigid.command("probe", np.array([0.001 * (tick - 600), 0.0]), np.array([0.1, 0.0]))
         ours.step()
         theirs = np.zeros(3)
         for _ in range(20):
-            oracle.step()
-            theirs += oracle.contact_force_on("rod") / 20
+            reference.step()
+            theirs += reference.contact_force_on("rod") / 20
         force.append([force_on(ours, "rod"), theirs])
     force = np.array(force)[650:]
     np.testing.assert_allclose(force[:, 0].mean(0)[[0, 2]], force[:, 1].mean(0)[[0, 2]], rtol=0.01)

@@ -51,7 +51,7 @@ def command(physics: Physics, tick: int) -> None:
 
 def numbers(physics: Physics) -> dict[str, bytes]:
     """Every number that the next tick starts from, by the name of what it belongs to."""
-    world, data, touching = physics.rigid.mj_model, physics.rigid.mj_data, physics.contact_solver
+    world, data = physics.rigid.mj_model, physics.rigid.mj_data
     found = {"plants": physics.state.joint_q.tobytes() + physics.state.joint_qd.tobytes()}
     for i in range(world.njnt):
         joint = world.joint(i)
@@ -61,8 +61,9 @@ def numbers(physics: Physics) -> dict[str, bytes]:
             np.ascontiguousarray(x).tobytes()
             for x in (q.qpos, q.qvel, data.qacc[first:last], data.qacc_warmstart[first:last])
         )
-    n = int(touching._known_count[0])
-    found["memory"] = touching._known_push[:n].tobytes() + touching._known_anchor[:n].tobytes()
+    warm_start = physics.contact_solver.impulses.warm_start
+    n = int(warm_start.count[0])
+    found["memory"] = warm_start.normal_impulse[:n].tobytes() + warm_start.anchor[:n].tobytes()
     found["contacts"] = b"".join(c.force.tobytes() for c in physics.contacts)
     parked = {f"free_bunch/{slot}" for slot in range(physics.rigid._pool_size)} - {
         f"free_bunch/{slot}" for slot in physics.rigid._bunch_slot.values()

@@ -39,7 +39,7 @@ def test_a_world_forgets_its_scene_with_the_last_actor_unless_facts_are_kept():
     agreement.keep("w", Plan("vsp", "D2"))
     agreement.went("w", "bob", "bob")
     assert agreement.plan("w") == Plan("vsp", "D2")
-    assert "--keep" in ask(agreement, "ada", "D1").refused
+    assert "--state-dir" in ask(agreement, "ada", "D1").refused
 
 
 def test_a_server_with_a_scene_lets_in_no_other():

@@ -19,7 +19,7 @@ from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
-from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 

@@ -139,7 +139,7 @@ def test_a_foreign_file_is_refused_and_left_as_it_is(tmp_path, content, word):
     with pytest.raises(NotKept, match=word) as caught:
         load_all(tmp_path)
     assert "w.facts" in str(caught.value)
-    assert "--keep" in str(caught.value)
+    assert "--state-dir" in str(caught.value)
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("w.facts", content)]
 
 

@@ -376,7 +376,7 @@ def test_the_scene_is_kept_with_the_facts(tmp_path):
         snapshot(ada, (0, 0), 1)
     assert [path.name for path in tmp_path.iterdir()] == ["vineyard.facts"]
     with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("bob", connect=server.endpoint) as bob:
-        with pytest.raises(Refused, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--keep"):
+        with pytest.raises(Refused, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--state-dir"):
             bob.join(hello("bob", "D2"))
         assert snapshot(bob, (0, 0), 1) == [box()]
 
@@ -452,7 +452,9 @@ def test_a_server_that_carries_waits_for_the_one_that_keeps():
 
 
 def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):
-    with pytest.raises(ValueError, match=r"only carries: give --keep, --scene and --max-clients to the one server"):
+    with pytest.raises(
+        ValueError, match=r"only carries: give --state-dir, --scene and --max-clients to the one server"
+    ):
         Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], keep=tmp_path)
 
 

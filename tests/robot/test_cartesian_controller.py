@@ -8,8 +8,8 @@ import pytest
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose, solve_prioritized_ik
-from vinesim.robot.description.description import load_description
-from vinesim.robot.drives import Robot
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.robot import Robot
 from vinesim.scene.builder import assemble
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -21,7 +21,7 @@ def led(
     """Lead a hand for a while; the places [tick, 3] m that its point went through."""
     robot, points = hand.robot, []
     for tick in range(round(seconds / 0.01)):
-        hand.move_towards(goal, ahead, up, speed=0.3, shoulder_height=float(goal[2]))
+        hand.move_towards(goal, ahead, up, speed=0.3, working_height=float(goal[2]))
         robot.control(0.01 * tick)
         robot.rigid.predict()
         robot.rigid.integrate()

@@ -13,7 +13,9 @@ import trimesh
 import yourdfpy
 
 from vinesim import frames
-from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.errors import DescriptionError
+from vinesim.robot.description.loader import load_description
 from vinesim.scene import data_files
 
 
@@ -404,6 +406,6 @@ def test_sidecar_faults_name_the_toml(toml: str, words: str, tmp_path: pathlib.P
 
 
 def test_an_extra_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinesim.robot.description.description._resource", lambda path: None)
+    monkeypatch.setattr("vinesim.robot.description.loader.find_installed", lambda path: None)
     with pytest.raises(DescriptionError, match=r"tiago_pro: .*pip install vinesim\[tiago\]"):
         load_description("tiago_pro")

@@ -14,8 +14,11 @@ from vinesim import frames
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription, load_description
-from vinesim.robot.drives import CommandError, CommandInterface, RemoteRobot, Robot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.commands import CommandError, CommandInterface
+from vinesim.robot.drives.remote_robot import RemoteRobot
+from vinesim.robot.drives.robot import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
 

@@ -13,8 +13,10 @@ from tests.support.contact_forces import pressed_on_ground
 from vinesim import frames
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription, load_description
-from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.drives.robot import Robot
 from vinesim.robot.tasks.pick import PickBunch, PickPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model

@@ -9,8 +9,11 @@ import pytest
 
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
-from vinesim.robot.drives import CommandError, Robot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.errors import DescriptionError
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.drives.robot import Robot
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble
 

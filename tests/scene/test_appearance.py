@@ -15,9 +15,10 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.human_shapes import BODY_PARTS, body_shapes, hand_shapes
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import CRATE_WALL
-from vinesim.robot.description import description
+from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance
 from vinesim.scene.appearance import AppearanceError
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import HumanSpec, Mesh, RigidVisual, Shape
 from vinesim.sensors.camera.camera import Camera
@@ -169,7 +170,7 @@ def test_every_surface_has_its_material() -> None:
     ],
 )
 def test_what_is_wrong_with_a_figure_is_said_in_one_line(tmp_path, line: str, words: str) -> None:
-    text = (appearance.find_data_file("figures", "worker", ".toml")).read_text()
+    text = find_data_file("figures", "worker", ".toml").read_text()
     file = tmp_path / "odd.toml"
     file.write_text(text[: text.index("[parts]")] + f"[parts]\n{line}\n")
     with pytest.raises(AppearanceError, match=words) as said:
@@ -217,7 +218,7 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
 def test_a_lamp_is_seen_in_its_colour() -> None:
     """F41: the lit tier of a robot's signal tower is the greenest thing in a picture of it, in the shade too."""
     rigid = RigidWorld(sensor_scenes.empty())
-    rigid.add_robot(description.load_description("vinebot").to_spec("bot"))
+    rigid.add_robot(load_description("vinebot").to_spec("bot"))
     primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
     pose = look_at(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.6, 0.3, 0.5)).render(primitives, pose)

@@ -12,8 +12,9 @@ from vinesim import frames
 from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.camera import point_cloud
-from vinesim.sensors.camera.camera import Camera, CameraSpec, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import SensorError
 from vinesim.sensors.truth import truth
@@ -113,7 +114,7 @@ def test_a_moved_bunch_moves_in_the_picture(model) -> None:
     body_q = view.body_q.copy()
     tree = int(model.body_tree[model.bunch_body[bunch]])
     body_q[model.bodies_of(tree), :3] += 0.02 * right
-    primitives.update(dataclasses.replace(view, body_q=body_q, moved=np.array([tree])))
+    primitives.update(dataclasses.replace(view, body_q=body_q, moved_trees=np.array([tree])))
     depth = np.linalg.norm(pose[:3] - centre)
     assert column() - before == pytest.approx(0.02 / depth * sensor_scenes.SMALL.fx, rel=0.25)
 
@@ -169,7 +170,7 @@ def test_things_cast_shadows_that_follow_them() -> None:
     lit, dark = ground(1.3, 0.55, 0.0), ground(1.3, 0.15, 0.0)
     assert dark < 0.7 * lit
     at[0, 1] += 0.6
-    primitives.update(dataclasses.replace(view, link_q=at, links=view.visuals))
+    primitives.update(dataclasses.replace(view, visual_q=at, visuals=view.visuals))
     assert ground(1.3, 0.15, 0.05) < 0.7 * lit  # not yet: shadows are redrawn at a bounded rate
     assert ground(1.3, 0.15, 0.2) > 0.8 * lit
     assert ground(1.3, 0.55, 0.2) < 0.7 * lit

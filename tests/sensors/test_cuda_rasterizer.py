@@ -5,10 +5,10 @@ import pytest
 
 from tests.sensors.test_camera_raster import VIEWPOINTS
 from tests.support import sensor_scenes
-from vinesim.kernels.raster import camera_raster
-from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
-from vinesim.sensors.camera.cuda_rasterizer import CudaRasterizer
+from vinesim.kernels.raster.pinhole import EMPTY_KEY, PRIMITIVE_MASK
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.cuda_rasterizer import CudaRasterizer
 
 CLOSE_TO_A_SOLID = ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62])
 
@@ -67,7 +67,7 @@ def test_some_clusters_alone(scene) -> None:
     some = np.arange(0, len(scene.cluster_first), 5)
     _small_rasterizer().rasterize(scene, lens, some, seen.keys)
     keys = seen.keys.numpy()
-    numbers = keys[keys < int(camera_raster.EMPTY_KEY)] & int(camera_raster.PRIMITIVE_MASK)
+    numbers = keys[keys < int(EMPTY_KEY)] & int(PRIMITIVE_MASK)
     owner = np.repeat(np.arange(len(scene.cluster_first)), scene.cluster_size)
     assert len(numbers) > 100
     assert np.isin(owner[numbers], some).all()

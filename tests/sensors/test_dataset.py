@@ -18,7 +18,7 @@ from vinesim.cli.render import run as render
 from vinesim.client.composition.composer import PlacementError
 from vinesim.client.composition.randomizer import SceneRandomizer
 from vinesim.errors import UsageError
-from vinesim.robot.description.description import DescriptionError
+from vinesim.robot.description.errors import DescriptionError
 from vinesim.scene.data_files import DataFileNotFound
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene

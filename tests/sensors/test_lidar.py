@@ -107,7 +107,7 @@ def test_a_scan_of_the_vineyard_follows_motion(lidar: Lidar) -> None:
     }
     import dataclasses
 
-    primitives.update(dataclasses.replace(view, link_q=view.visual_q + 0.5 * np.eye(7)[1]))
+    primitives.update(dataclasses.replace(view, visual_q=view.visual_q + 0.5 * np.eye(7)[1]))
     moved = lidar.scan(primitives, AT)
     mine = moved.xyz[moved.labels == label(Organ.ROBOT, 0)].astype(float)
     assert np.abs(np.hypot(mine[:, 0] - 2.0, mine[:, 1] - 0.5) - 0.05).max() < 2e-5

@@ -10,8 +10,8 @@ from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.berries import lay_out_berries
 from vinesim.scene.ids import Organ, label
-from vinesim.sensors.scene.plant_primitives import Ripeness
-from vinesim.sensors.scene.primitive_batches import SPHEROID
+from vinesim.sensors.raster.primitive_arrays import SPHEROID
+from vinesim.sensors.scene.bunch_primitives import Ripeness
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
@@ -80,7 +80,7 @@ def test_only_what_moved_is_moved(model, primitives) -> None:
     shifted = view.body_q.copy()
     shifted[:, :3] += [0.0, 0.0, 0.25]  # every body, but only one tree says so
     before = primitives.shapes.a.numpy().copy()
-    dirty = primitives.update(dataclasses.replace(view, body_q=shifted, moved=np.array([tree])))
+    dirty = primitives.update(dataclasses.replace(view, body_q=shifted, moved_trees=np.array([tree])))
     moved = np.flatnonzero(np.abs(primitives.shapes.a.numpy() - before).max(1) > 1e-6)
     carriers = primitives._carrier.numpy()[moved]
     assert set(carriers) <= set(range(*model.bodies_of(tree).indices(len(model.body_mass))))
@@ -88,9 +88,9 @@ def test_only_what_moved_is_moved(model, primitives) -> None:
     assert primitives.shapes.a.numpy()[moved, 2] == pytest.approx(before[moved, 2] + 0.25, abs=1e-5)
     # the tree falls asleep a little further on: its last motion is still taken over
     shifted[:, 2] += 0.01
-    primitives.update(dataclasses.replace(view, body_q=shifted, moved=np.zeros(0, np.int64)))
+    primitives.update(dataclasses.replace(view, body_q=shifted, moved_trees=np.zeros(0, np.int64)))
     assert primitives.shapes.a.numpy()[moved, 2] == pytest.approx(before[moved, 2] + 0.26, abs=1e-5)
-    assert len(primitives.update(dataclasses.replace(view, body_q=shifted, moved=np.zeros(0, np.int64)))) == 0
+    assert len(primitives.update(dataclasses.replace(view, body_q=shifted, moved_trees=np.zeros(0, np.int64)))) == 0
 
 
 def test_bounds_hold_what_they_bound(model, primitives) -> None:
@@ -112,12 +112,12 @@ def test_a_picked_bunch_leaves_the_vine_and_rides_on_its_link(model, primitives)
     assert (primitives.upper.numpy()[mine, 2] < -1e5).all()
     link = sensor_scenes.thing(name="bunch/3", organ=Organ.BUNCH, index=bunch)
     pose = np.array([[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]])
-    primitives.update(dataclasses.replace(view, bunch_attached=attached, links=(link,), link_q=pose))
+    primitives.update(dataclasses.replace(view, bunch_attached=attached, visuals=(link,), visual_q=pose))
     there = _of(primitives, Organ.BUNCH, bunch)
     shown = there[primitives.upper.numpy()[there, 2] > 0]
     assert (primitives.shapes.kind.numpy()[shown] == 1).sum() == model.bunch_berries[bunch]
     assert np.abs(primitives.shapes.a.numpy()[shown, :3] - pose[0, :3]).max() < 0.4
-    primitives.update(dataclasses.replace(view, links=()))
+    primitives.update(dataclasses.replace(view, visuals=()))
     assert (primitives.upper.numpy()[_of(primitives, Organ.BUNCH, bunch), 2] > 0).all()
 
 
@@ -142,7 +142,7 @@ def test_berries_ride_on_their_clusters(model, primitives) -> None:
     before = primitives.shapes.a.numpy()[_berries(primitives, bunch)].copy()
     body_q, moved = _bent(model, bunch)
     tree = int(model.body_tree[model.bunch_body[bunch]])
-    primitives.update(dataclasses.replace(rest_snapshot(model), body_q=body_q, moved=np.array([tree])))
+    primitives.update(dataclasses.replace(rest_snapshot(model), body_q=body_q, moved_trees=np.array([tree])))
     mine = _berries(primitives, bunch)
     after = primitives.shapes.a.numpy()[mine]
     assert len(after) == model.bunch_berries[bunch]
@@ -164,20 +164,22 @@ def test_a_picked_bunch_keeps_the_shape_it_had(model, primitives) -> None:
     bunch = 5
     body_q, _ = _bent(model, bunch)
     tree = int(model.body_tree[model.bunch_body[bunch]])
-    view = dataclasses.replace(rest_snapshot(model), body_q=body_q, moved=np.array([tree]))
+    view = dataclasses.replace(rest_snapshot(model), body_q=body_q, moved_trees=np.array([tree]))
     primitives.update(view)
     before = primitives.shapes.a.numpy()[_berries(primitives, bunch)].copy()
     attached = view.bunch_attached.copy()
     attached[bunch] = False
     link = sensor_scenes.thing(name=f"bunch/{bunch}", organ=Organ.BUNCH, index=bunch)
     loose = body_q[model.bunch_body[bunch]][None]
-    primitives.update(dataclasses.replace(view, bunch_attached=attached, links=(link,), link_q=loose))
+    primitives.update(dataclasses.replace(view, bunch_attached=attached, visuals=(link,), visual_q=loose))
     after = primitives.shapes.a.numpy()[_berries(primitives, bunch)]
     assert np.abs(after - before).max() < 2e-6
     # someone comes, everything is laid out anew while the stub's clusters are elsewhere: the loose one keeps its shape
     others = (link, sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1)))
-    still = dataclasses.replace(rest_snapshot(model), bunch_attached=attached, links=others, moved=np.array([tree]))
-    primitives.update(dataclasses.replace(still, link_q=np.concatenate([loose, loose])))
+    still = dataclasses.replace(
+        rest_snapshot(model), bunch_attached=attached, visuals=others, moved_trees=np.array([tree])
+    )
+    primitives.update(dataclasses.replace(still, visual_q=np.concatenate([loose, loose])))
     after = primitives.shapes.a.numpy()[_berries(primitives, bunch)]
     assert np.abs(after - before).max() < 2e-6
 
@@ -187,11 +189,11 @@ def test_links_come_move_and_go(model, primitives) -> None:
     link = sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1, at=(0.0, 0.0, 0.5)), index=2)
     pose = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
     links = (link,)
-    primitives.update(dataclasses.replace(view, links=links, link_q=pose))
+    primitives.update(dataclasses.replace(view, visuals=links, visual_q=pose))
     assert primitives.count == plants + 1
     assert primitives.label[-1] == label(Organ.ROBOT, 2)
     pose = pose + 0.5 * np.eye(7)[0]
-    dirty = primitives.update(dataclasses.replace(view, links=links, link_q=pose))
+    dirty = primitives.update(dataclasses.replace(view, visuals=links, visual_q=pose))
     assert len(dirty) == 1
     assert primitives.shapes.a.numpy()[-1] == pytest.approx([1.5, 0.0, 0.5, 0.1])
     primitives.update(view)

@@ -4,8 +4,8 @@ import importlib.util
 
 import pytest
 
-from vinesim.sensors.camera import renderers
-from vinesim.sensors.camera.cuda_rasterizer import CudaRasterizer
+from vinesim.sensors.raster import renderers
+from vinesim.sensors.raster.cuda_rasterizer import CudaRasterizer
 
 
 def test_warp_draws_on_a_cpu_by_itself_and_in_pieces_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:

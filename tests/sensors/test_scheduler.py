@@ -138,7 +138,8 @@ def test_trees_that_moved_in_skipped_views_are_taken_over() -> None:
         body_q[model.bodies_of(tree), 2] += 0.3
         # moves and sleeps again between two frames
         eyes.submit(
-            dataclasses.replace(view, time=0.4, body_q=body_q, moved=np.array([tree])), {"head": sensor_scenes.AHEAD}
+            dataclasses.replace(view, time=0.4, body_q=body_q, moved_trees=np.array([tree])),
+            {"head": sensor_scenes.AHEAD},
         )
         eyes.submit(dataclasses.replace(view, time=1.0, body_q=body_q), {"head": sensor_scenes.AHEAD})
         inbox.wait(2)

@@ -28,7 +28,7 @@ def _turn(lidar: Lidar, things, motion=None, pose=None, step: float = STEP, star
     for k in range(round(0.1 / step) + 2):
         time = start + k * step
         if motion is not None:
-            view = dataclasses.replace(view, link_q=motion(time - start))
+            view = dataclasses.replace(view, visual_q=motion(time - start))
             primitives.update(view)
         rolling.pose_history.add(time, AT if pose is None else pose(time - start))
         for scan in rolling.advance(primitives, time):

@@ -10,7 +10,8 @@ from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors import spec_file
-from vinesim.sensors.camera.camera import Camera, CameraSpec, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.spec_file import SensorError
 
 SPEC = CameraSpec.load("d435")

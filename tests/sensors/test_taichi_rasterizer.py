@@ -7,13 +7,13 @@ import pytest
 
 from tests.sensors.test_camera_raster import VIEWPOINTS
 from tests.support import sensor_scenes
-from vinesim.kernels.raster import camera_raster
-from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
+from vinesim.kernels.raster.pinhole import EMPTY_KEY, PRIMITIVE_MASK
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitive_batches import KINDS
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.primitive_arrays import KINDS
 
 pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
-taichi_rasterizer = pytest.importorskip("vinesim.sensors.camera.taichi_rasterizer")
+taichi_rasterizer = pytest.importorskip("vinesim.sensors.raster.taichi_rasterizer")
 NEAR_PLANE = {
     "through the canopy, a solid beside the lens": ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62]),
     "a leaf through the pinhole": ([1.1, 0.2, 1.97], [1.4, 0.5, 1.9]),
@@ -88,7 +88,7 @@ def test_some_clusters_alone(scene, raster) -> None:
         scene, pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"]))), some, seen.keys
     )
     keys = seen.keys.numpy()
-    numbers = keys[keys < int(camera_raster.EMPTY_KEY)] & int(camera_raster.PRIMITIVE_MASK)
+    numbers = keys[keys < int(EMPTY_KEY)] & int(PRIMITIVE_MASK)
     owner = np.repeat(np.arange(len(scene.cluster_first)), scene.cluster_size)
     assert len(numbers) > 100
     assert np.isin(owner[numbers], some).all()

@@ -14,7 +14,7 @@ from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitive_batches import SPHEROID
+from vinesim.sensors.raster.primitive_arrays import SPHEROID
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.truth import truth
 
@@ -311,7 +311,7 @@ def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
     hub = body_q[model.tree_first[tree], :3].astype(float)
     body_q[bodies, :3] = hub + frames.rotate(turn, body_q[bodies, :3] - hub)
     body_q[bodies, 3:] = frames.multiply(turn, body_q[bodies, 3:])
-    primitives.update(dataclasses.replace(view, body_q=body_q, moved=np.array([tree])))
+    primitives.update(dataclasses.replace(view, body_q=body_q, moved_trees=np.array([tree])))
     shift, _ = truth.optical_flow(one, truth.render_buffers(primitives, NEAR, pose))
     carried = np.append(np.isin(one.carrier_poses[:, :3], view.body_q[bodies, :3]).all(1), [False, False])[
         one.primitive

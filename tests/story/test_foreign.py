@@ -6,8 +6,10 @@ import pytest
 from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.robot.description.description import DescriptionError, RobotDescription, load_description
-from vinesim.robot.drives import Robot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.errors import DescriptionError
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.robot import Robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.builder import assemble
 

@@ -11,7 +11,7 @@ from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import pick_planning, start_poses
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load_description
+from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Kind, thing

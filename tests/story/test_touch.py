@@ -7,7 +7,7 @@ from vinesim.client.client import Client
 from vinesim.client.recording.trace import Trace, remote_error, touch_to_motion
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.robot.description.description import load_description as load_robot
+from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene

@@ -14,8 +14,9 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, RigidVisual, Shape, Snapshot
-from vinesim.sensors.camera.camera import CameraRasterizer, CameraSpec, pinhole
+from vinesim.sensors.camera.camera import CameraSpec
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 

@@ -15,7 +15,8 @@ from vinesim.client.client import Client
 from vinesim.net.codec import messages
 from vinesim.net.replication.retained import Facts
 from vinesim.net.transport.bus import EVERY, MemoryBus, MemoryHub
-from vinesim.robot.description.description import RobotDescription, load_description
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.model import Model

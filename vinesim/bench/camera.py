@@ -21,9 +21,10 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, Measurement
-from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
+from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitive_batches import CONE, LEAF, SPHEROID
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.primitive_arrays import CONE, LEAF, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 
 _ROUNDS = 7

@@ -21,10 +21,11 @@ from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement, RigidVisual, Shape, Snapshot
-from vinesim.sensors.camera.camera import Camera, CameraRasterizer, CameraSpec, pinhole
-from vinesim.sensors.camera.renderers import RendererUnavailable
+from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import depth_colours, look_at, write_png
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.renderers import RendererUnavailable
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
 from vinesim.sensors.truth import truth
@@ -70,9 +71,11 @@ def measure_plane(spec: CameraSpec) -> DepthStatistics:
     for number, away in enumerate(RANGES):
         wall = Shape("box", (0.05, 20.0, 20.0), frames.pose(np.array([away + 0.05, 0.0, 1.0])))
         nothing = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=0)
-        view = rest_snapshot(nothing, (RigidVisual("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None])
+        snapshot = rest_snapshot(
+            nothing, (RigidVisual("wall", Organ.ROBOT, 0, (wall,)),), frames.pose(np.zeros(3))[None]
+        )
         primitives = Primitives(nothing, grass=0.0)
-        primitives.update(view)
+        primitives.update(snapshot)
         camera = Camera(spec, spec.info("optical"), seed=SEED, image_index=number)
         frame = camera.render(primitives, look_at(np.array([0, 0, 1.0]), np.array([1.0, 0, 1.0])))
         mine = (frame.labels // LABEL_STRIDE == int(Organ.ROBOT)) & (frame.exact_depth < 1.1 * away)
@@ -81,7 +84,7 @@ def measure_plane(spec: CameraSpec) -> DepthStatistics:
 
 
 def measure_plants(
-    spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot
+    spec: CameraSpec, model: Model, primitives: Primitives, snapshot: Snapshot
 ) -> dict[str, DepthStatistics]:
     """Leaves and bunches, looked at from all ranges around some bunches."""
     rng = np.random.default_rng(SEED)
@@ -89,7 +92,7 @@ def measure_plants(
     seen: dict[tuple[str, float], list[tuple[np.ndarray, np.ndarray]]] = {}
     for away in RANGES:
         for _ in range(VIEWS_PER_RANGE):
-            frame = camera.render(primitives, _towards_a_bunch(rng, model, view, away))
+            frame = camera.render(primitives, _towards_a_bunch(rng, model, snapshot, away))
             organ = frame.labels // LABEL_STRIDE
             for name, number in (("leaves", Organ.LEAF), ("bunches", Organ.BUNCH)):
                 for at in RANGES:
@@ -102,10 +105,10 @@ def measure_plants(
     return found
 
 
-def _towards_a_bunch(rng: np.random.Generator, model: Model, view: Snapshot, away: float) -> np.ndarray:
+def _towards_a_bunch(rng: np.random.Generator, model: Model, snapshot: Snapshot, away: float) -> np.ndarray:
     """Pose [7] of an optical frame that looks at some bunch from a distance, from a robot's height."""
     bunch = int(rng.integers(len(model.bunch_body)))
-    pose = view.body_q[model.bunch_body[bunch]].astype(float)
+    pose = snapshot.body_q[model.bunch_body[bunch]].astype(float)
     middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
     around = rng.uniform(0.0, 2.0 * np.pi)
     rise = float(np.clip(rng.uniform(1.2, 1.7) - middle[2], -0.4 * away, 0.4 * away))
@@ -113,15 +116,15 @@ def _towards_a_bunch(rng: np.random.Generator, model: Model, view: Snapshot, awa
     return look_at(middle + np.array([level * np.cos(around), level * np.sin(around), rise]), middle)
 
 
-def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, view: Snapshot) -> np.ndarray:
+def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, snapshot: Snapshot) -> np.ndarray:
     """Share of the bunch that is hidden, share of its berries that are seen [bunch in a picture, 2]; whole bunches."""
     rng = np.random.default_rng(SEED)
     info = spec.info("optical")
     rows = []
     for away in (0.6, 0.8, 1.0, 1.3):
         for _ in range(VIEWS_PER_RANGE):
-            seen = truth.render_buffers(primitives, info, _towards_a_bunch(rng, model, view, away))
-            for one in truth.bunch_truths(primitives, view, seen):
+            seen = truth.render_buffers(primitives, info, _towards_a_bunch(rng, model, snapshot, away))
+            for one in truth.bunch_truths(primitives, snapshot, seen):
                 left, top, right, bottom = one.amodal_box
                 whole = left > 0 and top > 0 and right < info.width - 1 and bottom < info.height - 1
                 if whole and one.amodal_pixels > 1500:
@@ -172,7 +175,7 @@ class PixelView:
     primitive: np.ndarray
 
 
-def compare_renderers(spec: CameraSpec, model: Model, view: Snapshot) -> dict[str, PixelView]:
+def compare_renderers(spec: CameraSpec, model: Model, snapshot: Snapshot) -> dict[str, PixelView]:
     """One view by every renderer that runs here on the CPU, and by the ray caster, which is the measure of all."""
     info, pose = spec.info("optical"), look_at(*RENDERER_VIEW)
     lens, found = pinhole(info, pose), {}
@@ -181,7 +184,7 @@ def compare_renderers(spec: CameraSpec, model: Model, view: Snapshot) -> dict[st
             primitives = Primitives(model, renderer=name)
         except RendererUnavailable:
             continue
-        primitives.update(view)
+        primitives.update(snapshot)
         seen = CameraRasterizer(info.width, info.height)
         seen.draw(primitives, lens)
         depth, primitive = (a.numpy().reshape(info.height, info.width) for a in (seen.depth, seen.primitive))
@@ -194,9 +197,9 @@ def compare_renderers(spec: CameraSpec, model: Model, view: Snapshot) -> dict[st
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     """Figures of all sensor models; ``plot``: a folder for the pictures."""
     model = generate(load_scene("demo"))
-    primitives, view = Primitives(model), rest_snapshot(model)
+    primitives, snapshot = Primitives(model), rest_snapshot(model)
     spec = CameraSpec.load("d435")
-    depths = {"plane": measure_plane(spec), **measure_plants(spec, model, primitives, view)}
+    depths = {"plane": measure_plane(spec), **measure_plants(spec, model, primitives, snapshot)}
     for name, one in depths.items():
         for away, error in one.error.items():
             law = float(depth_noise_formula(spec, np.array(away)))
@@ -209,13 +212,13 @@ def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     for name, scan in scans.items():
         yield Measurement("sensors", f"{name}: shots that come back, of those that hit", scan.returned, "1")
         yield Measurement("sensors", f"{name}: mixed returns", scan.mixed, "1")
-    seen = measure_berries(spec, model, primitives, view)
+    seen = measure_berries(spec, model, primitives, snapshot)
     for low, high in ((0.0, 0.1), (0.4, 0.6), (0.8, 0.95)):
         mine = (seen[:, 0] >= low) & (seen[:, 0] < high)
         if mine.any():
             case = f"berries seen, bunch hidden by {100 * low:.0f} to {100 * high:.0f} %"
             yield Measurement("sensors", case, float(np.median(seen[mine, 1])), "1")
-    pictures = compare_renderers(spec, model, view)
+    pictures = compare_renderers(spec, model, snapshot)
     cast = pictures["rays"].primitive
     for name, look in pictures.items():
         if name != "rays":

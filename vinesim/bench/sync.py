@@ -30,8 +30,8 @@ from vinesim.net.replication.peers import ACTOR_PERIOD
 from vinesim.net.transport.bus import EVERY, MemoryHub
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.description import load_description as load_robot
-from vinesim.robot.drives import RemoteRobot
+from vinesim.robot.description.loader import load_description as load_robot
+from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model

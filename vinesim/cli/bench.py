@@ -24,7 +24,7 @@ def _contact() -> Iterator[Measurement]:
 
 def _tick() -> Iterator[Measurement]:
     from vinesim.bench.contact import step_measurements
-    from vinesim.robot.description.description import load_description
+    from vinesim.robot.description.loader import load_description
 
     robot = load_description("vinebot")
     raised = robot.home.copy()
@@ -35,7 +35,7 @@ def _tick() -> Iterator[Measurement]:
 
 def _asleep() -> Iterator[Measurement]:
     from vinesim.bench.vineyard import sleeping_measurements
-    from vinesim.robot.description.description import load_description
+    from vinesim.robot.description.loader import load_description
 
     return sleeping_measurements(load_description("vinebot").to_spec("robot"))
 

@@ -14,9 +14,9 @@ from vinesim.cli.render import parse_size
 from vinesim.client.composition.randomizer import SceneRandomizer
 from vinesim.errors import UsageError
 from vinesim.scene.spec import load_scene
-from vinesim.sensors.camera import renderers
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
+from vinesim.sensors.raster import renderers
 
 Share = tuple[multiprocessing.process.BaseProcess, Connection]
 

@@ -35,11 +35,11 @@ def run(
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
     from vinesim.scene.spec import load_scene, with_seed
-    from vinesim.sensors.camera import renderers
     from vinesim.sensors.camera.camera import Camera, CameraSpec
     from vinesim.sensors.export import annotations as formats
     from vinesim.sensors.export import images as picture
     from vinesim.sensors.export.dataset import resized_intrinsics
+    from vinesim.sensors.raster import renderers
     from vinesim.sensors.scene.primitives import Primitives
     from vinesim.sensors.scene.ray_caster import enclosing_primitive
     from vinesim.sensors.truth import truth
@@ -94,7 +94,7 @@ def run(
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:
     """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
     from vinesim.client.composition.composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
-    from vinesim.robot.description import description
+    from vinesim.robot.description.loader import load_description
     from vinesim.scene import appearance
 
     placed_robots, placed_people, placed_crates = [], [], []
@@ -102,7 +102,7 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
         name, mark, where = text.rpartition("@")
         if not (mark and name):
             raise UsageError(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
-        description.load_description(name)  # says what is wrong with it
+        load_description(name)  # says what is wrong with it
         placed_robots.append(RobotPlacement(name, *_parse_place("--robot", where, 3)))
     for text in people:
         parts = text.split(",")

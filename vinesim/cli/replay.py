@@ -23,7 +23,7 @@ POLL = 0.004
 
 def run(
     *, file: pathlib.Path, connect: str | None, listen: str | None, world: str, speed: float, start: float,
-    end: float | None, out: pathlib.Path | None, place: tuple[float, float, float] | None, scene: str | None,
+    end: float | None, out: pathlib.Path | None, pose: tuple[float, float, float] | None, scene: str | None,
     seed: int | None,
 ) -> int:  # fmt: skip
     """Play a file; 0 when its end is reached, or on Ctrl-C."""
@@ -42,7 +42,7 @@ def run(
     who = ", ".join(tape.actors) or "nobody"
     print(f"{file}: {len(tape.entries)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
     if out is not None:
-        return _look(tape, stop, out, place, scene, seed, speed, start, end)
+        return _look(tape, stop, out, pose, scene, seed, speed, start, end)
     return _tell(tape, stop, connect, listen, world, speed, start, end)
 
 
@@ -78,7 +78,7 @@ def _tell(
 
 
 def _look(
-    tape: Tape, stop: threading.Event, out: pathlib.Path, place: tuple[float, float, float] | None,
+    tape: Tape, stop: threading.Event, out: pathlib.Path, pose: tuple[float, float, float] | None,
     scene: str | None, seed: int | None, speed: float, start: float, end: float | None,
 ) -> int:  # fmt: skip
     """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
@@ -102,14 +102,14 @@ def _look(
             f"{tape.path} is of scene {tape.about.get('scene', '?')!r} with digest {digest}, "
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
-    eyes = standing_view(*place) if place is not None else follow_view(_first_pose(tape))
+    eyes = standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
     out.mkdir(parents=True, exist_ok=True)
     bus = ReplayBus(tape, "spectator", start=start, end=end)
     spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
     pictures = PictureWriter(spectator, out, 1.0)
     while not (bus.ended or stop.is_set()):
         bus.play(spectator.physics.dt * speed)
-        if place is None and spectator.physics.rigid.robots:
+        if pose is None and spectator.physics.rigid.robots:
             spectator.pose = follow_view(spectator.physics.rigid.base_state(min(spectator.physics.rigid.robots))[0])
         spectator.tick()
     pictures.save(spectator)
@@ -128,4 +128,4 @@ def _first_pose(tape: Tape) -> np.ndarray:
         for entry in tape.entries:
             if entry.key.startswith("a/") and sender_of(entry.key) in such:
                 return decode_pose(entry.payload, "").base_q
-    raise UsageError(f"{tape.path} has no pose of anybody to look at: give --place X Y YAW")
+    raise UsageError(f"{tape.path} has no pose of anybody to look at: give --pose X Y YAW")

@@ -19,7 +19,7 @@ STATUS_PERIOD = 1.0
 
 
 def run(
-    *, listen: list[str] | None, connect: list[str] | None, keep: pathlib.Path | None, scene: str | None,
+    *, listen: list[str] | None, connect: list[str] | None, state_dir: pathlib.Path | None, scene: str | None,
     seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, status: str,
 ) -> int:  # fmt: skip
     """Carry messages until SIGINT or SIGTERM."""
@@ -34,7 +34,7 @@ def run(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with Server(
-        listen or everywhere(secured=tls is not None), connect=connect or (), keep=keep, plan=plan, most=max_clients,
+        listen or everywhere(secured=tls is not None), connect=connect or (), keep=state_dir, plan=plan, most=max_clients,
         quota=Quota(*quota), certificates=tls,
     ) as server:  # fmt: skip
         if status != "json":

@@ -35,7 +35,8 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.drives import RemoteRobot, Robot
+from vinesim.robot.drives.remote_robot import RemoteRobot
+from vinesim.robot.drives.robot import Robot
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate

@@ -57,9 +57,7 @@ class Physics:
             max_rate=p.max_joint_rate, fault_rate=p.fault_joint_rate,
         )  # fmt: skip
         self.rigid = RigidWorld(model, parameters=p)
-        self.contact_solver = ContactSolver(
-            model, self.plants, self.rigid, capacity=p.contact_capacity, stiffness=p.contact_stiffness
-        )
+        self.contact_solver = ContactSolver(model, self.plants, self.rigid)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)

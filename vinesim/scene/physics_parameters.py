@@ -91,6 +91,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[m] Contacts exist from this gap on, or from as far as the two can come together in one step. TUNED."""
     static_contact_margin: Positive = 0.0002
     """[m] Static geoms and other branches are in contact when a step brings them nearer than this. TUNED."""
+    impact_speed: Positive = 0.3
+    """[m/s] A contact that closes faster is an impact: its tree is integrated with phi = 1. TUNED."""
     max_separation_speed: Positive = 1.0
     """[m/s] Overlap is resolved at this speed at most. TUNED."""
     contact_capacity: Count = 128

@@ -18,8 +18,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import camera_raster, lidar_raster
-from vinesim.kernels.raster import primitives as shapes
+from vinesim.kernels.raster import camera_raster, camera_raster_plants, lidar_raster, pose_clusters
 from vinesim.kernels.sensing import lidar_echoes, stereo_depth
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.scene.model import Model
@@ -37,7 +36,16 @@ _MAX_PENDING_POSES = 1024
 
 def load_kernels() -> None:
     """Compile what pictures and scans need, or read it from the cache, before anybody waits for one."""
-    for module in (lidar_echoes, deferred, shadow_maps, shapes, stereo_depth, lidar_raster, camera_raster):
+    for module in (
+        pose_clusters,
+        camera_raster,
+        camera_raster_plants,
+        lidar_raster,
+        deferred,
+        shadow_maps,
+        stereo_depth,
+        lidar_echoes,
+    ):
         wp.load_module(module, device="cpu")
 
 
@@ -131,17 +139,17 @@ class SensorScheduler:
             if kind is None:  # a failure of the body comes first
                 raise
 
-    def submit(self, view: Snapshot, poses: Mapping[str, np.ndarray]) -> None:
+    def submit(self, snapshot: Snapshot, poses: Mapping[str, np.ndarray]) -> None:
         """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
         self._raise()
         with self._condition:
-            self._latest = (view, poses)
+            self._latest = (snapshot, poses)
             for name in self._pending_poses.keys() & poses.keys():
-                self._pending_poses[name].append((view.time, poses[name]))
+                self._pending_poses[name].append((snapshot.time, poses[name]))
                 if len(self._pending_poses[name]) > _MAX_PENDING_POSES:
                     del self._pending_poses[name][: _MAX_PENDING_POSES // 2]
-            if len(view.moved_trees):
-                self._moved_trees.append(view.moved_trees)
+            if len(snapshot.moved_trees):
+                self._moved_trees.append(snapshot.moved_trees)
                 if len(self._moved_trees) > 256:
                     self._moved_trees = [np.unique(np.concatenate(self._moved_trees))]
             self._condition.notify()
@@ -161,22 +169,22 @@ class SensorScheduler:
                     self._condition.wait_for(lambda: self._stopping or self._latest is not None)
                     if self._stopping:
                         return
-                    (view, poses), self._latest = self._latest, None
+                    (snapshot, poses), self._latest = self._latest, None
                     moved += self._moved_trees
                     self._moved_trees = []
                     for name, poses_by_time in self._pending_poses.items():
                         for time, pose in poses_by_time:
                             self._scans[name].pose_history.add(time, pose)
                         poses_by_time.clear()
-                due = [m for m in self.sensors if self._is_due(m, view.time, poses)]
+                due = [m for m in self.sensors if self._is_due(m, snapshot.time, poses)]
                 if not due:
                     continue
-                self.primitives.update(view, np.concatenate(moved) if moved else np.zeros(0, np.int64))
+                self.primitives.update(snapshot, np.concatenate(moved) if moved else np.zeros(0, np.int64))
                 moved = []
                 for sensor in due:
                     if self._stopping:
                         return
-                    for result in self._results(sensor, view.time, poses[sensor.name]):
+                    for result in self._results(sensor, snapshot.time, poses[sensor.name]):
                         sensor.deliver(result)
                         self.frames[sensor.name] += 1
         except BaseException as failure:  # surfaced by the next see() or stop()

@@ -19,7 +19,7 @@ from vinesim import frames
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
-from vinesim.robot.description import description
+from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
@@ -120,7 +120,7 @@ class SceneComposer:
         """Let robots and people in."""
         for index, one in enumerate(self.robots):
             pose = _ground_pose(one.x, one.y, one.yaw)
-            rigid.add_robot(description.load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
+            rigid.add_robot(load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
         for index, one in enumerate(self.people):
             pose = appearance.apply_posture(
                 standing_pose(_ground_pose(one.x, one.y, one.yaw), one.height), one.posture, one.height

@@ -12,9 +12,10 @@ from vinesim.client.remote.remote_human import RemoteHuman, human_spec
 from vinesim.net.codec.messages import Hello, valid_name
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.world_core import CompiledWorld
-from vinesim.robot.description import description as descriptions
-from vinesim.robot.description.description import DescriptionError, RobotDescription
-from vinesim.robot.drives import RemoteRobot
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.errors import DescriptionError
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDesc
         return own
     name = hello.robot if valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
     try:
-        known = descriptions.load_description(name)
+        known = load_description(name)
         if known.urdf == hello.urdf:
             return known
     except DescriptionError:
@@ -105,4 +106,4 @@ def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDesc
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return descriptions.load_description(file)
+        return load_description(file)

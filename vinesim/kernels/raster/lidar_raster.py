@@ -7,7 +7,9 @@ camera's pixels are (:mod:`vinesim.kernels.raster.camera_raster`).
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import (
+from vinesim.kernels.raster.intersections import hit_cone, hit_primitive, hit_sphere
+from vinesim.kernels.raster.leaf_surface import hit_leaf, hit_leaf_rectangle, inside_outline, leaf_extent, leaf_heights
+from vinesim.kernels.raster.pinhole import (
     BATCH,
     EMPTY_KEY,
     PRIMITIVE_MASK,
@@ -27,14 +29,6 @@ from vinesim.kernels.raster.primitives import (
     TRIANGLE,
     Clusters,
     Shapes,
-    hit_cone,
-    hit_leaf,
-    hit_leaf_rectangle,
-    hit_primitive,
-    hit_sphere,
-    inside_outline,
-    leaf_extent,
-    leaf_heights,
     scale_along,
     xyz,
 )

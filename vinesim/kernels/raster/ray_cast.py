@@ -6,14 +6,9 @@ under refits, and a robot that drives through the rows does not stretch it.
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import SMOOTH_SIZE, Pinhole, pixel_ray
-from vinesim.kernels.raster.primitives import (
-    FAR,
-    LEAF,
-    Shapes,
-    hit_primitive,
-    xyz,
-)
+from vinesim.kernels.raster.intersections import hit_primitive
+from vinesim.kernels.raster.pinhole import SMOOTH_SIZE, Pinhole, pixel_ray
+from vinesim.kernels.raster.primitives import FAR, LEAF, Shapes, xyz
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from vinesim.kernels.raster.primitives import Shapes, normal_at
+from vinesim.kernels.raster.intersections import normal_at
+from vinesim.kernels.raster.primitives import Shapes
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

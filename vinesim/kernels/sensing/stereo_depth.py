@@ -5,7 +5,7 @@ Disparity d = f B / z, in pixels of the imagers, which may be coarser than the p
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import Pinhole, pixel_ray
+from vinesim.kernels.raster.pinhole import Pinhole, pixel_ray
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 

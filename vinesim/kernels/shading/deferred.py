@@ -7,7 +7,7 @@ bloom, lets light through when it is pale, and darkens where it touches its neig
 
 import warp as wp
 
-from vinesim.kernels.raster.camera_raster import Pinhole
+from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.raster.primitives import LEAF, SPHEROID, Shapes
 from vinesim.kernels.shading.materials import (
     BERRY,

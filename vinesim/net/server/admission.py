@@ -106,7 +106,7 @@ class Agreement:
                 remedy = "start the client with the server's scene and seed"
             elif world in self._kept:
                 whose = f"the facts kept of world {world!r} belong to"
-                remedy = "use that scene and seed, or start the server with another --keep"
+                remedy = "use that scene and seed, or start the server with another --state-dir"
             else:
                 whose = f"world {world!r} has"
                 remedy = "start all with the same scene, seed and release of vinesim"

@@ -67,14 +67,16 @@ class Journal:
         try:
             content = path.read_bytes()
         except OSError as error:
-            raise NotKept(f"{path}: cannot be read ({error.strerror}): mend that, or give another --keep") from error
+            raise NotKept(
+                f"{path}: cannot be read ({error.strerror}): mend that, or give another --state-dir"
+            ) from error
         start = MAGIC + bytes((VERSION,))
         if not content.startswith(MAGIC):
-            raise NotKept(f"{path}: is no journal of facts: move it away, or give another --keep")
+            raise NotKept(f"{path}: is no journal of facts: move it away, or give another --state-dir")
         if not content.startswith(start):
             raise NotKept(
                 f"{path}: journal of version {content[len(MAGIC) : len(start)].hex() or 'none'}, this release reads "
-                f"{VERSION:02x}: use the release that wrote it, or give another --keep"
+                f"{VERSION:02x}: use the release that wrote it, or give another --state-dir"
             )
         head: _Head | None = None
         facts = Facts()
@@ -87,7 +89,7 @@ class Journal:
                     if head.protocol != messages.PROTOCOL:
                         raise NotKept(
                             f"{path}: facts of protocol version {head.protocol}, this release speaks "
-                            f"{messages.PROTOCOL}: use the release that wrote them, or give another --keep"
+                            f"{messages.PROTOCOL}: use the release that wrote them, or give another --state-dir"
                         )
                 else:
                     for fact in messages.decode_facts(record[_CELL.size :]):
@@ -96,7 +98,9 @@ class Journal:
         except (msgspec.DecodeError, MessageError, struct.error) as error:
             why = str(error)
         if head is None:
-            raise NotKept(f"{path}: {why}, so nobody knows whose facts these are: move it away, or give another --keep")
+            raise NotKept(
+                f"{path}: {why}, so nobody knows whose facts these are: move it away, or give another --state-dir"
+            )
         if sound < len(content):
             aside = _free_name(path)
             _write(aside, content)
@@ -213,7 +217,7 @@ def _free_name(path: pathlib.Path) -> pathlib.Path:
 
 
 def _cannot_write(path: pathlib.Path, error: OSError) -> NotKept:
-    return NotKept(f"{path}: cannot be written ({error.strerror}): make room or give another --keep")
+    return NotKept(f"{path}: cannot be written ({error.strerror}): make room or give another --state-dir")
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -75,7 +75,7 @@ class Server:
         linked = [endpoints.parse(text, secured=safe) for text in connect]
         if linked and (keep is not None or plan is not None or most is not None):
             raise WrongUse(
-                f"a server linked to {linked[0]} only carries: give --keep, --scene and --max-clients "
+                f"a server linked to {linked[0]} only carries: give --state-dir, --scene and --max-clients "
                 "to the one server that connects to nobody"
             )
         settings: dict[str, Any] = {}

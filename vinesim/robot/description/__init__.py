@@ -1,1 +1,1 @@
-"""Robot descriptions: URDF, and a TOML file beside it with what a URDF cannot say."""
+"""Robot descriptions: URDF, and a TOML file beside it with what a URDF cannot express."""

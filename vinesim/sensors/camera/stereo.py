@@ -8,19 +8,19 @@ edges grow.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import cv2
 import msgspec
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import camera_raster
+from vinesim.kernels.raster.pinhole import NEAR_DEPTH, Pinhole
 from vinesim.kernels.sensing import stereo_depth
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraInfo
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer
+from vinesim.sensors.raster.primitive_arrays import PosedPrimitives
 
 
 class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -54,15 +54,6 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Grey level from which on a window is overexposed."""
 
 
-class DepthRenderer(Protocol):
-    """What draws the depth of a scene (:class:`vinesim.sensors.camera.camera.CameraRasterizer`)."""
-
-    depth: wp.array
-
-    def draw(self, primitives: Primitives, lens: camera_raster.Pinhole) -> None:
-        """Fill ``depth`` [pixel] m."""
-
-
 class Stereo:
     """The depth sensor of one camera: its second view, and its luck."""
 
@@ -71,10 +62,9 @@ class Stereo:
         spec: StereoSpec,
         info: CameraInfo,
         reach: tuple[float, float],
-        depth_renderer: Callable[[int, int, str], DepthRenderer],
         device: str = "cpu",
     ) -> None:
-        """``reach``: nearest and farthest depth [m]; ``depth_renderer`` makes what draws a view of some width and height."""
+        """``reach``: nearest and farthest depth [m]."""
         self.info, self.device = info, device
         s = self._parameters = stereo_depth.Stereo()
         s.baseline, s.focal_baseline = spec.baseline.value, spec.focal.value * spec.baseline.value
@@ -95,7 +85,7 @@ class Stereo:
         self._rows = int(np.ceil(info.height * focal / info.fy)) + 1
         self._centre = -edge * focal, info.cy / info.fy * focal
         self._focal = focal
-        self._second = depth_renderer(self._columns, self._rows, device)
+        self._second = CameraRasterizer(self._columns, self._rows, device)
         self._window = max(1, round(spec.window.value))
         cells = int(np.ceil(info.height * s.scale)), int(np.ceil(info.width * s.scale))
         self._noise = wp.empty((2, *cells), dtype=float, device=device)
@@ -103,8 +93,8 @@ class Stereo:
 
     def measure(
         self,
-        primitives: Primitives,
-        lens: camera_raster.Pinhole,
+        primitives: PosedPrimitives,
+        lens: Pinhole,
         depth: np.ndarray,
         rgb: np.ndarray,
         rng: np.random.Generator,
@@ -135,9 +125,9 @@ class Stereo:
         )
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
 
-    def _second_pinhole(self, lens: camera_raster.Pinhole) -> camera_raster.Pinhole:
+    def _second_pinhole(self, lens: Pinhole) -> Pinhole:
         """The second imager: parallel to the first, a baseline to its right."""
-        other = camera_raster.Pinhole()
+        other = Pinhole()
         turn = np.array(lens.rotation).reshape(3, 3)
         other.eye = wp.vec3(*map(float, np.array(lens.eye) + self._parameters.baseline * turn[0]))
         other.rotation = lens.rotation
@@ -146,7 +136,7 @@ class Stereo:
         other.width, other.height, other.max_depth = self._columns, self._rows, lens.max_depth
         wide = max(other.cx, other.width - other.cx) / other.fx
         high = max(other.cy, other.height - other.cy) / other.fy
-        other.near_radius = float(camera_raster.NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
+        other.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
         return other
 
     def _correlated_noise(self, rng: np.random.Generator) -> np.ndarray:

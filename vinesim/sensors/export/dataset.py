@@ -27,7 +27,7 @@ from vinesim.scene.values import CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
-from vinesim.sensors.scene.plant_primitives import Ripeness
+from vinesim.sensors.scene.bunch_primitives import Ripeness
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.spec_file import SensorError
@@ -142,9 +142,9 @@ class VineyardRenderer:
         """Write everything about one image; its record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _random_sun(rng)
-        view, near, happens = self._pose_scene(image)
-        seen = self._choose_view(rng, view, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
-        truths = truth.bunch_truths(self.primitives, view, seen, self.caster)
+        snapshot, near, happens = self._pose_scene(image)
+        seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
+        truths = truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image)
         frame = camera.render(self.primitives, seen.pose)
         bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)
@@ -192,7 +192,7 @@ class VineyardRenderer:
         return happens
 
     def _choose_view(
-        self, rng: np.random.Generator, view: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
+        self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
     ) -> truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 
@@ -200,15 +200,15 @@ class VineyardRenderer:
         place for that is soon found.
         """
         model = self.model
-        hanging = np.flatnonzero(view.bunch_attached)
+        hanging = np.flatnonzero(snapshot.bunch_attached)
         if near is not None:
-            away = np.linalg.norm(view.body_q[model.bunch_body[hanging], :2] - near, axis=1)
+            away = np.linalg.norm(snapshot.body_q[model.bunch_body[hanging], :2] - near, axis=1)
             hanging = hanging[away < MAX_ACTOR_DISTANCE] if (away < MAX_ACTOR_DISTANCE).any() else hanging
         if not len(hanging):
             raise DatasetError(f"scene {self.scene.name!r} bears too few bunches; raise fruit.bunches")
         for attempt in range(_MAX_TRIES):
             bunch = int(hanging[rng.integers(len(hanging))])
-            pose = view.body_q[model.bunch_body[bunch]].astype(float)
+            pose = snapshot.body_q[model.bunch_body[bunch]].astype(float)
             middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
             height, away, around = (
                 rng.uniform(*CAMERA_HEIGHT),

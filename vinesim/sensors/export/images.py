@@ -115,7 +115,7 @@ def overview_pose(model: Model) -> np.ndarray:
 
 def render_overview(
     model: Model,
-    view: Snapshot,
+    snapshot: Snapshot,
     out: str | pathlib.Path | None = None,
     *,
     pose: np.ndarray | None = None,
@@ -128,14 +128,14 @@ def render_overview(
 ) -> np.ndarray:
     """A picture of a scene [height, width, 3]; written to ``out`` if given.
 
-    ``pose`` [7] is the optical frame (default :func:`standpoint`), ``view_angle`` the horizontal field of view [rad].
+    ``pose`` [7] is the optical frame (default :func:`overview_pose`), ``view_angle`` the horizontal field of view [rad].
     """
     primitives = primitives or Primitives(model)
-    primitives.update(view)
+    primitives.update(snapshot)
     focal = 0.5 * width / np.tan(0.5 * view_angle)
     info = CameraInfo(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), "portrait")
     camera = Camera(CameraSpec.load("pinhole"), info, "portrait", sun, quality=quality)
-    image = camera.render(primitives, overview_pose(model) if pose is None else pose, view.time).rgb
+    image = camera.render(primitives, overview_pose(model) if pose is None else pose, snapshot.time).rgb
     if out is not None:
         write_png(out, image)
     return image

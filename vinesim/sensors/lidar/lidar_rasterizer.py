@@ -11,9 +11,10 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.raster import camera_raster, lidar_raster
+from vinesim.kernels.raster import lidar_raster
 from vinesim.kernels.raster import primitives as shapes
-from vinesim.sensors.camera.camera import MAX_DEPTH
+from vinesim.kernels.raster.pinhole import EMPTY_KEY
+from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 from vinesim.sensors.scene.primitives import Primitives
 
 
@@ -83,7 +84,7 @@ class LidarRasterizer:
         head.azimuth_half_range = (
             wp.vec2(float(np.cos(reaches)), float(np.sin(reaches))) if reaches < 1.5 else wp.vec2(-1.0, 0.0)
         )
-        self._keys[part].fill_(int(camera_raster.EMPTY_KEY))
+        self._keys[part].fill_(int(EMPTY_KEY))
         clusters = len(primitives.cluster_first)
         if len(self._cluster_distance) != clusters:
             self._cluster_distance = wp.empty(clusters, dtype=float, device=self.device)

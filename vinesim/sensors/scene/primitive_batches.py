@@ -7,28 +7,7 @@ import dataclasses
 import numpy as np
 
 from vinesim.kernels.raster import primitives
-
-CONE, SPHEROID, LEAF, BOX, ELLIPSOID, CYLINDER, TRIANGLE = (
-    int(k)
-    for k in (
-        primitives.CONE,
-        primitives.SPHEROID,
-        primitives.LEAF,
-        primitives.BOX,
-        primitives.ELLIPSOID,
-        primitives.CYLINDER,
-        primitives.TRIANGLE,
-    )
-)
-KINDS = {
-    "cone": CONE,
-    "spheroid": SPHEROID,
-    "leaf": LEAF,
-    "box": BOX,
-    "ellipsoid": ELLIPSOID,
-    "cylinder": CYLINDER,
-    "triangle": TRIANGLE,
-}
+from vinesim.sensors.raster.primitive_arrays import CONE
 
 
 @dataclasses.dataclass

@@ -7,28 +7,33 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.raster import primitives
-from vinesim.kernels.shading import materials, shadow_maps
+from vinesim.kernels.raster import pose_clusters, primitives
+from vinesim.kernels.shading import materials
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import RigidVisual, Snapshot
-from vinesim.sensors.camera import renderers
+from vinesim.sensors.raster import renderers
+from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches, bunch_bodies, cane_batch, leaf_batches
-from vinesim.sensors.scene.primitive_batches import CONE, KINDS, LEAF, placeholder_batch
+from vinesim.sensors.scene.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
+from vinesim.sensors.scene.cluster_layout import ClusterLayout, lay_out
+from vinesim.sensors.scene.leaf_density import LeafDensity
+from vinesim.sensors.scene.plant_primitives import cane_batch, leaf_batches
+from vinesim.sensors.scene.primitive_batches import placeholder_batch
 from vinesim.sensors.scene.rigid_primitives import rigid_batches
 from vinesim.sensors.scene.static_primitives import grass_batch, litter_batch, row_layout, trellis_batch
 
 log = logging.getLogger(__name__)
 
-_MAX_CLUSTER = 24
-"""Most primitives of one cluster."""
+_SKY_OF_RIGID = 0.7
+"""Share of the sky that robots, people and boxes see: GUESSED, nothing is baked for them."""
 
 
 class Primitives:
@@ -44,11 +49,11 @@ class Primitives:
         renderer: str = "warp",
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
-        the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.camera.renderers`).
+        the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.raster.renderers`).
         """
         self.model, self.device, self._ripeness = model, device, ripeness
         self.rasterizer = renderers.create_rasterizer(renderer, device)
-        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.camera.camera.CameraRasterizer` does so itself."""
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer` does so itself."""
         bodies = len(model.body_mass)
         self._static_carrier = bodies
         """Carrier of what stands still; links follow it."""
@@ -66,7 +71,7 @@ class Primitives:
         batches += [b for b in around if b is not None]
         self._fixed_batches = [b for b in batches if len(b)] or [placeholder_batch(bodies)]
         self._tree_count = trees
-        self._links: tuple[RigidVisual, ...] = ()
+        self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
         self._moved = np.zeros(0, np.int64)
@@ -104,90 +109,75 @@ class Primitives:
 
     # -- building
 
-    def _build(self, links: tuple[RigidVisual, ...]) -> None:
+    def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
         """Lay all primitives out in clusters: plants, what stands still, then links."""
         moving = rigid_batches(
-            self.model, links, self._static_carrier + 1, 0, self._picked_bunch_shapes(links), self._ripeness
+            self.model, visuals, self._static_carrier + 1, 0, self._picked_bunch_shapes(visuals), self._ripeness
         )
-        batches = self._fixed_batches + moving
-        first_rigid = len(self._fixed_batches)
-        pieces: dict[str, list[np.ndarray]] = {
-            name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
-        }
-        kinds, firsts, sizes, owners, of_bunch, rigids = [], [], [], [], [], []
-        total = 0
-        for number, batch in enumerate(batches):
-            order = np.lexsort((batch.bunch, batch.group))
-            group, bunch = batch.group[order], batch.bunch[order]
-            starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])
-            runs = np.diff(np.r_[starts, len(group)])
-            parts = (runs + _MAX_CLUSTER - 1) // _MAX_CLUSTER
-            inner = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
-            first = np.repeat(starts, parts) + inner * _MAX_CLUSTER
-            size = np.minimum(_MAX_CLUSTER, np.repeat(runs, parts) - inner * _MAX_CLUSTER)
-            still = number < first_rigid and bool((batch.carrier == self._static_carrier).all())
-            firsts.append(total + first)
-            sizes.append(size)
-            kinds.append(np.full(len(first), batch.kind))
-            owners.append(np.full(len(first), -1) if still or number >= first_rigid else group[first])
-            of_bunch.append(bunch[first])
-            rigids.append(np.full(len(first), number >= first_rigid))
-            for name, pile in pieces.items():
-                pile.append(getattr(batch, name)[order])
-            total += len(batch)
-        whole = {name: np.concatenate(pile) for name, pile in pieces.items()}
+        layout = lay_out(self._fixed_batches, moving, self._static_carrier)
         if self.layout_version:
-            whole["c"][: len(self._baked_c)] = self._baked_c
-        self.label, self.organ = whole["label"].astype(np.int32), whole["organ"].astype(np.int32)
-        self.cluster_first, self.cluster_size, self.cluster_kind, self._owner, self._cluster_bunch = (
-            np.concatenate(x).astype(np.int32) for x in (firsts, sizes, kinds, owners, of_bunch)
-        )
-        self.rigid_clusters = np.flatnonzero(np.concatenate(rigids))
+            layout.c[: len(self._baked_c)] = self._baked_c
+        self.label, self.organ = layout.label, layout.organ
+        self.cluster_first, self.cluster_size, self.cluster_kind = layout.first, layout.size, layout.kind
+        self._owner, self._cluster_bunch = layout.owner, layout.bunch
+        self.rigid_clusters = np.flatnonzero(layout.is_rigid)
         self.cluster_version = np.zeros(len(self.cluster_first), np.int64)
-        """:attr:`version` at which each cluster moved last."""
-        order = np.argsort(self._owner, kind="stable")
-        self._by_owner = order
-        self._owner_start = np.searchsorted(self._owner[order], np.arange(self._tree_count + 1))
-        shown = (
-            (self._cluster_bunch < 0) | self._attached[self._cluster_bunch]
-            if len(self._attached)
-            else np.ones(len(order), bool)
-        )
+        """:attr:`pose_version` at which each cluster moved last."""
+        self._by_owner = np.argsort(self._owner, kind="stable")
+        self._owner_start = np.searchsorted(self._owner[self._by_owner], np.arange(self._tree_count + 1))
+        self._upload(layout)
+        self._upload_materials(layout)
+        poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
+        poses[:, 6] = 1.0
+        poses[: self._static_carrier] = self._poses[: self._static_carrier] if len(self._poses) else self._rest
+        self._poses = poses
+        self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
+        self._visuals = visuals
+        self.plant_count = len(layout.label) - sum(len(b) for b in moving)
+        self.layout_version += 1
 
-        def array(values: np.ndarray, kind: type) -> wp.array:
-            return wp.array(np.ascontiguousarray(values), dtype=kind, device=self.device)
+    def _array(self, values: np.ndarray, kind: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=kind, device=self.device)
 
-        self._local, self.shapes, self.clusters, self.materials = (
-            primitives.Shapes(),
-            primitives.Shapes(),
-            primitives.Clusters(),
-            materials.Materials(),
-        )
-        primitive_kind = np.repeat(self.cluster_kind, self.cluster_size)
+    def _upload(self, layout: ClusterLayout) -> None:
+        """Device arrays of the primitives and clusters; poses are not yet applied."""
+        total = len(layout.label)
+        self._local, self.shapes, self.clusters = primitives.Shapes(), primitives.Shapes(), primitives.Clusters()
         for name in "abcd":
-            setattr(self._local, name, array(whole[name], wp.vec4))
+            setattr(self._local, name, self._array(getattr(layout, name), wp.vec4))
             setattr(self.shapes, name, wp.empty(total, dtype=wp.vec4, device=self.device))
+        primitive_kind = np.repeat(layout.kind, layout.size)
         for table in (self._local, self.shapes):
-            table.kind = array(primitive_kind, wp.int32)
+            table.kind = self._array(primitive_kind, wp.int32)
             table.outline, table.hull = self._outline, self._hull
         self.clusters.first, self.clusters.size, self.clusters.kind, self.clusters.shown = (
-            array(v.astype(np.int32), wp.int32)
-            for v in (self.cluster_first, self.cluster_size, self.cluster_kind, shown)
+            self._array(v.astype(np.int32), wp.int32)
+            for v in (layout.first, layout.size, layout.kind, self._cluster_shown())
         )
-        self._carrier, self.labels = array(whole["carrier"].astype(np.int32), wp.int32), array(self.label, wp.int32)
-        self.organs = array(self.organ, wp.int32)
+        self._carrier, self.labels, self.organs = (
+            self._array(v, wp.int32) for v in (layout.carrier, layout.label, layout.organ)
+        )
         self.lower, self.upper = (wp.empty(total, dtype=wp.vec3, device=self.device) for _ in range(2))
-        self.ball = wp.empty(len(self.cluster_first), dtype=wp.vec4, device=self.device)
-        self.materials.material, self.materials.tint = (
-            array(whole["material"].astype(np.int32), wp.int32),
-            array(whole["tint"], wp.vec3),
-        )
-        self.lamp_primitives = np.flatnonzero(whole["material"] == int(materials.LAMP))
-        """Primitives that shine."""
-        sky = np.full(total, 0.7, np.float32)
+        self.ball = wp.empty(len(layout.first), dtype=wp.vec4, device=self.device)
+
+    def _cluster_shown(self) -> np.ndarray:
+        """Whether each cluster is to be drawn [cluster]: not those of bunches that no longer hang."""
+        if not len(self._attached):
+            return np.ones(len(self._cluster_bunch), bool)
+        return (self._cluster_bunch < 0) | self._attached[self._cluster_bunch]
+
+    def _upload_materials(self, layout: ClusterLayout) -> None:
+        """Material, colour and visible sky of each primitive; baked values are kept."""
+        self.materials = materials.Materials()
+        self.materials.material = self._array(layout.material, wp.int32)
+        self.materials.tint = self._array(layout.tint, wp.vec3)
+        self.lamp_primitives = np.flatnonzero(layout.material == int(materials.LAMP))
+        """Primitives that emit light."""
+        sky = np.full(len(layout.label), _SKY_OF_RIGID, np.float32)
         if self.layout_version:
-            known = self._sky[: min(len(self._sky), total)]
+            known = self._sky[: min(len(self._sky), len(sky))]
             sky[: len(known)] = known
+            baked = self._baked_materials
             for name in (
                 "leaf_texture",
                 "noise_texture",
@@ -198,21 +188,13 @@ class Primitives:
                 "ground_y",
                 "ground_cell",
             ):
-                setattr(self.materials, name, getattr(self._baked_materials, name))
-        self.materials.sky = array(sky, float)
-        poses = np.zeros((self._static_carrier + 1 + len(links), 7), np.float32)
-        poses[:, 6] = 1.0
-        poses[: self._static_carrier] = self._poses[: self._static_carrier] if len(self._poses) else self._rest
-        self._poses = poses
-        self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
-        self._links = links
-        self.plant_count = total - sum(len(b) for b in moving)
-        self.layout_version += 1
+                setattr(self.materials, name, getattr(baked, name))
+        self.materials.sky = self._array(sky, float)
 
-    def _picked_bunch_shapes(self, links: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
+    def _picked_bunch_shapes(self, visuals: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
         """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
         picked = {}
-        for bunch in (link.index for link in links if link.organ == Organ.BUNCH):
+        for bunch in (visual.index for visual in visuals if visual.organ == Organ.BUNCH):
             q = np.asarray(self._body_q[bunch_bodies(self.model, bunch)], float)
             picked[bunch] = self._picked_shapes.get(bunch, frames.compose(frames.inverse(q[0]), q))
         self._picked_shapes = picked
@@ -222,86 +204,66 @@ class Primitives:
         """Share of the sky that every primitive and the ground see through the leaves, in the shape at rest."""
         self._pose(np.arange(len(self.cluster_first)))
         low, high = low - 3.0, high + 3.0
-        cell = max(0.15, float((high - low).max()) / 600.0)
-        size = np.maximum(((high - low) / cell).astype(int) + 1, 1)
-        corner = np.array([low[0], low[1], 0.0])
-        density = np.zeros((*size, int(3.0 / cell) + 1), np.float32)
-        foliage = (self.organ == int(Organ.LEAF)) & (self.shapes.kind.numpy() == LEAF)
         posed = self.shapes.a.numpy()
-        at = ((posed[foliage, :3] - corner) / cell).astype(int)
-        inside = ((at >= 0) & (at < density.shape)).all(1)
-        np.add.at(density, tuple(at[inside].T), 1.1 * posed[foliage, 3][inside] ** 2 / cell**3)
-        grid = wp.array(density, dtype=float, device=self.device)
-
-        def seen(points: np.ndarray) -> np.ndarray:
-            out = wp.zeros(len(points), dtype=float, device=self.device)
-            at = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device=self.device)
-            wp.launch(
-                shadow_maps.sky_visibility,
-                len(points),
-                inputs=[grid, wp.vec3(*map(float, corner)), float(cell), at],
-                outputs=[out],
-                device=self.device,
-            )
-            return out.numpy()
-
+        is_blade = (self.organ == int(Organ.LEAF)) & (self.shapes.kind.numpy() == LEAF)
+        canopy = LeafDensity(posed[is_blade], low, high, self.device)
         # light runs on from one piece of wood to the next: cones know the sky at their far end too
         wood = np.flatnonzero(self.shapes.kind.numpy() == CONE)
         wood_c = self._local.c.numpy()
-        wood_c[wood, 2:] = np.stack([seen(self.shapes.b.numpy()[wood, :3]), np.ones(len(wood))], 1)
+        wood_c[wood, 2:] = np.stack([canopy.visible_sky(self.shapes.b.numpy()[wood, :3]), np.ones(len(wood))], 1)
         self._local.c.assign(wood_c)
         self._baked_c = wood_c.copy()
-        self._sky = seen(posed[:, :3]) if len(posed) else np.zeros(0, np.float32)
-        self.materials.sky = wp.array(self._sky, dtype=float, device=self.device)
+        self._sky = canopy.visible_sky(posed[:, :3]) if len(posed) else np.zeros(0, np.float32)
+        baked = self.materials
+        baked.sky = wp.array(self._sky, dtype=float, device=self.device)
         step = max(0.2, float((high - low).max()) / 500.0)
         x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
-        ground = seen(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1)).reshape(x.shape)
-        baked = self.materials
+        ground = canopy.visible_sky(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1)).reshape(x.shape)
         baked.rows = wp.vec2(*row_layout(self.model))
         baked.ground_sky = wp.array(ground, dtype=float, device=self.device)
         baked.ground_x, baked.ground_y, baked.ground_cell = float(low[0]), float(low[1]), float(step)
         baked.leaf_texture, baked.noise_texture, baked.soil_texture = (
-            wp.array(t, dtype=wp.vec4, device=self.device)
-            for t in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
+            wp.array(table, dtype=wp.vec4, device=self.device)
+            for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
         )
         self._baked_materials = baked
 
     # -- following the world
 
-    def update(self, view: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
+    def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
         """Take over the poses of ``view``; returns the clusters that moved.
 
         ``moved`` are the trees that may have moved since the last call (default: those of the view and of the view
         before). Whoever skips views must gather it from all of them.
         """
-        if view.visuals is not self._links:
-            self._body_q = view.body_q
-            self._build(view.visuals)
+        if snapshot.visuals is not self._visuals:
+            self._body_q = snapshot.body_q
+            self._build(snapshot.visuals)
             everything = True
         else:
             everything = False
-        attached = np.asarray(view.bunch_attached, bool)
+        attached = np.asarray(snapshot.bunch_attached, bool)
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):
             self._attached = attached.copy()
             shown = self.clusters.shown.numpy()
-            shown[:] = (self._cluster_bunch < 0) | self._attached[self._cluster_bunch]
+            shown[:] = self._cluster_shown()
             if self.device != "cpu":
                 self.clusters.shown.assign(shown)
-        trees = np.union1d(view.moved_trees if moved is None else moved, self._moved).astype(np.int64)
-        self._moved = np.asarray(view.moved_trees, np.int64)
+        trees = np.union1d(snapshot.moved_trees if moved is None else moved, self._moved).astype(np.int64)
+        self._moved = np.asarray(snapshot.moved_trees, np.int64)
         if everything:
             dirty = np.arange(len(self.cluster_first))
         else:
             dirty = self._tree_clusters(trees)
             if len(changed):
                 dirty = np.union1d(dirty, np.flatnonzero(np.isin(self._cluster_bunch, changed)))
-            link_q = np.asarray(view.visual_q, np.float32).reshape(-1, 7)
-            if len(self.rigid_clusters) and not np.array_equal(self._poses[self._static_carrier + 1 :], link_q):
+            visual_q = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
+            if len(self.rigid_clusters) and not np.array_equal(self._poses[self._static_carrier + 1 :], visual_q):
                 dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
-            self._poses[: self._static_carrier] = view.body_q
-            self._poses[self._static_carrier + 1 :] = np.asarray(view.visual_q, np.float32).reshape(-1, 7)
+            self._poses[: self._static_carrier] = snapshot.body_q
+            self._poses[self._static_carrier + 1 :] = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
             self._pose(dirty)
         return dirty
 
@@ -314,7 +276,7 @@ class Primitives:
     def _pose(self, dirty: np.ndarray) -> None:
         self._pose_array.assign(self._poses)
         wp.launch(
-            primitives.pose_clusters,
+            pose_clusters.pose_clusters,
             len(dirty),
             inputs=[
                 self._local,
@@ -330,14 +292,14 @@ class Primitives:
         self.cluster_version[dirty] = self.pose_version
 
 
-def rest_snapshot(model: Model, links: tuple[RigidVisual, ...] = (), link_q: np.ndarray | None = None) -> Snapshot:
+def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:
     """A view of the vineyard at rest, for pictures and tests without physics."""
     return Snapshot(
         time=0.0,
         tick=0,
         body_q=State.at_rest(model).body_q,
         bunch_attached=np.ones(len(model.bunch_body), bool),
-        visuals=links,
-        visual_q=np.zeros((0, 7)) if link_q is None else np.asarray(link_q, float),
+        visuals=visuals,
+        visual_q=np.zeros((0, 7)) if visual_q is None else np.asarray(visual_q, float),
         moved_trees=np.zeros(0, np.int64),
     )

@@ -6,9 +6,10 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.raster import camera_raster, ray_cast
-from vinesim.sensors.camera.camera import MAX_DEPTH
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID
+from vinesim.kernels.raster import ray_cast
+from vinesim.kernels.raster.pinhole import Pinhole
+from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
+from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 
 
@@ -101,7 +102,7 @@ class RayCaster:
         found = primitive.numpy()
         return np.where(found == -1, np.inf, distance.numpy()), found
 
-    def cast_camera(self, lens: camera_raster.Pinhole) -> tuple[np.ndarray, np.ndarray]:
+    def cast_camera(self, lens: Pinhole) -> tuple[np.ndarray, np.ndarray]:
         """Depth [height, width] m (inf: nothing) and primitives [height, width] of a camera; as :meth:`cast`."""
         p, count = self.primitives, lens.width * lens.height
         depth = wp.empty(count, dtype=float, device=p.device)

@@ -13,8 +13,9 @@ from vinesim.scene.appearance import smooth_normals
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import Mesh, RigidVisual, Shape
-from vinesim.sensors.scene.plant_primitives import Ripeness, bunch_batches
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE, Batch, make_batch
+from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE
+from vinesim.sensors.scene.bunch_primitives import Ripeness, bunch_batches
+from vinesim.sensors.scene.primitive_batches import Batch, make_batch
 
 _MAX_MESH_FACES = 4000
 """Most triangles of one mesh; finer ones are simplified."""
@@ -39,7 +40,7 @@ _NORMAL_LEVELS = 2047
 
 def rigid_batches(
     model: Model,
-    links: tuple[RigidVisual, ...],
+    visuals: tuple[RigidVisual, ...],
     first: int,
     groups: int,
     shape: dict[int, np.ndarray],
@@ -50,20 +51,20 @@ def rigid_batches(
     ``shape`` has the poses [piece, 7] of each picked bunch's pieces in its frame.
     """
     batches: list[Batch] = []
-    for k, link in enumerate(links):
-        if link.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
-            place = shape[link.index]
-            which, on = np.array([link.index]), np.full(len(place), first + k)
+    for k, visual in enumerate(visuals):
+        if visual.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
+            place = shape[visual.index]
+            which, on = np.array([visual.index]), np.full(len(place), first + k)
             mine = bunch_batches(model, which, [place], [on], np.array([groups + k]), ripeness)
             batches += [dataclasses.replace(b, bunch=np.full(len(b), -1)) for b in mine]
             continue
-        usual = _DEFAULT_SURFACE.get(link.organ, "paint")
-        name = label(link.organ, link.index)
-        for piece in link.shapes:
+        usual = _DEFAULT_SURFACE.get(visual.organ, "paint")
+        name = label(visual.organ, visual.index)
+        for piece in visual.shapes:
             common = {
                 "material": _MATERIALS[piece.surface or usual],
                 "tint": np.asarray(piece.rgba[:3]) ** 2.2,
-                "organ": int(link.organ),
+                "organ": int(visual.organ),
                 "label": name,
                 "carrier": first + k,
                 "group": groups + k,

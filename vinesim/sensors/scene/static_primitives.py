@@ -8,8 +8,9 @@ from vinesim.kernels.shading import materials
 from vinesim.scene import leaves
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.primitive_batches import CONE, LEAF, Batch, make_batch, stack_columns
+from vinesim.sensors.scene.primitive_batches import Batch, make_batch, stack_columns
 
 _CELL_SIZE = 2.5
 """Side of the squares in which things that stand static_carrier are clustered [m]."""

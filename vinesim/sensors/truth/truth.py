@@ -18,8 +18,8 @@ from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.camera import point_cloud
-from vinesim.sensors.camera.camera import CameraRasterizer, pinhole
-from vinesim.sensors.scene.primitive_batches import CONE, SPHEROID
+from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.ray_caster import RayCaster
 
@@ -186,7 +186,7 @@ class BunchTruth:
 
 
 def bunch_truths(
-    primitives: Primitives, view: Snapshot, seen: PixelBuffers, caster: RayCaster | None = None
+    primitives: Primitives, snapshot: Snapshot, seen: PixelBuffers, caster: RayCaster | None = None
 ) -> tuple[BunchTruth, ...]:
     """Every bunch of which some pixel would be seen if it were alone, by index.
 
@@ -201,11 +201,11 @@ def bunch_truths(
     fruit = fruit[primitives.clusters_shown()[fruit]]
     count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
     posed = [getattr(primitives.shapes, k).numpy() for k in "ab"]
-    loose = {one.index: k for k, one in enumerate(view.visuals) if one.organ == Organ.BUNCH}
+    loose = {one.index: k for k, one in enumerate(snapshot.visuals) if one.organ == Organ.BUNCH}
     cuts = {
-        int(bunch): cut_point(model, view.body_q, int(bunch))
+        int(bunch): cut_point(model, snapshot.body_q, int(bunch))
         for bunch in np.unique(named[fruit] % LABEL_STRIDE)
-        if view.bunch_attached[bunch]
+        if snapshot.bunch_attached[bunch]
     }
     clear = _visible_cut_points(caster, seen.pose[:3], cuts)
     found = []
@@ -224,8 +224,8 @@ def bunch_truths(
                 for k in mine
             ]
         )
-        attached = bool(view.bunch_attached[bunch])
-        turn = (view.body_q[model.bunch_body[bunch]] if attached else view.visual_q[loose[bunch]])[3:]
+        attached = bool(snapshot.bunch_attached[bunch])
+        turn = (snapshot.body_q[model.bunch_body[bunch]] if attached else snapshot.visual_q[loose[bunch]])[3:]
         frame, size = _box_around(
             *(p[parts] for p in posed), np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
         )

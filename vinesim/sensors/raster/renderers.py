@@ -1,16 +1,10 @@
-"""Who finds out what each pixel sees: Warp's rasteriser, its form for GPUs, or the Taichi twin; all find the same."""
+"""Renderers by name: Warp on a CPU, Warp on CUDA, Taichi. All find the same primitive in every pixel."""
 
 from __future__ import annotations
 
 import importlib.util
-from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-import warp as wp
-
-if TYPE_CHECKING:
-    from vinesim.kernels.raster.camera_raster import Pinhole
-    from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.raster.primitive_arrays import PrimitiveRasterizer
 
 RENDERERS = ("warp", "taichi", "taichi-gpu")
 """By name, the default first (docs/decisions/renderers.md)."""
@@ -20,14 +14,6 @@ class RendererUnavailable(ValueError):
     """The text says which renderer cannot be had, and what to do."""
 
     exit_code = 3
-
-
-class PrimitiveRasterizer(Protocol):
-    """Something that draws keys: depth [um] above, number of the primitive below (see kernels/raster/camera_raster.py)."""
-
-    def rasterize(self, primitives: Primitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array) -> None:
-        """The nearest primitive of every pixel, of all clusters or of some [k]."""
-        ...
 
 
 def check_renderer(renderer: str) -> str:
@@ -48,7 +34,7 @@ def create_rasterizer(renderer: str, device: str) -> PrimitiveRasterizer | None:
             raise RendererUnavailable(
                 f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out"
             )
-        from vinesim.sensors.camera.taichi_rasterizer import TaichiRasterizer
+        from vinesim.sensors.raster.taichi_rasterizer import TaichiRasterizer
 
         try:
             return TaichiRasterizer(gpu=renderer == "taichi-gpu")
@@ -58,6 +44,6 @@ def create_rasterizer(renderer: str, device: str) -> PrimitiveRasterizer | None:
             ) from None
     if device == "cpu":
         return None
-    from vinesim.sensors.camera.cuda_rasterizer import CudaRasterizer
+    from vinesim.sensors.raster.cuda_rasterizer import CudaRasterizer
 
     return CudaRasterizer(device)

@@ -1,51 +1,24 @@
-"""The rasteriser once more, in Taichi: for all cores of a CPU, and for GPUs that Warp cannot use (Vulkan, Metal).
+"""Primitives in Taichi: for each kind, functions that place it in the optical frame, bound it, and meet it with a ray.
 
-It reads the arrays that kernels/raster/primitives.py describes and finds the same primitive in every pixel. Each kind is three
-functions: ``place`` carries a primitive into the optical frame, ``outline`` bounds its picture by a box and two strips
-``low <= x - slope y <= high``, ``hit`` meets it with the ray of a pixel.
-
-A GPU here may have no 64-bit atomics. There depth and number are found one after the other, in two passes.
-
-Only this module knows Taichi. No postponed annotations: Taichi needs real ones.
+``place`` carries a primitive into the optical frame, ``outline`` bounds its picture by a box and two strips
+``low <= x - slope y <= high``, ``hit`` meets it with the ray of a pixel. The arrays are those of
+:mod:`vinesim.kernels.raster.primitives`. No postponed annotations: Taichi needs real ones.
 """
 
-import contextlib
-import functools
-import io
 import os
-from typing import TYPE_CHECKING
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # standard output belongs to the command
 
-import numpy as np
 import taichi as ti
-import warp as wp
 from taichi.math import clamp, cross, dot, length, vec2, vec3, vec4
 
-from vinesim.kernels.raster import camera_raster
-from vinesim.kernels.raster import primitives as shapes
-from vinesim.sensors.scene.primitive_batches import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
+from vinesim.kernels.raster import leaf_surface, pinhole, primitives
+from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
 
-if TYPE_CHECKING:
-    from vinesim.sensors.scene.primitives import Primitives
-
-FAR, UNBOUND, CLOSE = float(shapes.FAR), float(camera_raster.UNBOUND), float(camera_raster.NEAR_DEPTH)
-EMPTY, SMOOTH_SIZE, TEXELS = (
-    int(camera_raster.EMPTY_KEY),
-    float(camera_raster.SMOOTH_SIZE),
-    float(shapes.OUTLINE_TEXELS),
-)
-_NO_PRIMITIVE = 2**31 - 1
-_INEXACT = 2**30
-"""Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
-_CORES, _GPU = (64, 1), (24, 32)
-"""How many share the primitives of a cluster, and the rows of each of them. Taichi hands 512 iterations at once to a
-core of a CPU, idle ones counted: so 8 clusters, few enough that no core is left with all that is near."""
-KEY, DEPTH, NUMBER = range(3)
-"""What a pass draws: depth and number in one; depth alone; the number of what lies at that depth."""
+FAR, UNBOUND, NEAR_DEPTH = float(primitives.FAR), float(pinhole.UNBOUND), float(pinhole.NEAR_DEPTH)
+TEXELS = float(leaf_surface.OUTLINE_TEXELS)
 
 mat3 = ti.types.matrix(3, 3, ti.f32)
-Table = ti.types.ndarray(dtype=vec4, ndim=1)
 Placed = ti.types.struct(a=vec4, b=vec4, c=vec4, d=vec4)
 """A primitive in the optical frame; boxes and ellipsoids keep two axes in b and c, with a half size beside each."""
 Lens = ti.types.struct(
@@ -104,7 +77,7 @@ def leaf_outline(s, hull: ti.template(), lens):
         q[2] = ti.max(q[2], 0.01)
         at = pixel_of(lens, q)
         box, turned = widened(box, at), widened(turned, vec2(at[0] - at[1], at[0] + at[1]))
-    if depth < CLOSE:
+    if depth < NEAR_DEPTH:
         turned = vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
         box = ball(lens, p + rib * (0.25 * size), 1.45 * size)
         if p[2] < -1.6 * size:
@@ -117,8 +90,8 @@ def cone_outline(s, hull: ti.template(), lens):
     a, b, r = s.a.xyz, s.b.xyz, ti.max(s.a[3], s.b[3])
     box, strip = EMPTY_BOUNDS, UNBOUNDED_STRIP
     if ti.max(a[2], b[2]) > -r:
-        # what comes closer than CLOSE may be cut there if its axis stays clear of all that is so close and in view
-        axis, cut, start, end, clear = b - a, CLOSE - r, a, b, True
+        # what comes closer than NEAR_DEPTH may be cut there if its axis stays clear of all that is so close and in view
+        axis, cut, start, end, clear = b - a, NEAR_DEPTH - r, a, b, True
         if ti.min(a[2], b[2]) < cut:
             clear = length(a + axis * clamp(-dot(a, axis) / dot(axis, axis), 0.0, 1.0)) - r > lens.near_radius
             if a[2] < cut and b[2] > cut:
@@ -164,7 +137,7 @@ def cylinder_outline(s, hull: ti.template(), lens):
 @ti.func
 def box_outline(s, hull: ti.template(), lens):
     o = ball_outline(lens, s.a.xyz, length(vec3(s.a[3], s.b[3], s.c[3])))
-    if o.depth > CLOSE:
+    if o.depth > NEAR_DEPTH:
         o.box = EMPTY_BOUNDS
         x, y, z = s.b.xyz * s.a[3], s.c.xyz * s.b[3], cross(s.b.xyz, s.c.xyz) * s.c[3]
         for n in ti.static(range(8)):
@@ -178,7 +151,7 @@ def triangle_outline(s, hull: ti.template(), lens):
     a, b, c = s.a.xyz, s.b.xyz, s.c.xyz
     depth, box = ti.min(a[2], b[2], c[2]), EMPTY_BOUNDS
     if dot(a, cross(b - a, c - a)) < 0.0 and ti.max(a[2], b[2], c[2]) > 0.0:
-        if depth > CLOSE:
+        if depth > NEAR_DEPTH:
             box = widened(widened(widened(box, pixel_of(lens, a)), pixel_of(lens, b)), pixel_of(lens, c))
         else:
             middle = (a + b + c) / 3.0
@@ -383,7 +356,7 @@ def place_box(lens, a, b, c, d):
     return Placed(a=point(lens, a), b=arrow(lens, vec4(first, c[0])), c=arrow(lens, vec4(second, c[1])), d=d)
 
 
-_KINDS = {
+KERNEL_FUNCTIONS = {
     CONE: (place_points, cone_outline, hit_cone),
     SPHEROID: (place_blade, spheroid_outline, hit_spheroid),
     TRIANGLE: (place_points, triangle_outline, hit_triangle),
@@ -392,171 +365,3 @@ _KINDS = {
     CYLINDER: (place_points, cylinder_outline, hit_cylinder),
     LEAF: (place_blade, leaf_outline, hit_leaf),  # last: the dearest test, so most of it is hidden by then
 }
-
-
-# ------------------------------------------------------------------------------------------------ drawing
-
-
-@ti.func
-def lens_of(view: ti.template()):
-    """The camera out of one array: a struct of vectors costs Taichi a millisecond a launch."""
-    return Lens(
-        eye=vec3(view[0], view[1], view[2]),
-        rotation=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
-        focal=vec2(view[12], view[13]),
-        centre=vec2(view[14], view[15]),
-        size=vec2(view[16], view[17]),
-        max_depth=view[18],
-        near_radius=view[19],
-    )
-
-
-@functools.cache
-def _draw_kernel(kind: int, phase: int):
-    """The kernel that draws clusters of one kind.
-
-    One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster.
-    """
-    place, outline, hit = _KINDS[kind]
-
-    @ti.kernel
-    def draw(
-        a: Table, b: Table, c: Table, d: Table,
-        outlines: ti.types.ndarray(ndim=3), hull: ti.types.ndarray(dtype=ti.f32, ndim=3),
-        first: ti.types.ndarray(dtype=ti.i32, ndim=1), size: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        which: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        view: ti.types.ndarray(dtype=ti.f32, ndim=1), lanes: ti.i32, slices: ti.i32,
-        keys: ti.types.ndarray(ndim=1), number: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ):  # fmt: skip
-        for k, lane, part in ti.ndrange(which.shape[0], lanes, slices):
-            i, end = first[which[k]] + lane, first[which[k]] + size[which[k]]
-            while i < end:
-                lens = lens_of(view)
-                s = place(lens, a[i], b[i], c[i], d[i])
-                o = outline(s, hull, lens)
-                smooth = s.a[3] * lens.focal[0] > s.a[2] * SMOOTH_SIZE
-                nearest = int(clamp(o.depth, 0.0, lens.max_depth) * 1.0e6)
-                left, right = clamp(o.box[0] - 0.01, 0.0, lens.size[0]), clamp(o.box[1] + 1.01, 0.0, lens.size[0])
-                top, bottom = (
-                    int(clamp(o.box[2] - 0.01, 0.0, lens.size[1])),
-                    int(clamp(o.box[3] + 1.01, 0.0, lens.size[1])),
-                )
-                if left < right:
-                    y = top + part
-                    while y < bottom:
-                        x0 = ti.max(left, o.rising[0] * y + o.rising[1] - 0.02, o.falling[0] * y + o.falling[1] - 0.02)
-                        x1 = ti.min(right, o.rising[0] * y + o.rising[2] + 1.02, o.falling[0] * y + o.falling[2] + 1.02)
-                        for x in range(int(x0), int(ti.max(x1, 0.0))):
-                            at = y * int(lens.size[0]) + x
-                            hidden = False
-                            if ti.static(phase == KEY):
-                                hidden = keys[at] <= ti.cast(nearest, ti.i64) << 32
-                            else:
-                                hidden = keys[at] < nearest
-                            if not hidden:
-                                ray = vec3((vec2(x, y) - lens.centre) / lens.focal, 1.0)
-                                t = hit(s, outlines, ray, smooth)
-                                if t < lens.max_depth:
-                                    z = int(t * 1.0e6)
-                                    if ti.static(phase == KEY):
-                                        key = (ti.cast(z, ti.i64) << 32) | i
-                                        if key < keys[at]:
-                                            ti.atomic_min(keys[at], key)
-                                    elif ti.static(phase == DEPTH):
-                                        ti.atomic_min(keys[at], z)
-                                    elif z <= keys[at] + 1:
-                                        ti.atomic_min(number[at], i + ti.select(z == keys[at], 0, _INEXACT))
-                        y += slices
-                i += lanes
-
-    return draw
-
-
-class TaichiRasterizer:
-    """Fills the keys of pictures as Warp's rasteriser does: on all cores of the CPU, or on a Vulkan or Metal GPU."""
-
-    def __init__(self, gpu: bool = False) -> None:
-        """Raises RuntimeError where there is no such GPU. A process has one kind of twin."""
-        _start(gpu)
-        self._gpu = gpu
-        self._of: tuple[object, int] = (None, -1)
-        self._number = np.zeros(1, np.int32)
-        self._tables: list = []
-        self._pixels: list = []
-
-    def rasterize(
-        self, primitives: "Primitives", lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
-    ) -> None:
-        """The nearest primitive of every pixel, of all clusters or of some [k]."""
-        which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
-        kind = primitives.cluster_kind[which]
-        mine = {number: which[kind == number] for number in _KINDS}
-        mine = {number: these for number, these in mine.items() if len(these)}
-        if self._gpu:
-            self._rasterize_on_gpu(primitives, lens, mine, keys.numpy())
-            return
-        s, eye, pixels = primitives.shapes, _pinhole_values(lens), keys.numpy()
-        tables = [t.numpy() for t in (s.a, s.b, s.c, s.d, s.outline, s.hull)]
-        pixels.fill(EMPTY)
-        for number, these in mine.items():
-            clusters_of = primitives.cluster_first, primitives.cluster_size, these
-            _draw_kernel(number, KEY)(*tables, *clusters_of, eye, *_CORES, pixels, self._number)
-
-    def _rasterize_on_gpu(
-        self, primitives: "Primitives", lens: camera_raster.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
-    ) -> None:
-        """On a GPU: depths, then numbers; what has not moved stays there."""
-        if self._of != (primitives, primitives.pose_version):
-            s, self._of = primitives.shapes, (primitives, primitives.pose_version)
-            vectors = [(ti.Vector.ndarray(4, ti.f32, len(t)), t.numpy()) for t in (s.a, s.b, s.c, s.d)]
-            flat = [(ti.ndarray(ti.i32, s.outline.shape), s.outline.numpy().astype(np.int32))]
-            hull = s.hull.numpy()
-            flat += [(ti.ndarray(ti.f32, hull.shape), hull)]
-            for place, values in vectors + flat:
-                place.from_numpy(np.ascontiguousarray(values))
-            self._tables = [place for place, _ in vectors + flat]
-        if not self._pixels or self._pixels[0].shape != keys.shape:
-            self._pixels = [ti.ndarray(ti.i32, keys.shape) for _ in range(2)]
-        for array in self._pixels:
-            array.fill(_NO_PRIMITIVE)
-        eye = _pinhole_values(lens)
-        for phase in (DEPTH, NUMBER):
-            for number, these in mine.items():
-                clusters_of = primitives.cluster_first, primitives.cluster_size, these
-                _draw_kernel(number, phase)(*self._tables, *clusters_of, eye, *_GPU, *self._pixels)
-        depth, number = (array.to_numpy().astype(np.int64) for array in self._pixels)
-        keys[:] = np.where(number == _NO_PRIMITIVE, EMPTY, (depth << 32) | (number & (_INEXACT - 1)))
-
-
-@functools.cache
-def _start(gpu: bool) -> None:
-    """Taichi, once a process; its greeting is kept from standard output, which belongs to the command."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        if gpu:
-            ti.init(arch=[ti.metal, ti.vulkan], enable_fallback=False, log_level=ti.ERROR)
-        else:
-            ti.init(arch=ti.cpu, log_level=ti.ERROR)
-        ti.sync()
-
-
-def _pinhole_values(lens: camera_raster.Pinhole) -> np.ndarray:
-    """What :func:`lens_of` reads."""
-    others = lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.max_depth, lens.near_radius
-    return np.concatenate([np.array(lens.eye), np.array(lens.rotation).ravel(), others]).astype(np.float32)
-
-
-def _visible_clusters(primitives: "Primitives", lens: camera_raster.Pinhole) -> np.ndarray:
-    """Clusters of which a pixel may see something, near ones first [k]."""
-    ball = primitives.ball.numpy()
-    r = ball[:, 3]
-    p = (ball[:, :3] - np.array(lens.eye)) @ np.array(lens.rotation).reshape(3, 3).T
-    seen = (r > 0.0) & (p[:, 2] > -r) & (p[:, 2] - r < lens.max_depth)
-    for x, low, high in (
-        (p[:, 0], -lens.cx / lens.fx, (lens.width - lens.cx) / lens.fx),
-        (p[:, 1], -lens.cy / lens.fy, (lens.height - lens.cy) / lens.fy),
-    ):
-        seen &= x - high * p[:, 2] < r * np.hypot(1.0, high)
-        seen &= x - low * p[:, 2] > -r * np.hypot(1.0, low)
-    which = np.flatnonzero(seen)
-    distance = np.linalg.norm(p[which], axis=1) - r[which]
-    return which[np.argsort(distance, kind="stable")].astype(np.int32)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import camera_raster, cuda_raster
-
-if TYPE_CHECKING:
-    from vinesim.sensors.scene.primitives import Primitives
+from vinesim.kernels.raster import cuda_raster
+from vinesim.kernels.raster.pinhole import EMPTY_KEY, Pinhole
+from vinesim.sensors.raster.primitive_arrays import PosedPrimitives
 
 _LISTS = int(cuda_raster.TILE_LISTS)
 
@@ -43,13 +40,13 @@ class CudaRasterizer:
         self._all = wp.empty(0, dtype=wp.int32, device=device)
 
     def rasterize(
-        self, primitives: Primitives, lens: camera_raster.Pinhole, clusters: np.ndarray | None, keys: wp.array
+        self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
         """The nearest primitive of every pixel, of all clusters or of some [k]."""
         if len(self._all) != len(primitives.cluster_first):
             self._all = wp.array(np.arange(len(primitives.cluster_first), dtype=np.int32), device=self.device)
         which = self._all if clusters is None else wp.array(np.asarray(clusters, np.int32), device=self.device)
-        keys.fill_(int(camera_raster.EMPTY_KEY))
+        keys.fill_(int(EMPTY_KEY))
         self._count.zero_()
         wp.launch(
             cuda_raster.list_tiles,

@@ -1,0 +1,101 @@
+"""Options of ``vinesim client`` as one value, and the checks that need no scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Collection
+
+from vinesim.errors import UsageError
+
+ROLES = ("robot", "human", "spectator")
+
+ROLES_OF_OPTION = {
+    **dict.fromkeys(("robot", "approach", "namespace", "ros", "push", "job", "watch"), ("robot",)),
+    **dict.fromkeys(("walk", "reach", "height"), ("human",)),
+    "jitter_buffer": ("robot", "human"),
+    "sensor_hz": ("robot", "spectator"),
+    "renderer": ("robot", "spectator"),
+}
+"""The roles that an option belongs to, by its name; all roles have the options that are not named here."""
+
+STATUS_FORMATS = ("text", "json", "none")
+
+
+@dataclasses.dataclass(frozen=True)
+class ClientOptions:
+    """What stands on the command line of one client; each field has the name of its option."""
+
+    role: str
+    name: str | None
+    """None: the role and the process id."""
+    connect: str | None
+    """Endpoint of the server; None: no network."""
+    tls: pathlib.Path | None
+    scene: str
+    seed: int | None
+    robot: list[str] | None
+    """One robot for each; None: one vinebot."""
+    spawn: int
+    pose: tuple[float, float, float] | None
+    """x, y [m] and yaw [rad] of the start, instead of the scene's."""
+    approach: float
+    """How far behind its start pose a robot begins [m]."""
+    namespace: str
+    ros: bool
+    push: int | None
+    """Bunch."""
+    job: str | None
+    walk: tuple[float, float] | None
+    """x, y [m]."""
+    reach: int | None
+    """Bunch."""
+    height: float
+    """[m]"""
+    watch: int | None
+    """Bunch."""
+    interest_radius: float
+    """[m]"""
+    jitter_buffer: float
+    """[ms]"""
+    device: str
+    threads: int
+    seconds: float | None
+    """Simulated time after which the client stops [s]; None: until a signal."""
+    out: pathlib.Path | None
+    status: str
+    sensor_hz: float | None
+    renderer: str
+
+
+def check_role(role: str, given: Collection[str]) -> None:
+    """:class:`UsageError` unless there is such a role and it has all the options ``given`` on the command line."""
+    if role not in ROLES:
+        raise UsageError(f"role {role!r} is none of {', '.join(ROLES)}; give one of them")
+    for option in sorted(given):
+        roles = ROLES_OF_OPTION.get(option, ROLES)
+        if role not in roles:
+            flag = "--no-ros" if option == "ros" else f"--{option.replace('_', '-')}"
+            raise UsageError(f"{flag} is an option of --role {' or '.join(roles)}, not of {role}; leave it out")
+
+
+def check_status(status: str) -> None:
+    """:class:`UsageError` unless there is such a format of status lines."""
+    if status not in STATUS_FORMATS:
+        raise UsageError(f"--status {status!r}: give text, json or none")
+
+
+def check_options(options: ClientOptions) -> None:
+    """Refuse what can be refused before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
+    check_status(options.status)
+    if options.tls is not None and options.connect is None:
+        raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")
+    from vinesim.physics.plants.device_buffers import find_device
+    from vinesim.sensors.raster import renderers
+
+    find_device(options.device)
+    renderers.check_renderer(options.renderer)
+    if options.threads > 1 and options.device != "cpu":
+        raise UsageError(
+            f"--threads {options.threads} --device {options.device}: threads are for the CPU; leave one of the two out"
+        )

@@ -1,0 +1,169 @@
+"""What the processes of all client roles have in common: bus, loop, status lines, report, and their orderly end."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import os
+import pathlib
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Self, TypeVar
+
+from vinesim.cli.client_options import ClientOptions, check_options
+from vinesim.client.client import Client
+from vinesim.client.rate_loop import RateLoop
+from vinesim.client.recording.trace import Trace
+from vinesim.client.status import Status
+from vinesim.client.tasks.start_poses import with_start_pose
+from vinesim.net.transport.bus import Bus, MemoryHub
+from vinesim.robot.tasks.task import Task
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.model import Model
+from vinesim.scene.spec import load_scene, with_seed
+
+SWITCH_INTERVAL = 2e-4
+"""How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
+STATUS_PERIOD = 1.0
+"""Wall time between two status lines [s]."""
+TRACE_CAPACITY = 1 << 17
+"""Steps that a trace of one bunch can hold: 22 minutes."""
+
+T = TypeVar("T")
+
+
+class ClientSession:
+    """One client process: its scene, its buses and its loop. A context; leaving it closes everything in order."""
+
+    def __init__(self, options: ClientOptions) -> None:
+        """Check the options and generate the vineyard; errors of the scene and :class:`UsageError` come from here."""
+        check_options(options)
+        # The loop gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a step.
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        self.options = options
+        self.name = options.name or f"{options.role}-{os.getpid()}"
+        self.scene = with_seed(load_scene(options.scene), options.seed)
+        self.spawn = options.spawn
+        """Index of the start pose in the scene."""
+        if options.pose is not None:
+            self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
+        self.model = generate(self.scene)
+        self._hub = MemoryHub()
+        self._stack = contextlib.ExitStack()
+        self._stop = threading.Event()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self._stack.__exit__(*exception)
+
+    def enter(self, context: contextlib.AbstractContextManager[T]) -> T:
+        """Enter a context that is left with the session."""
+        return self._stack.enter_context(context)
+
+    def bus(self, name: str) -> Bus:
+        """A member of the world on the server, or of a network in memory if there is no server."""
+        if self.options.connect is None:
+            return self.enter(self._hub.bus(name))
+        from vinesim.net.transport.zenoh_bus import ZenohBus
+
+        return self.enter(ZenohBus(name, connect=self.options.connect, certificates=self.options.tls))
+
+    def client_options(self, name: str | None = None) -> dict[str, Any]:
+        """Keyword arguments that :class:`Client` takes for every role; ``name`` instead of the session's."""
+        options = self.options
+        return {
+            "name": name or self.name,
+            "interest_radius": options.interest_radius,
+            "jitter_buffer": 1e-3 * options.jitter_buffer,
+            "device": options.device,
+            "threads": options.threads,
+            "executor": self.enter(ThreadPoolExecutor(1, "spawner")),
+        }
+
+    def leave_at_end(self, client: Client) -> None:
+        """Let a client take its leave before its buses close."""
+        self._stack.callback(client.leave)
+
+    def trace(self, client: Client, bunch: int) -> Trace:
+        """Record force on and displacement of a bunch from now on."""
+        client.trace = start_trace(client, self.model, bunch)
+        return client.trace
+
+    def run(
+        self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
+        publish: Callable[[dict[str, Any]], None] = lambda _: None,
+    ) -> Status:  # fmt: skip
+        """Step in real time until a signal, the time limit or the end of the ``task``; returns the final status.
+
+        ``sent`` counts the ROS messages by topic, ``publish`` takes every status for /diagnostics.
+        """
+        loop = RateLoop(client.physics.dt)
+        status = Status(client, loop, sent, task)
+        reporter = threading.Thread(
+            target=report_status, args=(status, publish, self.options.status, self._stop), name="status"
+        )
+        reporter.start()
+        self._stack.callback(reporter.join)
+        self._stack.callback(self._stop.set)
+        is_done = (lambda: False) if task is None else (lambda: task.is_done)
+        run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
+        return status
+
+
+def start_trace(client: Client, model: Model, bunch: int) -> Trace:
+    """An empty trace of a bunch that hangs at rest."""
+    body = int(model.bunch_body[bunch])
+    return Trace(model, bunch, client.physics.state.body_q[body].copy(), TRACE_CAPACITY)
+
+
+def run_loop(
+    stop: threading.Event, step: Callable[[], None], loop: RateLoop, seconds: float | None, dt: float,
+    is_done: Callable[[], bool] = lambda: False,
+) -> None:  # fmt: skip
+    """Step in real time until ``stop`` (SIGINT and SIGTERM set it), for ``seconds`` of simulated time, or until done."""
+    gc.collect()
+    gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
+    # until here Ctrl-C simply interrupts; from now on it ends the run in order
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    limit = None if seconds is None else round(seconds / dt)
+    while not (stop.is_set() or loop.ticks == limit or is_done()):
+        loop.begin()
+        step()
+        loop.end()
+
+
+def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
+    """Write ``report.json``, whole or not at all."""
+    partial = out / "report.json.part"
+    partial.write_text(json.dumps(report, indent=2) + "\n")
+    partial.replace(out / "report.json")
+
+
+def report_status(status: Status, publish: Callable[[dict[str, Any]], None], form: str, stop: threading.Event) -> None:
+    """Every second hand the status to ``publish`` and print it as text or JSON; runs until ``stop``."""
+    try:
+        while not stop.wait(STATUS_PERIOD):
+            values = status.current()
+            publish(values)
+            if form == "json":
+                print(json.dumps(values), flush=True)
+            elif form == "text":
+                print(status_line(values), flush=True)
+    except BrokenPipeError:  # the reader of standard output is gone: that ends the run, not the log
+        stop.set()
+
+
+def status_line(values: dict[str, Any]) -> str:
+    """One line of text for a status."""
+    return (
+        f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
+        f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
+        f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'nobody'}"
+    )

@@ -1,0 +1,96 @@
+"""``vinesim client``: its options, and which of them belong to which role."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from vinesim.cli.commands.options import Pose, Renderer, Scene, Seconds, Seed, StatusFormat
+
+Role = Annotated[str, typer.Option(help="robot, human or spectator.")]
+Name = Annotated[str | None, typer.Option(help="The actor's unique name; ROLE-PID unless given.")]
+Server = Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")]
+Certificates = Annotated[
+    pathlib.Path | None,
+    typer.Option(help="Folder with ca.pem, NAME.pem and NAME.key; the server is then tls/HOST:7447."),
+]
+Robots = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Of a robot: a URDF file, or the name of one that ships: vinebot, logistic. Given several times, so many "
+        "robots NAME_1, NAME_2, each under its namespace."
+    ),
+]
+Spawn = Annotated[int, typer.Option(min=0, help="Index of one of the scene's start poses.")]
+StartPose = Annotated[Pose | None, typer.Option(help="Start at X Y [m] with YAW [rad] instead.")]
+Approach = Annotated[float, typer.Option(help="Of a robot: start this far behind the start pose and drive to it [m].")]
+Namespace = Annotated[str, typer.Option(help="Of a robot: prefix of all ROS topics.")]
+Ros = Annotated[bool, typer.Option(help="Of a robot: run a ROS 2 node, if ROS 2 is installed.")]
+Job = Annotated[str | None, typer.Option(help="Of a robot: do a job and stop: pick or exchange.")]
+Height = Annotated[float, typer.Option(min=1.0, max=2.5, help="Of a human [m].")]
+InterestRadius = Annotated[
+    float, typer.Option(min=0.1, max=5.0, help="Actors nearer than this to an object receive its motion [m].")
+]
+JitterBuffer = Annotated[
+    float,
+    typer.Option(min=0.0, max=500.0, help="Show other actors this much later, without the network's jitter [ms]."),
+]
+Device = Annotated[str, typer.Option(help="Where plants are simulated: cpu, cuda or cuda:N.")]
+Threads = Annotated[
+    int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 32 awake trees, on free cores.")
+]
+Out = Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")]
+SensorRate = Annotated[
+    float | None, typer.Option(min=0.1, help="Pictures and scans a second; each sensor's own rate unless given.")
+]
+# what the clients of a demo and of a benchmark are told to do
+Push = Annotated[int | None, typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly.")]
+Watch = Annotated[
+    int | None, typer.Option(hidden=True, help="Of a robot: record force and displacement of this bunch.")
+]
+Walk = Annotated[tuple[float, float] | None, typer.Option(hidden=True, help="Of a human: walk to this point, x y [m].")]
+Reach = Annotated[
+    int | None, typer.Option(hidden=True, help="Of a human: walk to this bunch, hold it, pull, let go, repeatedly.")
+]
+
+
+def client(
+    ctx: typer.Context, role: Role = "robot", name: Name = None, connect: Server = None, tls: Certificates = None,
+    scene: Scene = "demo", seed: Seed = None, robot: Robots = None, spawn: Spawn = 0, pose: StartPose = None,
+    approach: Approach = 0.0, namespace: Namespace = "", ros: Ros = True, push: Push = None, job: Job = None,
+    walk: Walk = None, reach: Reach = None, height: Height = 1.75, watch: Watch = None,
+    interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
+    threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
+    sensor_hz: SensorRate = None, renderer: Renderer = "warp",
+) -> None:  # fmt: skip
+    """Join the vineyard as one actor, with a simulation of its own.
+
+    \b
+    Examples:
+      vinesim client --role robot
+      vinesim client --role robot --connect tcp/127.0.0.1:7447 --name picker --spawn 1
+      vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
+      vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
+      vinesim client --role spectator --connect tcp/127.0.0.1:7447 --pose 2 0 1.57 --out pictures
+      vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva
+    """
+    values = {option: value for option, value in locals().items() if option != "ctx"}
+    from vinesim.cli.client_options import ClientOptions, check_role
+
+    check_role(role, {option for option in values if _is_given(ctx, option)})
+    options = ClientOptions(**values)
+    if role == "robot":
+        from vinesim.cli.robot_client import run
+    elif role == "human":
+        from vinesim.cli.human_client import run
+    else:
+        from vinesim.cli.spectator_client import run
+    raise typer.Exit(run(options))
+
+
+def _is_given(ctx: typer.Context, option: str) -> bool:
+    """Whether an option stands on the command line, rather than having its default."""
+    source = ctx.get_parameter_source(option)
+    return source is not None and source.name == "COMMANDLINE"

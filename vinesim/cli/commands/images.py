@@ -1,0 +1,99 @@
+"""``vinesim scene show``, ``vinesim render`` and ``vinesim dataset``: their options."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from vinesim.cli.commands.options import Camera, ImageSize, Renderer, Scene, Seed
+
+
+def scene_show(
+    file: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
+    seed: Seed = None,
+    out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; NAME.png unless given.")] = None,
+) -> None:
+    """Print what a scene holds, and draw it.
+
+    \b
+    Examples:
+      vinesim scene show demo
+      vinesim scene show my-block.toml --seed 4 --out block.png
+    """
+    from vinesim.cli.scene import show
+
+    raise typer.Exit(show(file, seed, out))
+
+
+def render(
+    scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
+    at: Annotated[str, typer.Option(help="Position of the camera, X,Y,Z [m].")],
+    look: Annotated[str, typer.Option(help="The point it looks at, X,Y,Z [m].")],
+    camera: Camera = "d435",
+    size: ImageSize = None,
+    seed: Seed = None,
+    hour: Annotated[
+        float | None, typer.Option(min=0.0, max=24.0, help="Solar time [h], instead of the scene's own sun.")
+    ] = None,
+    out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its truth.")] = pathlib.Path("render"),
+    robot: Annotated[list[str] | None, typer.Option(help="NAME@X,Y[,YAW]: a robot there [m, rad]; may repeat.")] = None,
+    person: Annotated[
+        list[str] | None,
+        typer.Option(help="X,Y[,YAW][,POSTURE]: a person who stands, picks, reaches, points, waves, carries or walks."),
+    ] = None,
+    crate: Annotated[
+        list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
+    ] = None,
+    renderer: Renderer = "warp",
+) -> None:
+    """Render one picture with its ground truth: ids, masks, boxes, berries, cut points.
+
+    Writes rgb.png, depth.png (16 bits, mm), labels.png (id = R + 256 G + 65536 B), overlay.png, camera.json and
+    truth.json. Bunches in a crate were picked from the nearest vines.
+
+    \b
+    Examples:
+      vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7
+      vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
+      vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick --crate 1.8,0.75,0,0.4
+    """  # a command line that can be copied
+    from vinesim.cli.render import run
+
+    code = run(
+        scene, camera=camera, at=at, look=look, size=size, hour=hour, seed=seed, out=out, renderer=renderer,
+        robots=robot or (), people=person or (), crates=crate or (),
+    )  # fmt: skip
+    raise typer.Exit(code)
+
+
+def dataset(
+    images: Annotated[int, typer.Option(min=1, max=999_999, help="How many.")],
+    out: Annotated[pathlib.Path, typer.Option(help="Folder of the data set; an unfinished one is continued.")],
+    scene: Scene = "demo",
+    seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
+    camera: Camera = "d435",
+    size: ImageSize = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Processes; half as many as cores unless given.")
+    ] = None,
+    renderer: Renderer = "warp",
+    actors: Annotated[
+        float, typer.Option(help="Share of the images with people, robots, crates and wind; 0 leaves the vines alone.")
+    ] = 0.4,
+) -> None:
+    """Render random pictures of random vineyards with their truth: COCO with masks, YOLO, depth, ids, poses.
+
+    Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
+    Killed or stopped, the same command continues; more images may be asked for later.
+
+    \b
+    Examples:
+      vinesim dataset --images 1000 --out grapes
+      vinesim dataset --images 200 --out vsp --scene vsp --seed 3 --camera pinhole --size 320x240 --workers 4
+    """
+    options = dict(locals())
+    from vinesim.cli.dataset import run
+
+    raise typer.Exit(run(**options))

@@ -1,0 +1,22 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
+Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, harvest, tendone, vsp.")]
+Renderer = Annotated[
+    str, typer.Option(help="Rasterizer: warp, taichi (all cores) or taichi-gpu (Vulkan, Metal); needs vinesim[taichi].")
+]
+Camera = Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")]
+ImageSize = Annotated[
+    str | None, typer.Option(help="WxH [px] at the same horizontal field of view; the camera's own unless given.")
+]
+Seconds = Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")]
+StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")]
+World = Annotated[str, typer.Option(help="Which of the server's worlds.")]
+Pose = tuple[float, float, float]
+"""X Y [m] and YAW [rad]."""

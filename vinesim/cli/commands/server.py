@@ -1,0 +1,60 @@
+"""``vinesim server``: its options."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from vinesim.cli.commands.options import StatusFormat
+
+
+def server(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where to listen, several times if need be; port 0 takes a free one. tcp/0.0.0.0:7447 for everything "
+            "and udp/0.0.0.0:7447 for poses, unless given; with --tls tls/ and quic/."
+        ),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Only route, for the server at this endpoint, which admits actors and keeps the state."),
+    ] = None,
+    state_dir: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Folder in which picked bunches, boxes and cuts are kept; in memory unless given."),
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="Admit this scene only; unless given, the first actor decides.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of that scene, instead of its own.")] = None,
+    max_clients: Annotated[
+        int | None, typer.Option(min=1, help="Largest number of actors at a time; no bound unless given.")
+    ] = None,
+    quota: Annotated[
+        tuple[float, float],
+        typer.Option(help="MESSAGES/s and BYTES/s of retained records (cuts, resting objects) for each actor."),
+    ] = (200.0, 200_000.0),
+    tls: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): nobody else gets in.")
+    ] = None,
+    status: StatusFormat = "none",
+) -> None:
+    """Route messages between clients, and keep the retained state. The server simulates nothing.
+
+    The state is kept in memory unless --state-dir is given: a demonstration begins with an unpicked vineyard each time.
+
+    \b
+    Examples:
+      vinesim server
+      vinesim server --listen tcp/127.0.0.1:0 --status text
+      vinesim server --scene vsp --max-clients 12 --state-dir harvest/
+      vinesim server --tls certs/
+      vinesim server --connect tcp/192.168.1.5:7447
+    """
+    options = dict(locals())
+    from vinesim.cli.server import run
+
+    raise typer.Exit(run(**options))

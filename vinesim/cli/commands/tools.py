@@ -1,0 +1,74 @@
+"""``vinesim bench``, ``vinesim ros`` and ``vinesim certs``: their options."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+
+def bench(
+    names: Annotated[list[str], typer.Argument(help="plants, camera, sync; several are run one after the other.")],
+    json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
+    plot: Annotated[
+        pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
+    ] = None,
+) -> None:
+    """Measure, beside a peer that runs in the same process on the same scene.
+
+    Of physics: plants, contact, tick, asleep. Of sensors: camera and lidar (speed), sensors (what they measure, beside
+    the truth), eyes (the tick beside pictures). Of the network: sync (what delay does, in simulated time), link (real
+    clients over emulated links; needs root), traffic (bytes a client receives), load (many clients), fuzz (broken
+    messages).
+
+    \b
+    Examples:
+      vinesim bench plants --json
+      vinesim bench plants camera
+      vinesim bench sync --json --plot docs/pictures/network-sync.png
+      vinesim bench sensors --plot docs/pictures
+    """
+    from vinesim.cli.bench import run
+
+    raise typer.Exit(run(names, json, plot))
+
+
+def ros_build_interfaces(
+    quiet: Annotated[bool, typer.Option(help="Print nothing if all is well, or if ROS is not installed.")] = False,
+) -> None:
+    """Build the ROS message packages that have no wheel (once; cached). Needs g++.
+
+    \b
+    Examples:
+      vinesim ros build-interfaces
+    """
+    from vinesim.cli.ros import build
+
+    raise typer.Exit(build(quiet))
+
+
+def certs_new(
+    actor: Annotated[str, typer.Argument(help="The actor's name, or server.")],
+    dir: Annotated[pathlib.Path, typer.Option(help="Folder of the authority; made at first use.")] = pathlib.Path(
+        "certs"
+    ),
+    role: Annotated[str, typer.Option(help="robot, human or spectator, who only reads.")] = "robot",
+    host: Annotated[
+        list[str] | None, typer.Option(help="For server: name or address by which clients reach it; repeatable.")
+    ] = None,
+) -> None:
+    """Make the certificate and key of an actor; at first use the authority's and the server's as well.
+
+    An actor needs ca.pem, NAME.pem and NAME.key; ca.key stays where it is made. The server reads its folder when it
+    starts: an actor made later is admitted after a restart, one whose .pem is removed is not.
+
+    \b
+    Examples:
+      vinesim certs new server --host 192.168.1.5
+      vinesim certs new picker
+      vinesim certs new visitor --role spectator --dir certs
+    """
+    from vinesim.cli.certs import new
+
+    raise typer.Exit(new(actor, dir, role, host or []))

@@ -1,0 +1,73 @@
+"""``vinesim demo --job``: one robot does a job, and a visitor watches."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+from rich.console import Console
+
+from vinesim.cli.demo.placement import visitor_pose
+from vinesim.cli.demo.processes import START_TIMEOUT, process_group
+from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
+from vinesim.cli.demo.summary import job_summary, write_summary
+from vinesim.client.tasks.tasks import UnknownTask
+from vinesim.robot.description.loader import load_description
+from vinesim.ros import ros_setup
+from vinesim.scene.spec import load_scene, with_seed
+
+JOBS = {"pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged")}
+"""Jobs: the robot that does them unless another is named, and the key of ``summary.json`` for whether it was done."""
+TIME_LIMIT = 120.0
+"""Simulated time that a job may take unless given [s]."""
+
+
+def run_job(
+    job: str, *, seconds: float | None, seed: int | None, scene: str | None, robot: str | None, headless: bool,
+    out: pathlib.Path,
+) -> int:  # fmt: skip
+    """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
+    if job not in JOBS:
+        raise UnknownTask(f"no job {job!r}; give push, {' or '.join(JOBS)}")
+    console = Console(stderr=True)
+    default_robot, done_key = JOBS[job]
+    robot, scene = robot or default_robot, scene or "harvest"
+    plan = with_seed(load_scene(scene), seed)
+    load_description(robot)  # refused once, and before any process starts
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "summary.json").unlink(missing_ok=True)
+    with process_group() as group:
+        server, endpoint = group.start_server()
+        console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
+        common = ["-m", "vinesim.cli", "client", "--role", "robot", "--connect", endpoint, "--scene", scene]
+        common += ["--seed", str(plan.seed), "--robot", robot, "--status", "json"]
+        visitor, newest = None, Statuses()
+        if (place := visitor_pose(plan)) is not None:
+            visitor = group.start(
+                VISITOR, *common, "--name", VISITOR, *place, "--namespace", VISITOR, "--out", str(out / VISITOR),
+                "--sensor-hz", "0.5",
+            )  # fmt: skip
+            newest[VISITOR] = json.loads(visitor.next_line(START_TIMEOUT))
+        picker = group.start(
+            PICKER, *common, "--name", PICKER, "--job", job, "--seconds", str(seconds or TIME_LIMIT),
+            "--out", str(out / PICKER), "--sensor-hz", "1",
+        )  # fmt: skip
+        newest[PICKER] = json.loads(picker.next_line(START_TIMEOUT))
+        show_progress(picker, visitor, server, newest, console, headless)
+        if visitor is not None:
+            visitor.finish()
+    summary = job_summary(
+        out, job, done_key, scene=scene, seed=plan.seed, robot=robot, no_ros=ros_setup.unavailable_reason(),
+        with_visitor=visitor is not None,
+    )  # fmt: skip
+    write_summary(out, summary)
+    done = summary[done_key]
+    console.print(f"{done_key} after {summary['seconds']:.1f} s" if done else f"not {done_key}: {summary['reason']}")
+    if visitor is not None:
+        sent = summary["told_visitor"]
+        console.print(
+            f"{VISITOR} received {sum(sent['bytes'].values())} B of it, {sent['bytes_per_s']:.0f} B/s, and has "
+            f"{summary['visitor']['bunches_picked']} of {summary['bunches_picked']} bunches off their vines"
+        )
+    console.print(f"pictures and summary.json are in {out}/")
+    return 0 if done else 5

@@ -1,0 +1,41 @@
+"""Where the robots of a demo start, as options of ``vinesim client``."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vinesim.client.tasks import start_poses
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene
+
+APPROACH_DISTANCE = 14
+"""Distance from which the visitor drives up [m]: beyond the interest radius at first."""
+VISITOR_DISTANCE = 3.0
+"""Distance from which a visitor watches a job [m]."""
+
+
+def choose_poses(scene: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:
+    """The bunch to push, and the start poses of picker and visitor: the scene's own if a bunch is in reach there."""
+    start = start_poses.spawn_pose(scene, 0)
+    try:
+        return start_poses.find_reachable_bunch(model, start), (["--spawn", "0"], ["--spawn", "1"])
+    except start_poses.PlacementError:
+        bunch, picker = start_poses.find_push_pose(model, start[:2])
+    visitor = start_poses.find_approach_pose(model, picker, APPROACH_DISTANCE)
+    return bunch, (_pose_option(picker), _pose_option(visitor))
+
+
+def visitor_pose(scene: Scene) -> list[str] | None:
+    """Where a visitor watches a job: beside the picker's start, on the way to the second start pose; None if none."""
+    if len(scene.spawns) < 2:
+        return None
+    here, there = (start_poses.spawn_pose(scene, i)[:2] for i in (0, 1))
+    way = (there - here) / max(float(np.linalg.norm(there - here)), 1e-9)
+    place = here + VISITOR_DISTANCE * way
+    return ["--pose", f"{place[0]:.4f}", f"{place[1]:.4f}", f"{math.atan2(-way[1], -way[0]):.4f}"]
+
+
+def _pose_option(pose: np.ndarray) -> list[str]:
+    return ["--pose", *(f"{value:.4f}" for value in (pose[0], pose[1], 2.0 * math.atan2(pose[5], pose[6])))]

@@ -1,0 +1,145 @@
+"""The processes of a demo: started, read, and ended together."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+EXIT_TIMEOUT = 1.6
+"""Time between SIGINT and SIGKILL when the demo is left [s]."""
+START_TIMEOUT = 300.0
+"""Longest start of a client; a first run compiles kernels [s]."""
+REPORT_TIMEOUT = 60.0
+"""Longest time in which a process writes its report and ends [s]; a busy machine needs a dozen."""
+STDERR_LINES = 40
+"""Lines of standard error that are kept."""
+
+
+class DemoFailed(RuntimeError):
+    """A process of the demo ended too early or printed nothing; the text names it and its last line on stderr."""
+
+    exit_code = 4
+
+
+@dataclasses.dataclass
+class Process:
+    """A child process, its unread lines of output and its newest lines of standard error."""
+
+    name: str
+    child: subprocess.Popen[str]
+    stdout_lines: queue.Queue[str]
+    """An empty string marks the end."""
+    stderr_tail: list[str]
+
+    @classmethod
+    def start(cls, name: str, *arguments: str, **environ: str) -> Process:
+        """Run ``python ARGUMENTS`` in a session of its own, so that Ctrl-C reaches it only through the demo."""
+        child = subprocess.Popen(
+            [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True, start_new_session=True, env={**os.environ, **environ},
+        )  # fmt: skip
+        process = cls(name, child, queue.Queue(), [])
+        threading.Thread(target=process._read_stdout, daemon=True).start()
+        threading.Thread(target=process._read_stderr, daemon=True).start()
+        return process
+
+    def _read_stdout(self) -> None:
+        assert self.child.stdout is not None
+        for line in self.child.stdout:
+            self.stdout_lines.put(line.rstrip("\n"))
+        self.stdout_lines.put("")
+
+    def _read_stderr(self) -> None:
+        assert self.child.stderr is not None
+        for line in self.child.stderr:
+            self.stderr_tail = [*self.stderr_tail[-STDERR_LINES:], line.rstrip("\n")]
+
+    def next_line(self, timeout: float) -> str:
+        """The next line of output; :class:`DemoFailed` if it ended or printed nothing for ``timeout`` [s]."""
+        try:
+            line = self.stdout_lines.get(timeout=timeout)
+        except queue.Empty:
+            raise DemoFailed(f"{self.name} printed nothing for {timeout:.0f} s; {self._stderr_summary()}") from None
+        if not line:
+            raise self.failure()
+        return line
+
+    def remaining_output(self, timeout: float) -> str:
+        """Close its standard input and return everything that it prints until its end."""
+        assert self.child.stdin is not None
+        self.child.stdin.close()
+        lines = []
+        while line := self.stdout_lines.get(timeout=timeout):
+            lines.append(line)
+        return "\n".join(lines)
+
+    def failure(self) -> DemoFailed:
+        """The error to raise for a process that ended too early."""
+        self.wait_or_kill(REPORT_TIMEOUT)
+        return DemoFailed(f"{self.name} ended with exit code {self.child.returncode}; {self._stderr_summary()}")
+
+    def _stderr_summary(self) -> str:
+        lines = [line for line in self.stderr_tail if line.strip()]
+        return f"its last line on stderr: {lines[-1]}" if lines else "nothing on stderr"
+
+    def interrupt(self) -> None:
+        """Send SIGINT; :meth:`wait_or_kill` waits for the end."""
+        if self.child.poll() is None:
+            self.child.send_signal(signal.SIGINT)
+
+    def wait_or_kill(self, timeout: float) -> None:
+        """Wait up to ``timeout`` [s] for its end, then kill it."""
+        try:
+            self.child.wait(max(timeout, 0.0))
+        except subprocess.TimeoutExpired:
+            self.child.kill()
+            self.child.wait()
+
+    def finish(self) -> None:
+        """Interrupt it and wait for its report; :class:`DemoFailed` if it fails."""
+        self.interrupt()
+        self.wait_or_kill(REPORT_TIMEOUT)
+        if self.child.returncode:
+            raise self.failure()
+
+
+class ProcessGroup:
+    """The processes of one demo, with ROS on this machine only unless the user has chosen otherwise."""
+
+    def __init__(self) -> None:
+        self.processes: list[Process] = []
+        self._environ = {}
+        if "ROS_AUTOMATIC_DISCOVERY_RANGE" not in os.environ:
+            self._environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+    def start(self, name: str, *arguments: str) -> Process:
+        """Start ``python ARGUMENTS``."""
+        self.processes.append(Process.start(name, *arguments, **self._environ))
+        return self.processes[-1]
+
+    def start_server(self) -> tuple[Process, str]:
+        """Start a server on a free port of this machine; the process and its endpoint."""
+        server = self.start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0")
+        return server, server.next_line(START_TIMEOUT).removeprefix("listening on ")
+
+
+@contextlib.contextmanager
+def process_group() -> Iterator[ProcessGroup]:
+    """Processes that end with the block, all within :data:`EXIT_TIMEOUT`, however it is left."""
+    group = ProcessGroup()
+    try:
+        yield group
+    finally:
+        deadline = time.monotonic() + EXIT_TIMEOUT
+        for process in group.processes:
+            process.interrupt()
+        for process in group.processes:
+            process.wait_or_kill(deadline - time.monotonic())

@@ -1,0 +1,241 @@
+"""Broadphase: boxes around geoms, actors, capsules and trees, swept over the step, and the trees that actors are near.
+
+All boxes are axis-aligned. They are grown by how far their content can move in the step, so a sleeping tree wakes before
+anything reaches it.
+"""
+
+import warp as wp
+
+from vinesim.kernels.contact.structs import (
+    AABB_BLOCK,
+    Aabbs,
+    Actors,
+    Capsules,
+    CapsuleStates,
+    Geoms,
+    GeomStates,
+    Parameters,
+    PlantBodies,
+    RigidBodies,
+    Trees,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+FAR = wp.constant(1.0e30)
+"""[m] Corners of an empty box."""
+
+
+@wp.func
+def aabbs_disjoint(a_low: wp.vec3, a_high: wp.vec3, b_low: wp.vec3, b_high: wp.vec3):
+    """Whether two boxes have nothing in common."""
+    return (
+        a_low[0] > b_high[0]
+        or a_low[1] > b_high[1]
+        or a_low[2] > b_high[2]
+        or b_low[0] > a_high[0]
+        or b_low[1] > a_high[1]
+        or b_low[2] > a_high[2]
+    )
+
+
+@wp.func
+def exists_at_level(level: int, is_fine: bool):
+    """Whether a capsule exists at its tree's level of detail: always (0), while coarse (1), while fine (2)."""
+    return level == 0 or (level == 2) == is_fine
+
+
+@wp.func
+def is_collidable(level: int, is_fine: bool, bunch: int, bunch_attached: wp.array(dtype=wp.bool)):
+    """Whether a capsule collides: it exists, and if it belongs to a bunch, that is not picked."""
+    collides = exists_at_level(level, is_fine)
+    if collides and bunch >= 0:
+        collides = bunch_attached[bunch]
+    return collides
+
+
+@wp.kernel
+def geom_aabbs(
+    # model
+    parameters: Parameters,
+    geoms: Geoms,
+    # in
+    rigid: RigidBodies,
+    # out
+    states_out: GeomStates,
+):
+    """One thread per geom: motion of its centre, and its box, grown by how far it can come in the step."""
+    g = wp.tid()
+    rotation = rigid.xmat[geoms.id[g]]
+    center = rigid.xpos[geoms.id[g]] + rotation * geoms.center[g]
+    body = geoms.body[g]
+    spin = wp.vec3d(rigid.cvel[body, 0], rigid.cvel[body, 1], rigid.cvel[body, 2])
+    velocity = wp.vec3d(rigid.cvel[body, 3], rigid.cvel[body, 4], rigid.cvel[body, 5])
+    arm = center - rigid.subtree_com[geoms.root[g]]
+    velocity = velocity + wp.cross(spin, arm)
+    half = geoms.half[g]
+    extent = wp.length(half)
+    speed = wp.length(velocity) + wp.length(spin) * extent
+    # A drive may start within the step. Its likely speed: the free one with the smaller correction of the last two
+    # steps, if they agree in sign. Its largest speed: the free one.
+    linear_likely = wp.vec3d()
+    spin_likely = wp.vec3d()
+    linear_free = wp.vec3d()
+    spin_free = wp.vec3d()
+    dof = geoms.dof[g]
+    while dof >= 0:
+        angular = wp.vec3d(rigid.cdof[dof, 0], rigid.cdof[dof, 1], rigid.cdof[dof, 2])
+        linear = wp.vec3d(rigid.cdof[dof, 3], rigid.cdof[dof, 4], rigid.cdof[dof, 5]) + wp.cross(angular, arm)
+        rate = rigid.velocity_free[dof]
+        linear_free += rate * linear
+        spin_free += rate * angular
+        last = rigid.correction[dof]
+        before = rigid.correction_before[dof]
+        if last * before > wp.float64(0.0):
+            rate += wp.where(wp.abs(last) < wp.abs(before), last, before)
+        linear_likely += rate * linear
+        spin_likely += rate * angular
+        dof = rigid.dof_parent[dof]
+    speed = wp.max(speed, wp.length(linear_likely) + wp.length(spin_likely) * extent)
+    largest = wp.max(speed, wp.length(linear_free) + wp.length(spin_free) * extent)
+    grown = parameters.margin + parameters.dt * largest
+    box = wp.vec3()
+    for i in range(3):
+        reach = wp.abs(rotation[i, 0]) * half[0] + wp.abs(rotation[i, 1]) * half[1] + wp.abs(rotation[i, 2]) * half[2]
+        box[i] = wp.float32(reach + grown)
+    middle = wp.vec3(wp.float32(center[0]), wp.float32(center[1]), wp.float32(center[2]))
+    states_out.center[g] = center
+    states_out.velocity[g] = velocity
+    states_out.angular_velocity[g] = spin
+    states_out.speed[g] = speed
+    states_out.low[g] = middle - box
+    states_out.high[g] = middle + box
+
+
+@wp.kernel
+def tree_aabbs(
+    # model
+    parameters: Parameters,
+    capsules: Capsules,
+    # in
+    order: wp.array(dtype=wp.int32),
+    trees: Trees,
+    bodies: PlantBodies,
+    # out
+    states_out: CapsuleStates,
+    wood_boxes_out: Aabbs,
+    tree_boxes_out: Aabbs,
+):
+    """One thread per tree: capsules in the world, their boxes, that of the tree, and that of its wood.
+
+    Thread i takes the tree ``trees.awake[order[i]]``.
+    """
+    tree = trees.awake[order[wp.tid()]]
+    is_fine = trees.is_fine[tree]
+    dt = wp.float32(parameters.dt)
+    low = wp.vec3(FAR)
+    high = wp.vec3(-FAR)
+    wood_low = wp.vec3(FAR)
+    wood_high = wp.vec3(-FAR)
+    for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
+        if exists_at_level(capsules.level[s], is_fine):
+            body = capsules.body[s]
+            pose = bodies.q[body]
+            velocity = bodies.qd[body]
+            start = wp.transform_point(pose, capsules.local_start[s])
+            end = wp.transform_point(pose, capsules.local_end[s])
+            speed = wp.length(wp.spatial_top(velocity)) + capsules.extent[s] * wp.length(wp.spatial_bottom(velocity))
+            grown = wp.vec3(capsules.radius[s] + speed * dt)
+            capsule_low = wp.min(start, end) - grown
+            capsule_high = wp.max(start, end) + grown
+            low = wp.min(low, capsule_low)
+            high = wp.max(high, capsule_high)
+            if capsules.bunch[s] < 0:
+                wood_low = wp.min(wood_low, capsule_low)
+                wood_high = wp.max(wood_high, capsule_high)
+            states_out.start[s] = start
+            states_out.end[s] = end
+            states_out.speed[s] = speed
+            states_out.low[s] = capsule_low
+            states_out.high[s] = capsule_high
+    wood_boxes_out.low[tree] = wood_low
+    wood_boxes_out.high[tree] = wood_high
+    tree_boxes_out.low[tree] = low
+    tree_boxes_out.high[tree] = high
+
+
+@wp.kernel
+def actor_aabbs(
+    # model
+    parameters: Parameters,
+    actors: Actors,
+    # in
+    geom_states: GeomStates,
+    # out
+    actor_boxes_out: Aabbs,
+):
+    """One thread per actor: the box around it; an empty one for a box or a free bunch that does not move."""
+    actor = wp.tid()
+    low = wp.vec3(FAR)
+    high = wp.vec3(-FAR)
+    fastest = wp.float64(0.0)
+    for g in range(actors.start[actor], actors.start[actor + 1]):
+        low = wp.min(low, geom_states.low[g])
+        high = wp.max(high, geom_states.high[g])
+        fastest = wp.max(fastest, geom_states.speed[g])
+    if actors.wakes_only_moving[actor] and fastest < parameters.wake_speed:
+        low = wp.vec3(FAR)
+        high = wp.vec3(-FAR)
+    actor_boxes_out.low[actor] = low
+    actor_boxes_out.high[actor] = high
+
+
+@wp.kernel
+def block_aabbs(
+    # in
+    blocks: wp.array(dtype=wp.int32),
+    boxes: Aabbs,
+    # out
+    block_boxes_out: Aabbs,
+):
+    """One thread per block of 32 boxes: the box around them. Thread i takes the block ``blocks[i]``."""
+    block = blocks[wp.tid()]
+    low = wp.vec3(FAR)
+    high = wp.vec3(-FAR)
+    for i in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, boxes.low.shape[0])):
+        low = wp.min(low, boxes.low[i])
+        high = wp.max(high, boxes.high[i])
+    block_boxes_out.low[block] = low
+    block_boxes_out.high[block] = high
+
+
+@wp.kernel
+def mark_near_trees(
+    # model
+    actors: Actors,
+    # in
+    trees: Trees,
+    block_boxes: Aabbs,
+    tree_boxes: Aabbs,
+    actor_boxes: Aabbs,
+    geom_states: GeomStates,
+    # out
+    is_near_out: wp.array(dtype=wp.bool),
+):
+    """One thread per block: mark those of its trees whose box a geom of an actor overlaps.
+
+    A remote actor counts at remote trees only.
+    """
+    block = wp.tid()
+    for actor in range(actors.start.shape[0] - 1):
+        actor_low = actor_boxes.low[actor]
+        actor_high = actor_boxes.high[actor]
+        if not aabbs_disjoint(block_boxes.low[block], block_boxes.high[block], actor_low, actor_high):
+            for tree in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, tree_boxes.low.shape[0])):
+                low = tree_boxes.low[tree]
+                high = tree_boxes.high[tree]
+                counts = trees.is_remote[tree] or not actors.is_remote[actor]
+                if counts and not is_near_out[tree] and not aabbs_disjoint(low, high, actor_low, actor_high):
+                    for g in range(actors.start[actor], actors.start[actor + 1]):
+                        if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
+                            is_near_out[tree] = True

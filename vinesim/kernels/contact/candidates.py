@@ -1,0 +1,50 @@
+"""One contact as the narrowphase finds it, and what both narrowphases do with it."""
+
+import warp as wp
+
+from vinesim.kernels.contact.structs import Candidates
+
+wp.set_module_options({"enable_backward": False})
+
+MIN_NORMAL_COSINE = wp.constant(wp.float64(0.5))
+"""[1] Least cosine between the normals before and after a step for which the contact moves smoothly. TUNED."""
+
+
+@wp.struct
+class Candidate:
+    """A pair of a capsule and another shape."""
+
+    exists: wp.bool
+    """Whether the two may touch before the step ends."""
+    is_impact: wp.bool
+    gap: wp.float64
+    end_gap: wp.float64
+    normal: wp.vec3d
+    point: wp.vec3d
+
+
+@wp.func
+def is_smooth(normal: wp.vec3d, end_normal: wp.vec3d):
+    """Whether a contact keeps its side of the other shape in the step."""
+    return wp.dot(normal, end_normal) > MIN_NORMAL_COSINE
+
+
+@wp.func
+def curvature_gap(distance: wp.float64, end_distance: wp.float64, approach: wp.float64, motion: wp.float64):
+    """Change of distance [m] in a step that constant velocity does not explain, at most the relative ``motion`` [m].
+
+    ``approach`` [m]: change of distance at constant velocity; negative if the two come together.
+    """
+    return wp.clamp(end_distance - distance - approach, -motion, motion)
+
+
+@wp.func
+def store_candidate(row: int, slot: int, feature: int, other: int, candidate: Candidate, candidates_out: Candidates):
+    """Write a candidate to its slot of its tree, if there is one left."""
+    if slot < candidates_out.feature.shape[1]:
+        candidates_out.feature[row, slot] = feature
+        candidates_out.other[row, slot] = other
+        candidates_out.gap[row, slot] = candidate.gap
+        candidates_out.end_gap[row, slot] = candidate.end_gap
+        candidates_out.normal[row, slot] = candidate.normal
+        candidates_out.point[row, slot] = candidate.point

@@ -1,0 +1,238 @@
+"""Distances: from points and segments to MuJoCo's primitives, and between two segments.
+
+A plant's capsule is a segment with a radius (a sphere when both ends agree); a rigid geom is one of MuJoCo's primitives.
+:func:`primitive_distance` gives distance and direction from a point to a primitive. Along a segment that distance is
+convex, so a bisection of its slope finds where the two are closest, for every kind of primitive alike.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+# MuJoCo's mjtGeom
+PLANE = wp.constant(0)
+SPHERE = wp.constant(2)
+CAPSULE = wp.constant(3)
+ELLIPSOID = wp.constant(4)
+CYLINDER = wp.constant(5)
+BOX = wp.constant(6)
+
+MIN_COPLANAR_COSINE = wp.constant(wp.float64(0.999))
+"""[1] Least cosine between the normals at both ends of the part of a segment that lies along one face. TUNED."""
+SLOPE_BISECTIONS = wp.constant(30)
+"""Halvings of the segment in the search for its closest point: to 1e-9 of its length."""
+FACE_BISECTIONS = wp.constant(12)
+"""Halvings in the search for the ends of what lies along a face: to 1/4096 of the segment's length."""
+
+vec5d = wp.types.vector(length=5, dtype=wp.float64)
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
+
+
+@wp.func
+def cylinder_distance(size: wp.vec3d, p: wp.vec3d):
+    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a cylinder along z, in its frame."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    rho = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+    radial = wp.vec3d(one, zero, zero)
+    if rho > wp.float64(1.0e-12):
+        radial = wp.vec3d(p[0] / rho, p[1] / rho, zero)
+    axial = wp.vec3d(zero, zero, wp.where(p[2] < zero, -one, one))
+    across = rho - size[0]
+    along = wp.abs(p[2]) - size[1]
+    if across > zero and along > zero:
+        gap = wp.sqrt(across * across + along * along)
+        n = (across * radial + along * axial) / gap
+        return wp.vec4d(n[0], n[1], n[2], gap)
+    if across > along:
+        return wp.vec4d(radial[0], radial[1], radial[2], across)
+    return wp.vec4d(axial[0], axial[1], axial[2], along)
+
+
+@wp.func
+def box_distance(size: wp.vec3d, p: wp.vec3d):
+    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a box, in its frame."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    q = wp.vec3d(
+        wp.clamp(p[0], -size[0], size[0]), wp.clamp(p[1], -size[1], size[1]), wp.clamp(p[2], -size[2], size[2])
+    )
+    out = p - q
+    gap = wp.length(out)
+    if gap > wp.float64(1.0e-12):
+        n = out / gap
+        return wp.vec4d(n[0], n[1], n[2], gap)
+    depth = wp.vec3d(size[0] - wp.abs(p[0]), size[1] - wp.abs(p[1]), size[2] - wp.abs(p[2]))
+    if depth[0] <= depth[1] and depth[0] <= depth[2]:
+        return wp.vec4d(wp.where(p[0] < zero, -one, one), zero, zero, -depth[0])
+    if depth[1] <= depth[2]:
+        return wp.vec4d(zero, wp.where(p[1] < zero, -one, one), zero, -depth[1])
+    return wp.vec4d(zero, zero, wp.where(p[2] < zero, -one, one), -depth[2])
+
+
+@wp.func
+def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
+    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a primitive, in the primitive's frame.
+
+    ``size`` is MuJoCo's ``geom_size``. The distance to an ellipsoid is of first order: exact on its surface only.
+    """
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    tiny = wp.float64(1.0e-12)
+    if kind == PLANE:
+        return wp.vec4d(zero, zero, one, p[2])
+    if kind == SPHERE or kind == CAPSULE:
+        q = wp.vec3d(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
+        length = wp.length(q)
+        n = wp.vec3d(one, zero, zero)
+        if length > tiny:
+            n = q / length
+        return wp.vec4d(n[0], n[1], n[2], length - size[0])
+    if kind == ELLIPSOID:
+        a = wp.cw_div(p, size)
+        b = wp.cw_div(a, size)
+        level = wp.length(a)
+        gradient = wp.length(b)
+        if gradient < tiny:
+            return wp.vec4d(zero, zero, one, -size[2])
+        n = b / gradient
+        return wp.vec4d(n[0], n[1], n[2], level * (level - one) / gradient)
+    if kind == CYLINDER:
+        return cylinder_distance(size, p)
+    return box_distance(size, p)
+
+
+@wp.func
+def distance_slope(kind: int, size: wp.vec3d, p: wp.vec3d, direction: wp.vec3d):
+    """Derivative of the distance from a primitive as the point moves along ``direction`` [m]."""
+    n = primitive_distance(kind, size, p)
+    return n[0] * direction[0] + n[1] * direction[1] + n[2] * direction[2]
+
+
+@wp.func
+def closest_on_segment(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
+    """Where (0 to 1) on the segment from a to b the primitive is closest; the middle of all such places if many."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    half = wp.float64(0.5)
+    along = b - a
+    flat = wp.float64(1.0e-9) * wp.length(along)
+    if flat == zero:
+        return zero
+    if distance_slope(kind, size, a, along) > flat:
+        return zero
+    if distance_slope(kind, size, b, along) < -flat:
+        return one
+    # where the slope stops being negative, where it starts being positive
+    low = zero
+    high = one
+    for i in range(SLOPE_BISECTIONS):
+        middle = half * (low + high)
+        if distance_slope(kind, size, a + middle * along, along) < -flat:
+            low = middle
+        else:
+            high = middle
+    first = high
+    low = first
+    high = one
+    if distance_slope(kind, size, a + wp.min(first + wp.float64(1.0e-6), one) * along, along) > flat:
+        return first
+    for i in range(SLOPE_BISECTIONS):
+        middle = half * (low + high)
+        if distance_slope(kind, size, a + middle * along, along) > flat:
+            high = middle
+        else:
+            low = middle
+    return half * (first + low)
+
+
+@wp.func
+def segment_primitive_distance(
+    kind: int, size: wp.vec3d, rotation: wp.mat33d, center: wp.vec3d, a: wp.vec3d, b: wp.vec3d
+):
+    """World normal (0 to 2) and distance (3) [m] from a primitive to the segment a b, and where on it (4, 0 to 1)."""
+    to_local = wp.transpose(rotation)
+    start = to_local * (a - center)
+    along = to_local * (b - center) - start
+    t = closest_on_segment(kind, size, start, start + along)
+    n = primitive_distance(kind, size, start + t * along)
+    normal = rotation * wp.vec3d(n[0], n[1], n[2])
+    return vec5d(normal[0], normal[1], normal[2], n[3], t)
+
+
+@wp.func
+def has_flat_or_straight_side(kind: int):
+    """Whether a segment can lie along this kind of primitive."""
+    return kind == BOX or kind == CAPSULE or kind == CYLINDER
+
+
+@wp.func
+def on_same_face(closest: wp.vec4d, other: wp.vec4d, tolerance: wp.float64):
+    """Whether a point lies along the same face as the closest one, to within ``tolerance`` [m]."""
+    cosine = closest[0] * other[0] + closest[1] * other[1] + closest[2] * other[2]
+    return cosine > MIN_COPLANAR_COSINE and other[3] < closest[3] + tolerance
+
+
+@wp.func
+def interval_along_face(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64, tolerance: wp.float64):
+    """Both ends (0 to 1) of the part of a segment along a primitive's face about its closest point ``t``.
+
+    They are the same if it crosses the face. What lies along a face needs two contacts: with one, it rocks about it from
+    step to step. All in the primitive's frame.
+    """
+    half = wp.float64(0.5)
+    along = b - a
+    closest = primitive_distance(kind, size, a + t * along)
+    ends = wp.vec2d(wp.float64(0.0), wp.float64(1.0))
+    for side in range(2):
+        if not on_same_face(closest, primitive_distance(kind, size, a + ends[side] * along), tolerance):
+            outer = ends[side]
+            inner = t
+            for i in range(FACE_BISECTIONS):
+                middle = half * (outer + inner)
+                if on_same_face(closest, primitive_distance(kind, size, a + middle * along), tolerance):
+                    inner = middle
+                else:
+                    outer = middle
+            ends[side] = inner
+    if (ends[1] - ends[0]) * wp.length(along) < wp.float64(2.0) * tolerance:
+        ends = wp.vec2d(t, t)
+    return ends
+
+
+@wp.func
+def segment_segment_distance(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """World normal (0 to 2) and distance (3) [m] from segment c d to a b, where on a b (4) and on c d (5), 0 to 1.
+
+    Ericson, Real-Time Collision Detection (2005), section 5.1.9; parallel segments meet in the middle of their overlap.
+    """
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    tiny = wp.float64(1.0e-12)
+    u = b - a
+    v = d - c
+    w = a - c
+    uu = wp.dot(u, u)
+    vv = wp.dot(v, v)
+    uv = wp.dot(u, v)
+    uw = wp.dot(u, w)
+    vw = wp.dot(v, w)
+    s = zero
+    determinant = uu * vv - uv * uv
+    if determinant > tiny * uu * vv:
+        s = wp.clamp((uv * vw - vv * uw) / determinant, zero, one)
+    elif uu > tiny and vv > tiny:
+        low = wp.clamp(wp.min(-uw, uv - uw) / uu, zero, one)
+        high = wp.clamp(wp.max(-uw, uv - uw) / uu, zero, one)
+        s = wp.float64(0.5) * (low + high)
+    t = zero
+    if vv > tiny:
+        t = wp.clamp((uv * s + vw) / vv, zero, one)
+    if uu > tiny:
+        s = wp.clamp((uv * t - uw) / uu, zero, one)
+    between = w + s * u - t * v
+    length = wp.length(between)
+    n = wp.vec3d(zero, zero, one)
+    if length > tiny:
+        n = between / length
+    return vec6d(n[0], n[1], n[2], length, s, t)

@@ -1,0 +1,72 @@
+"""From impulses to forces: contact forces, wrenches on plant bodies, and the warm start of the next step."""
+
+import warp as wp
+
+from vinesim.kernels.contact.structs import CONTACTS, Contacts, Islands, Parameters, Rows, WarmStart
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def store_warm_start(
+    # model
+    parameters: Parameters,
+    # in
+    islands: Islands,
+    rows: Rows,
+    # out
+    contacts_out: Contacts,
+    warm_start_out: WarmStart,
+):
+    """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
+    c = wp.tid()
+    n = 3 * c
+    axes = contacts_out.axes[c]
+    t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
+    t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
+    impulse = wp.vec3d(rows.impulse[n], rows.impulse[n + 1], rows.impulse[n + 2])
+    contacts_out.force[c] = wp.transpose(axes) * impulse / parameters.dt
+    slip_u = rows.velocity_free[n + 1]
+    slip_v = rows.velocity_free[n + 2]
+    for m in range(islands.start[contacts_out.island[c]], islands.start[contacts_out.island[c] + 1]):
+        for k in range(3 * islands.contact[m], 3 * islands.contact[m] + 3):
+            slip_u = slip_u + rows.delassus[n + 1, k] * rows.impulse[k]
+            slip_v = slip_v + rows.delassus[n + 2, k] * rows.impulse[k]
+    # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
+    force_u = impulse[1] / parameters.dt + parameters.damping * slip_u
+    force_v = impulse[2] / parameters.dt + parameters.damping * slip_v
+    anchor = -force_u / parameters.stiffness * t1
+    anchor = anchor - force_v / parameters.stiffness * t2
+    warm_start_out.feature[c] = contacts_out.feature[c]
+    warm_start_out.other[c] = contacts_out.other[c]
+    warm_start_out.normal_impulse[c] = impulse[0]
+    warm_start_out.friction_impulse[c] = impulse[1] * t1 + impulse[2] * t2
+    warm_start_out.anchor[c] = anchor
+    if impulse[0] <= wp.float64(0.0):
+        warm_start_out.feature[c] = -1
+
+
+@wp.kernel
+def accumulate_wrenches(
+    # model
+    parameters: Parameters,
+    # in
+    counters: wp.array(dtype=wp.int32),
+    contacts: Contacts,
+    rows: Rows,
+    # out
+    wrench_out: wp.array2d(dtype=wp.float64),
+):
+    """One thread per plant body in contact: the sum of the wrenches [N, N m] of all contacts on it."""
+    body = wp.tid()
+    for k in range(6):
+        wrench_out[body, k] = wp.float64(0.0)
+    for row in range(3 * counters[CONTACTS]):
+        c = row // 3
+        force = rows.impulse[row] / parameters.dt
+        if contacts.body_slot[c] == body:
+            for k in range(6):
+                wrench_out[body, k] = wrench_out[body, k] + force * rows.plant_jacobian[row, k]
+        if contacts.other[c] < 0 and contacts.other_slot[c] == body:
+            for k in range(6):
+                wrench_out[body, k] = wrench_out[body, k] + force * rows.plant_jacobian[row, 6 + k]

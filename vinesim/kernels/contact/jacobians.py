@@ -1,0 +1,154 @@
+"""Jacobians of the contacts, the velocities along them without contacts, their bias, and the guess of the impulses.
+
+A contact has three rows: normal n (from the other side to the plant) and two tangents. In each direction there is an
+implicit spring and damper. Along the tangents the spring's stretch is the *anchor*: it remembers where a sticking contact
+began.
+"""
+
+import warp as wp
+
+from vinesim.kernels.contact.motion import to_double, velocity_at
+from vinesim.kernels.contact.structs import (
+    Candidates,
+    Contacts,
+    Geoms,
+    Parameters,
+    PlantBodies,
+    RigidBodies,
+    Rows,
+    WarmStart,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def first_tangent(n: wp.vec3d):
+    """A unit vector across n, the same for the same n."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    other = wp.vec3d(zero, one, zero)
+    if wp.abs(n[0]) < wp.float64(0.7):
+        other = wp.vec3d(one, zero, zero)
+    return wp.normalize(wp.cross(n, other))
+
+
+@wp.func
+def write_plant_row(
+    row: int, column: int, sign: wp.float64, axis: wp.vec3d, lever: wp.vec3d, jacobian_out: wp.array2d(dtype=wp.float64)
+):
+    """Write the six entries of one plant body in a row of the Jacobian."""
+    moment = wp.cross(lever, axis)
+    for k in range(3):
+        jacobian_out[row, column + k] = sign * axis[k]
+        jacobian_out[row, column + 3 + k] = sign * moment[k]
+
+
+@wp.func
+def write_rigid_row(
+    row: int,
+    last_dof: int,
+    axis: wp.vec3d,
+    arm: wp.vec3d,
+    rigid: RigidBodies,
+    jacobian_out: wp.array2d(dtype=wp.float64),
+):
+    """Write a row of the rigid world's Jacobian; returns the geom's free velocity along it [m/s]."""
+    velocity = wp.float64(0.0)
+    dof = int(last_dof)
+    while dof >= 0:
+        angular = wp.vec3d(rigid.cdof[dof, 0], rigid.cdof[dof, 1], rigid.cdof[dof, 2])
+        linear = wp.vec3d(rigid.cdof[dof, 3], rigid.cdof[dof, 4], rigid.cdof[dof, 5])
+        entry = wp.dot(axis, linear + wp.cross(angular, arm))
+        jacobian_out[row, dof] = entry
+        velocity = velocity + entry * rigid.velocity_free[dof]
+        dof = rigid.dof_parent[dof]
+    return velocity
+
+
+@wp.func
+def write_bias(
+    c: int, parameters: Parameters, feature: int, other: int, end_gap: wp.float64, axes: wp.mat33d,
+    warm_start: WarmStart, rows_out: Rows,
+):  # fmt: skip
+    """Write bias velocities and the guess of the impulses of one contact.
+
+    The spring of an open gap does not push yet: the gap only must not close further within the step.
+    """
+    share = parameters.stiffness * parameters.dt + parameters.damping
+    if end_gap > wp.float64(0.0):
+        rows_out.bias[3 * c] = end_gap / parameters.dt
+    else:
+        rows_out.bias[3 * c] = wp.max(end_gap * parameters.stiffness / share, -parameters.max_separation_speed)
+    t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
+    t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
+    for k in range(warm_start.count[0]):
+        if warm_start.feature[k] == feature and warm_start.other[k] == other:
+            rows_out.impulse[3 * c] = warm_start.normal_impulse[k]
+            rows_out.impulse[3 * c + 1] = wp.dot(t1, warm_start.friction_impulse[k])
+            rows_out.impulse[3 * c + 2] = wp.dot(t2, warm_start.friction_impulse[k])
+            rows_out.bias[3 * c + 1] = wp.dot(t1, warm_start.anchor[k]) * parameters.stiffness / share
+            rows_out.bias[3 * c + 2] = wp.dot(t2, warm_start.anchor[k]) * parameters.stiffness / share
+
+
+@wp.kernel
+def write_contact_rows(
+    # model
+    parameters: Parameters,
+    geoms: Geoms,
+    # in
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    candidates: Candidates,
+    warm_start: WarmStart,
+    # out
+    contacts_out: Contacts,
+    rows_out: Rows,
+):
+    """One thread per contact: its three rows. The rigid Jacobian was zeroed before."""
+    c = wp.tid()
+    slots = candidates.feature.shape[1]
+    tree_row = contacts_out.source[c] // slots
+    slot = contacts_out.source[c] % slots
+    g = contacts_out.other[c]
+    n = candidates.normal[tree_row, slot]
+    x = candidates.point[tree_row, slot]
+    t1 = first_tangent(n)
+    t2 = wp.cross(n, t1)
+    contacts_out.gap[c] = candidates.gap[tree_row, slot]
+    contacts_out.point[c] = x
+    contacts_out.axes[c] = wp.matrix_from_rows(n, t1, t2)
+    body = contacts_out.body[c]
+    lever = x - to_double(wp.transform_get_translation(bodies.q[body]))
+    velocity = velocity_at(bodies.q[body], bodies.qd_free[body], x)
+    contacts_out.friction[c] = parameters.plant_friction
+    other = contacts_out.other_body[c]
+    other_lever = lever
+    last_dof = int(-1)  # noqa: RUF046
+    arm = lever
+    if g >= 0:
+        contacts_out.friction[c] = geoms.friction[g]
+        last_dof = geoms.dof[g]
+        arm = x - rigid.subtree_com[geoms.root[g]]
+    else:
+        other_lever = x - to_double(wp.transform_get_translation(bodies.q[other]))
+        velocity = velocity - velocity_at(bodies.q[other], bodies.qd_free[other], x)
+
+    for r in range(3):
+        axis = n
+        if r == 1:
+            axis = t1
+        if r == 2:
+            axis = t2
+        row = 3 * c + r
+        write_plant_row(row, 0, wp.float64(1.0), axis, lever, rows_out.plant_jacobian)
+        if g < 0:
+            write_plant_row(row, 6, wp.float64(-1.0), axis, other_lever, rows_out.plant_jacobian)
+        rigid_velocity = write_rigid_row(row, last_dof, axis, arm, rigid, rows_out.rigid_jacobian)
+        rows_out.velocity_free[row] = wp.dot(axis, velocity) - rigid_velocity
+        rows_out.bias[row] = wp.float64(0.0)
+        rows_out.impulse[row] = wp.float64(0.0)
+    write_bias(
+        c, parameters, contacts_out.feature[c], g, candidates.end_gap[tree_row, slot], contacts_out.axes[c],
+        warm_start, rows_out,
+    )  # fmt: skip

@@ -1,0 +1,72 @@
+"""Motion of bodies within one step: velocities of material points, and where they are when the step ends."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def to_double(v: wp.vec3):
+    """A vector of single precision in double precision."""
+    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+
+@wp.func
+def velocity_at(pose: wp.transform, velocity: wp.spatial_vector, point: wp.vec3d):
+    """World velocity [m/s] of a body's material at a point; ``velocity`` (linear, angular) is that of its origin."""
+    lever = point - to_double(wp.transform_get_translation(pose))
+    return to_double(wp.spatial_top(velocity)) + wp.cross(to_double(wp.spatial_bottom(velocity)), lever)
+
+
+@wp.func
+def rotate_by_small_angle(angle: wp.vec3d, rotation: wp.mat33d):
+    """A rotation turned by a small angle [rad], to second order."""
+    columns = wp.transpose(rotation)
+    x = columns[0] + wp.cross(angle, columns[0] + wp.float64(0.5) * wp.cross(angle, columns[0]))
+    y = columns[1] + wp.cross(angle, columns[1] + wp.float64(0.5) * wp.cross(angle, columns[1]))
+    z = columns[2] + wp.cross(angle, columns[2] + wp.float64(0.5) * wp.cross(angle, columns[2]))
+    return wp.matrix_from_cols(x, y, z)
+
+
+@wp.func
+def extrapolate_point(
+    dt: float, pose: wp.transform, velocity: wp.spatial_vector, acceleration: wp.spatial_vector, point: wp.vec3
+):
+    """Where a material point of a body is after a step of ``dt`` [s], to second order in dt."""
+    arm = point - wp.transform_get_translation(pose)
+    omega = wp.spatial_bottom(velocity)
+    linear = wp.spatial_top(velocity) + wp.cross(omega, arm)
+    centripetal = wp.cross(omega, wp.cross(omega, arm))
+    tangential = wp.cross(wp.spatial_bottom(acceleration), arm)
+    return point + dt * (linear + 0.5 * dt * (wp.spatial_top(acceleration) + tangential + centripetal))
+
+
+@wp.func
+def velocity_product_acceleration(
+    body: int,
+    body_parent: wp.array(dtype=wp.int32),
+    body_cut: wp.array(dtype=wp.bool),
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
+):
+    """Acceleration (linear, angular) of a body while all joints between it and its root turn at constant rates.
+
+    Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
+    """
+    origin = wp.transform_get_translation(body_q[body])
+    linear = wp.vec3()
+    angular = wp.vec3()
+    k = int(body)
+    while k >= 0:
+        parent = body_parent[k]
+        if body_cut[k]:
+            parent = -1
+        if parent >= 0:
+            joint = wp.transform_get_translation(body_q[k])
+            omega = wp.spatial_bottom(body_qd[parent])
+            relative = wp.cross(omega, wp.spatial_bottom(body_qd[k]))
+            angular += relative
+            linear += wp.cross(relative, origin - joint)
+            linear += wp.cross(omega, wp.cross(omega, joint - wp.transform_get_translation(body_q[parent])))
+        k = parent
+    return wp.spatial_vector(linear, angular)

@@ -1,0 +1,194 @@
+"""Narrowphase of plants among themselves: bunches against the wood of their tree and other bunches, tree against tree.
+
+Two capsules that overlap while all plants rest as generated, or are that near, are in contact only from there on.
+"""
+
+import warp as wp
+
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
+from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
+from vinesim.kernels.contact.distance import segment_segment_distance, vec6d
+from vinesim.kernels.contact.motion import extrapolate_point, to_double, velocity_at, velocity_product_acceleration
+from vinesim.kernels.contact.structs import (
+    AWAKE_TREES,
+    SORT_AXIS,
+    Aabbs,
+    Candidates,
+    Capsules,
+    CapsuleStates,
+    Parameters,
+    PlantBodies,
+    Trees,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def are_adjacent(x: int, y: int, parent: wp.array(dtype=wp.int32)):
+    """Whether two bodies are the same, or at most two joints apart."""
+    adjacent = x == y
+    if x >= 0 and y >= 0:
+        x_parent = parent[x]
+        y_parent = parent[y]
+        adjacent = adjacent or x_parent == y or y_parent == x or (x_parent >= 0 and x_parent == y_parent)
+        if x_parent >= 0:
+            adjacent = adjacent or parent[x_parent] == y
+        if y_parent >= 0:
+            adjacent = adjacent or parent[y_parent] == x
+    return adjacent
+
+
+@wp.func
+def distance_after_step(
+    dt: wp.float32,
+    s: int,
+    t: int,
+    body: int,
+    other_body: int,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+):
+    """:func:`segment_segment_distance` of two capsules' axes at the end of the step if both move on as they do."""
+    acceleration = velocity_product_acceleration(body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
+    other_acceleration = velocity_product_acceleration(other_body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
+    return segment_segment_distance(
+        to_double(extrapolate_point(dt, bodies.q[body], bodies.qd[body], acceleration, capsule_states.start[s])),
+        to_double(extrapolate_point(dt, bodies.q[body], bodies.qd[body], acceleration, capsule_states.end[s])),
+        to_double(
+            extrapolate_point(
+                dt, bodies.q[other_body], bodies.qd[other_body], other_acceleration, capsule_states.start[t]
+            )
+        ),
+        to_double(
+            extrapolate_point(
+                dt, bodies.q[other_body], bodies.qd[other_body], other_acceleration, capsule_states.end[t]
+            )
+        ),
+    )
+
+
+@wp.func
+def plant_candidate(
+    parameters: Parameters,
+    s: int,
+    t: int,
+    nearest: vec6d,
+    bodies: PlantBodies,
+    capsules: Capsules,
+    capsule_states: CapsuleStates,
+):
+    """The contact of capsules ``s`` and ``t``, whose axes are ``nearest`` as :func:`segment_segment_distance` says."""
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    dt = parameters.dt
+    radii = wp.float64(capsules.radius[s] + capsules.radius[t])
+    body = capsules.body[s]
+    other_body = capsules.body[t]
+    a = to_double(capsule_states.start[s])
+    b = to_double(capsule_states.end[s])
+    candidate = Candidate()
+    gap = nearest[3] - radii
+    candidate.normal = wp.vec3d(nearest[0], nearest[1], nearest[2])
+    depth = wp.float64(capsules.radius[s]) + half * gap
+    candidate.point = a + nearest[4] * (b - a) - depth * candidate.normal
+    velocity = velocity_at(bodies.q[body], bodies.qd[body], candidate.point)
+    relative = velocity - velocity_at(bodies.q[other_body], bodies.qd[other_body], candidate.point)
+    approach = dt * wp.dot(candidate.normal, relative)
+    at_rest = segment_segment_distance(
+        to_double(capsules.rest_start[s]),
+        to_double(capsules.rest_end[s]),
+        to_double(capsules.rest_start[t]),
+        to_double(capsules.rest_end[t]),
+    )
+    gap = gap - wp.min(at_rest[3] - radii - parameters.margin, zero)
+    free = velocity_at(bodies.q[body], bodies.qd_free[body], candidate.point)
+    free = free - velocity_at(bodies.q[other_body], bodies.qd_free[other_body], candidate.point)
+    soonest = wp.min(wp.min(approach, dt * wp.dot(candidate.normal, free)), zero)
+    candidate.exists = gap + soonest < parameters.static_margin
+    candidate.gap = gap
+    if candidate.exists:
+        later = distance_after_step(wp.float32(dt), s, t, body, other_body, bodies, capsule_states)
+        end_normal = wp.vec3d(later[0], later[1], later[2])
+        curvature = zero
+        if is_smooth(candidate.normal, end_normal):
+            curvature = curvature_gap(nearest[3], later[3], approach, dt * wp.length(relative))
+            candidate.normal = wp.normalize(candidate.normal + end_normal)
+        candidate.end_gap = gap + curvature
+        candidate.is_impact = gap + approach + curvature < zero and approach < -parameters.impact_speed * dt
+    return candidate
+
+
+@wp.kernel
+def find_plant_contacts(
+    # model
+    parameters: Parameters,
+    capsules: Capsules,
+    # in
+    order: wp.array(dtype=wp.int32),
+    sorted_rows: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
+    trees: Trees,
+    tree_boxes: Aabbs,
+    wood_boxes: Aabbs,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+    # out
+    candidates_out: Candidates,
+):
+    """One thread per awake tree: its contacts with itself and with the trees behind it in the order of their boxes.
+
+    Thread i takes the place ``order[i]`` in that order: the row ``sorted_rows[order[i]]`` of the candidates.
+    """
+    place = order[wp.tid()]
+    row = sorted_rows[place]
+    tree = trees.awake[row]
+    count = candidates_out.count[row]
+    axis = counters[SORT_AXIS]
+    skin = wp.float32(parameters.margin)
+    dt = wp.float32(parameters.dt)
+    for other_place in range(place, counters[AWAKE_TREES]):
+        other = trees.awake[sorted_rows[other_place]]
+        if tree_boxes.low[other][axis] > tree_boxes.high[tree][axis]:
+            break
+        if not aabbs_disjoint(
+            tree_boxes.low[tree], tree_boxes.high[tree], tree_boxes.low[other], tree_boxes.high[other]
+        ):
+            low = wp.max(tree_boxes.low[tree], tree_boxes.low[other])
+            high = wp.min(tree_boxes.high[tree], tree_boxes.high[other])
+            for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
+                s_low = capsule_states.low[s] - wp.vec3(skin)
+                s_high = capsule_states.high[s] + wp.vec3(skin)
+                is_near = not aabbs_disjoint(s_low, s_high, low, high)
+                if other == tree:  # bunches against wood, and against later bunches
+                    clear = aabbs_disjoint(s_low, s_high, wood_boxes.low[tree], wood_boxes.high[tree])
+                    later_bunch = capsules.bunch[s] < capsules.tree_last_bunch[tree]
+                    is_near = capsules.bunch[s] >= 0 and (not clear or later_bunch)
+                if is_near and is_collidable(
+                    capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached
+                ):
+                    for t in range(capsules.tree_start[other], capsules.tree_start[other + 1]):
+                        pair = not aabbs_disjoint(s_low, s_high, capsule_states.low[t], capsule_states.high[t])
+                        if pair and other == tree:
+                            pair = not are_adjacent(capsules.body[s], capsules.body[t], bodies.parent)
+                            if capsules.bunch[t] >= 0:
+                                pair = pair and capsules.bunch[t] > capsules.bunch[s]
+                        if pair and is_collidable(
+                            capsules.level[t], trees.is_fine[other], capsules.bunch[t], trees.bunch_attached
+                        ):
+                            nearest = segment_segment_distance(
+                                to_double(capsule_states.start[s]),
+                                to_double(capsule_states.end[s]),
+                                to_double(capsule_states.start[t]),
+                                to_double(capsule_states.end[t]),
+                            )
+                            radii = capsules.radius[s] + capsules.radius[t]
+                            margin = radii + skin + (capsule_states.speed[s] + capsule_states.speed[t]) * dt
+                            if nearest[3] < wp.float64(margin):
+                                candidate = plant_candidate(parameters, s, t, nearest, bodies, capsules, capsule_states)
+                                if candidate.exists:
+                                    if candidate.is_impact:
+                                        candidates_out.is_impact[row] = True
+                                    store_candidate(row, count, 2 * s, -1 - t, candidate, candidates_out)
+                                    count = count + 1
+    candidates_out.count[row] = count

@@ -1,0 +1,292 @@
+"""Narrowphase of plants and rigid geoms: where a tree's capsules touch them, or may touch them before the step ends.
+
+Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on.
+"""
+
+import warp as wp
+
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
+from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
+from vinesim.kernels.contact.distance import (
+    has_flat_or_straight_side,
+    interval_along_face,
+    segment_primitive_distance,
+    vec5d,
+)
+from vinesim.kernels.contact.motion import (
+    extrapolate_point,
+    rotate_by_small_angle,
+    to_double,
+    velocity_at,
+    velocity_product_acceleration,
+)
+from vinesim.kernels.contact.structs import (
+    AABB_BLOCK,
+    Aabbs,
+    Candidates,
+    Capsules,
+    CapsuleStates,
+    Geoms,
+    GeomStates,
+    Parameters,
+    PlantBodies,
+    RigidBodies,
+    Trees,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Pair:
+    """A capsule and a geom that are nearer than they can come together in the step."""
+
+    capsule: int
+    body: int
+    """plant body."""
+    geom: int
+    ends: int
+    """2 if a part of the capsule lies along a face of the geom: a contact at each end of it; else 1."""
+    rotation: wp.mat33d
+    """of the geom."""
+
+
+@wp.func
+def list_near_geoms(
+    row: int,
+    low: wp.vec3,
+    high: wp.vec3,
+    is_remote: bool,
+    movable: int,
+    geoms: Geoms,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    near_geoms_out: wp.array2d(dtype=wp.int32),
+):
+    """List the geoms whose boxes overlap that of a tree; returns their number."""
+    count = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    for g in range(movable):
+        counts = is_remote or not geoms.is_remote[g]
+        if counts and not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
+            near_geoms_out[row, count] = g
+            count = count + 1
+    for block in range(static_blocks.low.shape[0]):
+        if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
+            first = movable + block * AABB_BLOCK
+            for g in range(first, wp.min(first + AABB_BLOCK, geoms.id.shape[0])):
+                has_room = count < near_geoms_out.shape[1]
+                if has_room and not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
+                    near_geoms_out[row, count] = g
+                    count = count + 1
+    return count
+
+
+@wp.func
+def follow_contact(
+    parameters: Parameters,
+    candidate: Candidate,
+    pair: Pair,
+    nearest: vec5d,
+    t: wp.float64,
+    approach: wp.float64,
+    relative: wp.vec3d,
+    velocity: wp.vec3d,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+    geoms: Geoms,
+    geom_states: GeomStates,
+):
+    """The candidate with normal, point and gap of the whole step: both sides go on as they move now.
+
+    Two ends along a face are followed each for itself; for a single contact the closest points are found anew at the end
+    of the step. ``approach`` [m]: change of distance at constant velocity; ``relative`` [m/s]: ``velocity`` of the
+    capsule at the contact less that of the geom.
+    """
+    s = pair.capsule
+    body = pair.body
+    g = pair.geom
+    dt = parameters.dt
+    half = wp.float64(0.5)
+    acceleration = velocity_product_acceleration(body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
+    end_a = to_double(
+        extrapolate_point(wp.float32(dt), bodies.q[body], bodies.qd[body], acceleration, capsule_states.start[s])
+    )
+    end_b = to_double(
+        extrapolate_point(wp.float32(dt), bodies.q[body], bodies.qd[body], acceleration, capsule_states.end[s])
+    )
+    if pair.ends == 2:
+        end_a = end_a + t * (end_b - end_a)
+        end_b = end_a
+    later = segment_primitive_distance(
+        geoms.kind[g],
+        geoms.size[g],
+        rotate_by_small_angle(dt * geom_states.angular_velocity[g], pair.rotation),
+        geom_states.center[g] + dt * geom_states.velocity[g],
+        end_a,
+        end_b,
+    )
+    end_normal = wp.vec3d(later[0], later[1], later[2])
+    curvature = wp.float64(0.0)
+    if is_smooth(candidate.normal, end_normal):
+        curvature = curvature_gap(nearest[3], later[3], approach, dt * wp.length(relative))
+        moved = end_a + later[4] * (end_b - end_a)
+        moved = moved - (later[3] - half * candidate.gap) * end_normal - dt * velocity
+        candidate.normal = wp.normalize(candidate.normal + end_normal)
+        candidate.point = half * (candidate.point + moved)
+    candidate.end_gap = candidate.gap + curvature
+    if candidate.gap + approach + curvature < wp.float64(0.0) and approach < -parameters.impact_speed * dt:
+        candidate.is_impact = True
+    return candidate
+
+
+@wp.func
+def rigid_candidate(
+    parameters: Parameters,
+    pair: Pair,
+    nearest: vec5d,
+    t: wp.float64,
+    is_static: bool,
+    bodies: PlantBodies,
+    capsules: Capsules,
+    capsule_states: CapsuleStates,
+    geoms: Geoms,
+    geom_states: GeomStates,
+):
+    """The contact of a pair at ``t`` (0 to 1) on the capsule; ``nearest``: see :func:`segment_primitive_distance`."""
+    s = pair.capsule
+    body = pair.body
+    g = pair.geom
+    zero = wp.float64(0.0)
+    dt = parameters.dt
+    radius = wp.float64(capsules.radius[s])
+    a = to_double(capsule_states.start[s])
+    b = to_double(capsule_states.end[s])
+    candidate = Candidate()
+    candidate.exists = True
+    candidate.gap = nearest[3] - radius
+    candidate.normal = wp.vec3d(nearest[0], nearest[1], nearest[2])
+    candidate.point = a + t * (b - a) - (radius + wp.float64(0.5) * candidate.gap) * candidate.normal
+    velocity = velocity_at(bodies.q[body], bodies.qd[body], candidate.point)
+    geom_velocity = geom_states.velocity[g] + wp.cross(
+        geom_states.angular_velocity[g], candidate.point - geom_states.center[g]
+    )
+    relative = velocity - geom_velocity
+    approach = dt * wp.dot(candidate.normal, relative)
+    if is_static:
+        at_rest = segment_primitive_distance(
+            geoms.kind[g],
+            geoms.size[g],
+            pair.rotation,
+            geom_states.center[g],
+            to_double(capsules.rest_start[s]),
+            to_double(capsules.rest_end[s]),
+        )
+        candidate.gap = candidate.gap - wp.min(at_rest[3] - radius - parameters.margin, zero)
+        free = velocity_at(bodies.q[body], bodies.qd_free[body], candidate.point)
+        soonest = wp.min(wp.min(approach, dt * wp.dot(candidate.normal, free)), zero)
+        candidate.exists = candidate.gap + soonest < parameters.static_margin
+    if candidate.exists:
+        candidate = follow_contact(
+            parameters, candidate, pair, nearest, t, approach, relative, velocity, bodies, capsule_states, geoms,
+            geom_states,
+        )  # fmt: skip
+    return candidate
+
+
+@wp.func
+def contact_ends(
+    parameters: Parameters, kind: int, size: wp.vec3d, rotation: wp.mat33d, center: wp.vec3d, a: wp.vec3d, b: wp.vec3d,
+    t: wp.float64,
+):  # fmt: skip
+    """Ends (0 to 1) of the part of the segment a b that lies along a face of a geom; ``t`` twice if none does."""
+    ends = wp.vec2d(t, t)
+    if has_flat_or_straight_side(kind):
+        to_local = wp.transpose(rotation)
+        ends = interval_along_face(kind, size, to_local * (a - center), to_local * (b - center), t, parameters.margin)
+    return ends
+
+
+@wp.kernel
+def find_rigid_contacts(
+    # model
+    parameters: Parameters,
+    movable: int,
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    order: wp.array(dtype=wp.int32),
+    trees: Trees,
+    tree_boxes: Aabbs,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+    rigid: RigidBodies,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    # out
+    candidates_out: Candidates,
+):
+    """One thread per awake tree: its contacts with rigid geoms, in the order of (capsule, geom, end).
+
+    Thread i takes the tree ``trees.awake[order[i]]`` and writes the row ``order[i]`` of the candidates.
+    """
+    row = order[wp.tid()]
+    tree = trees.awake[row]
+    near_count = list_near_geoms(
+        row, tree_boxes.low[tree], tree_boxes.high[tree], trees.is_remote[tree], movable, geoms, geom_states,
+        static_blocks, candidates_out.near_geoms,
+    )  # fmt: skip
+    is_impact = bool(False)
+    count = int(0)  # noqa: RUF046
+    last = capsules.tree_start[tree + 1]
+    if near_count == 0:
+        last = capsules.tree_start[tree]
+    for s in range(capsules.tree_start[tree], last):
+        if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
+            radius = wp.float64(capsules.radius[s])
+            a = to_double(capsule_states.start[s])
+            b = to_double(capsule_states.end[s])
+            middle = wp.float64(0.5) * (a + b)
+            bound = wp.float64(0.5) * wp.length(b - a) + radius
+            for k in range(near_count):
+                g = candidates_out.near_geoms[row, k]
+                center = geom_states.center[g]
+                margin = (
+                    parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
+                )
+                between = middle - center
+                limit = bound + geoms.radius[g] + margin
+                overlap = not aabbs_disjoint(
+                    capsule_states.low[s], capsule_states.high[s], geom_states.low[g], geom_states.high[g]
+                )
+                if overlap and wp.dot(between, between) < limit * limit:
+                    rotation = rigid.xmat[geoms.id[g]]
+                    nearest = segment_primitive_distance(geoms.kind[g], geoms.size[g], rotation, center, a, b)
+                    if nearest[3] - radius < margin:
+                        ends = contact_ends(
+                            parameters, geoms.kind[g], geoms.size[g], rotation, center, a, b, nearest[4]
+                        )
+                        pair = Pair()
+                        pair.capsule = s
+                        pair.body = capsules.body[s]
+                        pair.geom = g
+                        pair.ends = wp.where(ends[0] < ends[1], 2, 1)
+                        pair.rotation = rotation
+                        for end in range(pair.ends):
+                            if pair.ends == 2:
+                                p = a + ends[end] * (b - a)
+                                nearest = segment_primitive_distance(
+                                    geoms.kind[g], geoms.size[g], rotation, center, p, p
+                                )
+                            candidate = rigid_candidate(
+                                parameters, pair, nearest, ends[end], g >= movable, bodies, capsules, capsule_states,
+                                geoms, geom_states,
+                            )  # fmt: skip
+                            if candidate.exists:
+                                is_impact = is_impact or candidate.is_impact
+                                store_candidate(row, count, 2 * s + end, g, candidate, candidates_out)
+                                count = count + 1
+    candidates_out.is_impact[row] = is_impact
+    candidates_out.count[row] = count
+    slots = candidates_out.feature.shape[1]
+    for k in range(wp.min(count, slots), slots):
+        candidates_out.feature[row, k] = -1

@@ -1,0 +1,337 @@
+"""Arrays of the contact kernels, grouped: plants and their capsules, rigid geoms, candidates, contacts, warm start.
+
+Sizes in brackets. Positions and velocities are in world axes; a *capsule* always belongs to a plant and a *geom* to a
+rigid body. One side of a contact is a capsule; the other is a geom (its number) or another plant's capsule (-1 - its
+number).
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+# entries of ``counters``
+AWAKE_TREES = wp.constant(0)
+CONTACTS = wp.constant(1)
+OVERFLOW = wp.constant(2)
+"""Contacts beyond what one tree can have at once."""
+IMPACTED_TREES = wp.constant(3)
+"""Trees with a contact that closes faster than the impact speed."""
+BODIES = wp.constant(4)
+"""Plant bodies in contact."""
+IS_CONSTRAINED = wp.constant(5)
+"""1 if a rigid body in contact is bound by active constraints of MuJoCo."""
+ISLANDS = wp.constant(6)
+SORT_AXIS = wp.constant(7)
+"""World axis (0, 1, 2) along which the boxes of trees are sorted."""
+COUNTERS = 8
+
+AABB_BLOCK = wp.constant(32)
+"""So many static boxes share one box around them, and are skipped by one comparison."""
+
+
+@wp.struct
+class Parameters:
+    """Numbers of the contact model, see :class:`vinesim.scene.physics_parameters.PhysicsParameters`."""
+
+    dt: wp.float64
+    """[s]"""
+    stiffness: wp.float64
+    """[N/m]"""
+    damping: wp.float64
+    """[N s/m]"""
+    compliance: wp.float64
+    """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), on the diagonal of the Delassus matrix."""
+    margin: wp.float64
+    """[m] Contacts with movable geoms exist from this gap on."""
+    static_margin: wp.float64
+    """[m] The same for static geoms and other plants."""
+    max_separation_speed: wp.float64
+    """[m/s]"""
+    impact_speed: wp.float64
+    """[m/s] A contact that closes faster is an impact."""
+    wake_speed: wp.float64
+    """[m/s] Boxes and free bunches that are slower wake no plant."""
+    plant_friction: wp.float64
+    """[1] Coulomb coefficient between plants."""
+
+
+@wp.struct
+class Aabbs:
+    """Axis-aligned boxes [box] m; empty where low > high."""
+
+    low: wp.array(dtype=wp.vec3)
+    high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Trees:
+    """State of all trees; a tree is one kinematic tree of a plant."""
+
+    awake: wp.array(dtype=wp.int32)
+    """[k] numbers of the trees that this step is about; as many as the thread count says."""
+    is_fine: wp.array(dtype=wp.bool)
+    """[tree] whether the clusters of its bunches are free to move."""
+    is_remote: wp.array(dtype=wp.bool)
+    """[tree] whether another client owns its state."""
+    bunch_attached: wp.array(dtype=wp.bool)
+    """[bunch]"""
+
+
+@wp.struct
+class PlantBodies:
+    """Bodies of all plants."""
+
+    parent: wp.array(dtype=wp.int32)
+    """[body] -1 for a root."""
+    tree: wp.array(dtype=wp.int32)
+    """[body]"""
+    is_cut: wp.array(dtype=wp.bool)
+    """[body] whether its joint was cut."""
+    q: wp.array(dtype=wp.transform)
+    """[body] pose of its origin."""
+    qd: wp.array(dtype=wp.spatial_vector)
+    """[body] velocity (linear, angular) of its origin at the start of the step."""
+    qd_free: wp.array(dtype=wp.spatial_vector)
+    """[body] the same at the end of the step if there were no contacts."""
+
+
+@wp.struct
+class Capsules:
+    """Collision capsules of all plants, sorted by body."""
+
+    tree_start: wp.array(dtype=wp.int32)
+    """[tree + 1] first capsule of each tree."""
+    tree_last_bunch: wp.array(dtype=wp.int32)
+    """[tree] highest number of a bunch in it, -1 for none."""
+    body: wp.array(dtype=wp.int32)
+    bunch: wp.array(dtype=wp.int32)
+    """[capsule] -1 for wood."""
+    level: wp.array(dtype=wp.int32)
+    """[capsule] level of detail of its tree at which it exists: 0 both, 1 coarse, 2 fine."""
+    local_start: wp.array(dtype=wp.vec3)
+    """[capsule] m, in the body's frame."""
+    local_end: wp.array(dtype=wp.vec3)
+    radius: wp.array(dtype=float)
+    """[capsule] m"""
+    extent: wp.array(dtype=float)
+    """[capsule] m, farthest point from the body's origin."""
+    rest_start: wp.array(dtype=wp.vec3)
+    """[capsule] m, in the world while all plants rest as they were generated."""
+    rest_end: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class CapsuleStates:
+    """The capsules of awake trees at the start of the step [capsule]."""
+
+    start: wp.array(dtype=wp.vec3)
+    end: wp.array(dtype=wp.vec3)
+    speed: wp.array(dtype=float)
+    """[m/s] bound of the speed of all its points."""
+    low: wp.array(dtype=wp.vec3)
+    """[m] box of the space that it sweeps in the step."""
+    high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Geoms:
+    """Rigid geoms that plants collide with [geom]: first those that can move, then static ones."""
+
+    id: wp.array(dtype=wp.int32)
+    """number in MuJoCo's arrays."""
+    body: wp.array(dtype=wp.int32)
+    """MuJoCo body."""
+    root: wp.array(dtype=wp.int32)
+    """root body of its kinematic tree, about whose centre of mass MuJoCo expresses ``cvel`` and ``cdof``."""
+    dof: wp.array(dtype=wp.int32)
+    """last degree of freedom that moves it, -1 for none."""
+    kind: wp.array(dtype=wp.int32)
+    """mjtGeom."""
+    size: wp.array(dtype=wp.vec3d)
+    """geom_size of MuJoCo."""
+    center: wp.array(dtype=wp.vec3d)
+    """[m] in the geom's frame."""
+    half: wp.array(dtype=wp.vec3d)
+    """[m] half edges of its box, in its own axes."""
+    radius: wp.array(dtype=wp.float64)
+    """[m] of its bounding sphere."""
+    friction: wp.array(dtype=wp.float64)
+    is_remote: wp.array(dtype=wp.bool)
+    """whether it belongs to the copy of another client's robot or person: that touches remote trees only."""
+
+
+@wp.struct
+class GeomStates:
+    """The same geoms at the start of the step [geom]."""
+
+    center: wp.array(dtype=wp.vec3d)
+    velocity: wp.array(dtype=wp.vec3d)
+    """[m/s] of the centre."""
+    angular_velocity: wp.array(dtype=wp.vec3d)
+    """[rad/s]"""
+    speed: wp.array(dtype=wp.float64)
+    """[m/s] likely bound of the speed of all its points in the step."""
+    low: wp.array(dtype=wp.vec3)
+    """[m] box of the space that it can sweep in the step."""
+    high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Actors:
+    """Robots, people, boxes and free bunches [actor]: each a range of the movable geoms."""
+
+    start: wp.array(dtype=wp.int32)
+    """[actor + 1] first geom of each."""
+    is_remote: wp.array(dtype=wp.bool)
+    wakes_only_moving: wp.array(dtype=wp.bool)
+    """Boxes and free bunches wake plants only while they are faster than ``wake_speed``."""
+
+
+@wp.struct
+class RigidBodies:
+    """MuJoCo's arrays of the same names, and the velocities of its degrees of freedom."""
+
+    xpos: wp.array(dtype=wp.vec3d)
+    """[MuJoCo geom]"""
+    xmat: wp.array(dtype=wp.mat33d)
+    """[MuJoCo geom]"""
+    cvel: wp.array2d(dtype=wp.float64)
+    """[MuJoCo body, 6] angular, linear."""
+    cdof: wp.array2d(dtype=wp.float64)
+    """[dof, 6] angular, linear."""
+    subtree_com: wp.array(dtype=wp.vec3d)
+    """[MuJoCo body]"""
+    dof_parent: wp.array(dtype=wp.int32)
+    dof_tree: wp.array(dtype=wp.int32)
+    velocity_free: wp.array(dtype=wp.float64)
+    """[dof] at the end of the step if there were no plants."""
+    correction: wp.array(dtype=wp.float64)
+    """[dof] by which plants changed that prediction in the last step."""
+    correction_before: wp.array(dtype=wp.float64)
+    """[dof] the same in the step before."""
+    tree_island: wp.array(dtype=wp.int32)
+    """[MuJoCo tree] label of those that active constraints couple."""
+
+
+@wp.struct
+class RigidFactors:
+    """MuJoCo's sparse factors L^T D L of the mass matrix M and of M^, which has the implicit servos in it."""
+
+    tree_dof: wp.array(dtype=wp.int32)
+    """tree_dofadr"""
+    tree_dof_count: wp.array(dtype=wp.int32)
+    row_start: wp.array(dtype=wp.int32)
+    """M_rowadr"""
+    row_count: wp.array(dtype=wp.int32)
+    """M_rownnz"""
+    column: wp.array(dtype=wp.int32)
+    """M_colind"""
+    implicit: wp.array(dtype=wp.float64)
+    """qH"""
+    implicit_inverse: wp.array(dtype=wp.float64)
+    """qHDiagInv; 0 if nothing is implicit in the whole world: then M^ is M."""
+    plain: wp.array(dtype=wp.float64)
+    """qLD"""
+    plain_inverse: wp.array(dtype=wp.float64)
+    """qLDiagInv"""
+
+
+@wp.struct
+class Candidates:
+    """What the narrowphase finds, by awake tree and slot [awake tree, slot]."""
+
+    count: wp.array(dtype=wp.int32)
+    """[awake tree] found; those beyond the number of slots are only counted."""
+    is_impact: wp.array(dtype=wp.bool)
+    """[awake tree] whether one of them is an impact."""
+    near_geoms: wp.array2d(dtype=wp.int32)
+    """[awake tree, k] scratch: geoms whose box overlaps that of the tree."""
+    feature: wp.array2d(dtype=wp.int32)
+    """2 * capsule + end of the part along a face; -1 for an empty slot."""
+    other: wp.array2d(dtype=wp.int32)
+    """geom, or -1 - capsule of another plant."""
+    gap: wp.array2d(dtype=wp.float64)
+    """[m] at the start of the step."""
+    end_gap: wp.array2d(dtype=wp.float64)
+    """[m] ``gap`` with what the curvature of the motion adds to it in the step; that of the velocity is not in it."""
+    normal: wp.array2d(dtype=wp.vec3d)
+    """from the other side to the capsule."""
+    point: wp.array2d(dtype=wp.vec3d)
+    """[m]"""
+
+
+@wp.struct
+class Contacts:
+    """Contacts of the step [contact], one after the other."""
+
+    source: wp.array(dtype=wp.int32)
+    """awake tree * slots + slot of its candidate."""
+    feature: wp.array(dtype=wp.int32)
+    other: wp.array(dtype=wp.int32)
+    body: wp.array(dtype=wp.int32)
+    """plant body."""
+    body_slot: wp.array(dtype=wp.int32)
+    """place of ``body`` in the list of bodies in contact."""
+    other_body: wp.array(dtype=wp.int32)
+    """the other plant body, -1 for a geom."""
+    other_slot: wp.array(dtype=wp.int32)
+    gap: wp.array(dtype=wp.float64)
+    friction: wp.array(dtype=wp.float64)
+    point: wp.array(dtype=wp.vec3d)
+    axes: wp.array(dtype=wp.mat33d)
+    """rows: normal, first and second tangent."""
+    island: wp.array(dtype=wp.int32)
+    force: wp.array(dtype=wp.vec3d)
+    """[N] on the plant."""
+
+
+@wp.struct
+class Islands:
+    """Islands: sets of contacts that do not affect each other within the step."""
+
+    start: wp.array(dtype=wp.int32)
+    """[island + 1] first place of each in ``contact``."""
+    contact: wp.array(dtype=wp.int32)
+    """[contact] contacts, island by island."""
+    sweeps: wp.array(dtype=wp.int32)
+    """[island] Gauss-Seidel sweeps of the last solve."""
+
+
+@wp.struct
+class Rows:
+    """Three rows for each contact [row]: normal, first and second tangent."""
+
+    plant_jacobian: wp.array2d(dtype=wp.float64)
+    """[row, 12] of the body and of the other plant body, each linear and angular."""
+    rigid_jacobian: wp.array2d(dtype=wp.float64)
+    """[row, dof]"""
+    plant_response: wp.array2d(dtype=wp.float64)
+    """[row, 6 * body in contact] M^-1 J^T: change of velocity of plant bodies for a unit impulse along the row."""
+    rigid_response: wp.array2d(dtype=wp.float64)
+    """[row, dof] the same for the rigid world."""
+    delassus: wp.array2d(dtype=wp.float64)
+    """[row, row] J M^-1 J^T, within islands only."""
+    velocity_free: wp.array(dtype=wp.float64)
+    """[row] m/s along the row at the end of the step without contacts."""
+    bias: wp.array(dtype=wp.float64)
+    """[row] m/s"""
+    impulse: wp.array(dtype=wp.float64)
+    """[row] N s"""
+    newton_system: wp.array2d(dtype=wp.float64)
+    """[row, row + 2] scratch of Newton steps; the last column keeps the impulses from before the first of them."""
+
+
+@wp.struct
+class WarmStart:
+    """What the next step starts from [contact of the last step]."""
+
+    count: wp.array(dtype=wp.int32)
+    """[1]"""
+    feature: wp.array(dtype=wp.int32)
+    """-1 if the contact did not press."""
+    other: wp.array(dtype=wp.int32)
+    normal_impulse: wp.array(dtype=wp.float64)
+    friction_impulse: wp.array(dtype=wp.vec3d)
+    """world axes."""
+    anchor: wp.array(dtype=wp.vec3d)
+    """[m] stretch of the tangential spring since the contact began to stick, world axes."""

@@ -1,0 +1,107 @@
+"""Pinhole projection, bounds of what is projected, and the depth test of all rasterisers.
+
+A pixel keeps its nearest hit by ``atomic_min`` on a 64-bit key: depth [um] above, number of the primitive below. Depth
+runs along the optical axis. There is no near plane: whatever is in front of the pinhole is seen.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+EMPTY_KEY = wp.constant(wp.int64(1 << 62))
+"""Key of a pixel that sees no primitive."""
+PRIMITIVE_MASK = wp.constant(wp.int64(0x7FFFFFFF))
+UNBOUND = wp.constant(1.0e6)
+"""A tangent beyond any picture."""
+NEAR_DEPTH = wp.constant(0.05)
+"""Nearer than this [m] bounds are taken from spheres, which know no plane."""
+BATCH = wp.constant(64)
+"""Pixels of a row that are taken at once; loops over them are written so that LLVM takes eight at a time."""
+SMOOTH_SIZE = wp.constant(120.0)
+"""From this size in pixels on a leaf's outline is interpolated between texels."""
+
+
+FloatBatch = wp.types.vector(length=64, dtype=wp.float32)
+"""Scratch for one run of pixels."""
+
+
+IntBatch = wp.types.vector(length=64, dtype=wp.int32)
+
+
+@wp.struct
+class Pinhole:
+    """Where a camera is and how it projects. Pixel centres have whole coordinates (sensor_msgs/CameraInfo)."""
+
+    eye: wp.vec3
+    rotation: wp.mat33
+    """Rows: right, down, forward, in the world."""
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    max_depth: float
+    """Farthest depth that is drawn [m]."""
+    near_radius: float
+    """Radius of a ball around the eye that holds all of the view within the depth CLOSE [m]."""
+
+
+@wp.func
+def pixel_ray(lens: Pinhole, x: int, y: int) -> wp.vec3:
+    """Ray of a pixel in the optical frame, 1 along the axis."""
+    return wp.vec3((float(x) - lens.cx) / lens.fx, (float(y) - lens.cy) / lens.fy, 1.0)
+
+
+@wp.func
+def depth_key(t: float, i: int) -> wp.int64:
+    """What a hit is kept as: the least is the nearest."""
+    return (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i)
+
+
+@wp.func
+def depth_test(pixel: int, t: float, i: int, reach: float, keys_out: wp.array(dtype=wp.int64)):
+    """Enter a hit."""
+    if t < reach:
+        wp.atomic_min(keys_out, pixel, depth_key(t, i))
+
+
+@wp.func
+def circle_tangents(x: float, z: float, r: float) -> wp.vec2:
+    """Both tangents (x / z) from the origin to a circle; beyond +-90 degrees they are unbound, with the right sign."""
+    free = x * x + z * z - r * r
+    low = -UNBOUND
+    high = UNBOUND
+    if free > 0.0:
+        t = wp.sqrt(free)
+        tiny = 1.0e-6 * t
+        lx = x * t - z * r
+        lz = z * t + x * r
+        hx = x * t + z * r
+        hz = z * t - x * r
+        low = wp.where(lz > tiny, lx / wp.max(lz, tiny), wp.where(lx < 0.0, -UNBOUND, UNBOUND))
+        high = wp.where(hz > tiny, hx / wp.max(hz, tiny), wp.where(hx < 0.0, -UNBOUND, UNBOUND))
+    return wp.vec2(low, high)
+
+
+@wp.func
+def sphere_bounds(lens: Pinhole, p: wp.vec3, r: float) -> wp.vec4:
+    """Lowest and highest x, lowest and highest y of a sphere's picture [pixel]."""
+    h = circle_tangents(p[0], p[2], r)
+    v = circle_tangents(p[1], p[2], r)
+    return wp.vec4(
+        h[0] * lens.fx + lens.cx, h[1] * lens.fx + lens.cx, v[0] * lens.fy + lens.cy, v[1] * lens.fy + lens.cy
+    )
+
+
+@wp.func
+def clip_to_image(lens: Pinhole, bound: wp.vec4) -> wp.vec4i:
+    """Bound cut to the picture: first and last + 1 column, first and last + 1 row."""
+    w = float(lens.width)
+    h = float(lens.height)
+    return wp.vec4i(
+        int(wp.clamp(bound[0] - 0.01, 0.0, w)),
+        int(wp.clamp(bound[1] + 1.01, 0.0, w)),
+        int(wp.clamp(bound[2] - 0.01, 0.0, h)),
+        int(wp.clamp(bound[3] + 1.01, 0.0, h)),
+    )

@@ -1,0 +1,192 @@
+"""Collision detection of plants: boxes of trees and geoms, trees that actors are near, and candidates of contacts.
+
+The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then
+:meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for each
+listing of the rigid world: a bound launch costs a fifth of a plain one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.contact import broadphase, narrowphase_plants, narrowphase_rigid, structs
+from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
+from vinesim.physics.contact.scene_arrays import PlantArrays, RigidArrays
+from vinesim.physics.contact.shared_arrays import SharedArrays, share
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+
+AABB_BLOCK = int(structs.AABB_BLOCK)
+MIN_TREES_PER_THREAD = 16
+"""With fewer awake trees for each thread, handing them over costs more than it saves. TUNED."""
+MIN_TREE_ROOM = 64
+"""Rows of the candidates that are allocated at least; more when more trees are awake."""
+
+Launch = Callable[..., None]
+
+
+class ContactDetection:
+    """Finds which trees actors are near, and where awake trees touch rigid geoms, each other and themselves."""
+
+    def __init__(
+        self,
+        plants: ArticulationSolver,
+        arrays: PlantArrays,
+        parameters: PhysicsParameters,
+        kernel_parameters: structs.Parameters,
+    ) -> None:
+        self.plants, self.arrays, self.parameters = plants, arrays, parameters
+        self._kernel_parameters = kernel_parameters
+        trees = len(arrays.trees.is_fine)
+        self._order, self._partition = np.zeros(trees, np.int32), (0, 0)
+        self._sorted_rows = np.zeros(trees, np.int32)
+        self._is_near = np.zeros(trees, np.bool_)
+        self.counters = np.zeros(structs.COUNTERS, np.int32)
+        """See :mod:`vinesim.kernels.contact.structs`."""
+        self.tree_boxes = SharedArrays.zeros(structs.Aabbs, trees)
+        self._wood_boxes = SharedArrays.zeros(structs.Aabbs, trees)
+        blocks = -(-trees // AABB_BLOCK)
+        self._blocks, self._block_boxes = np.zeros(blocks, np.int32), SharedArrays.zeros(structs.Aabbs, blocks)
+        self.slots = np.arange(parameters.max_contacts_per_tree)
+        self._room = 0
+
+    def set_rigid_world(self, rigid_arrays: RigidArrays) -> None:
+        """Take over the geoms of the rigid world after an actor came or went."""
+        self.rigid_arrays, self._static_bounded = rigid_arrays, False
+        static = rigid_arrays.count - rigid_arrays.movable
+        self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-static // AABB_BLOCK))
+        self._actor_boxes = SharedArrays.zeros(structs.Aabbs, rigid_arrays.actor_count)
+        self._allocate_candidates(max(self._room, MIN_TREE_ROOM))
+
+    def _allocate_candidates(self, trees: int) -> None:
+        """Room for the candidates of so many awake trees."""
+        self._room, slots = trees, len(self.slots)
+        near = min(self.rigid_arrays.count, self.rigid_arrays.movable + self.parameters.max_static_geoms_per_tree)
+        self.candidates = SharedArrays.zeros(
+            structs.Candidates, trees, slots, count=np.zeros(trees, np.int32), is_impact=np.zeros(trees, np.bool_),
+            near_geoms=np.zeros((trees, near), np.int32),
+        )  # fmt: skip
+        self._bind_launches()
+
+    # ------------------------------------------------------------------ broadphase
+
+    def update_tree_bounds(self, trees: np.ndarray) -> None:
+        """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies."""
+        self.arrays.trees.awake[: len(trees)] = trees
+        self._launch_over_trees(len(trees), self._tree_aabbs)
+        blocks = np.unique(trees // AABB_BLOCK)
+        self._blocks[: len(blocks)] = blocks
+        self._block_aabbs(len(blocks))
+
+    def find_near_trees(self) -> np.ndarray:
+        """Trees [k] whose box a geom of an actor overlaps within the step."""
+        if self._static_bounded:
+            self._geom_aabbs(self.rigid_arrays.movable)
+        else:
+            self._geom_aabbs(self.rigid_arrays.count)
+            self._bound_static_geoms()
+        self._actor_aabbs(self.rigid_arrays.actor_count)
+        self._is_near[:] = False
+        self._mark_near_trees(len(self._blocks))
+        return np.flatnonzero(self._is_near)
+
+    def _bound_static_geoms(self) -> None:
+        """Boxes around blocks of static geoms; the ground reaches down without end."""
+        first, states, boxes = self.rigid_arrays.movable, self.rigid_arrays.geom_states, self._static_blocks
+        ground = np.flatnonzero(self.rigid_arrays.geoms.kind[first:] == 0) + first
+        states.low[ground, 2] = -PLANE_HALF_SIZE
+        for block in range(len(boxes.low)):
+            of = slice(first + AABB_BLOCK * block, first + AABB_BLOCK * (block + 1))
+            boxes.low[block], boxes.high[block] = states.low[of].min(0), states.high[of].max(0)
+        self._static_bounded = True
+
+    # ------------------------------------------------------------------ narrowphase
+
+    def find_candidates(self, awake: np.ndarray, plant_plant_contacts: bool) -> None:
+        """Fill ``candidates`` for the awake trees [k]; ``counters`` says how many trees these are."""
+        trees = len(awake)
+        if trees > self._room:
+            self._allocate_candidates(2 * trees)
+        self.arrays.trees.awake[:trees] = awake
+        self.counters[structs.AWAKE_TREES] = trees
+        self._launch_over_trees(trees, self._tree_aabbs, self._find_rigid_contacts)
+        if plant_plant_contacts:
+            low = self.tree_boxes.low[awake]
+            axis = self.counters[structs.SORT_AXIS] = int(np.argmax(low.max(0) - low.min(0)))
+            self._sorted_rows[:trees] = np.argsort(low[:, axis], kind="stable")
+            self._launch_over_trees(trees, self._find_plant_contacts)
+
+    def deepest(self, trees: int, count: int) -> np.ndarray:
+        """The ``count`` candidates with the smallest gap, as numbers row * slots + slot in ascending order."""
+        found = np.flatnonzero(self.slots < self.candidates.count[:trees, None])
+        return np.sort(found[np.argsort(self.candidates.gap.ravel()[found], kind="stable")[:count]])
+
+    # ------------------------------------------------------------------ launches
+
+    def _launch_over_trees(self, count: int, *launches: Launch) -> None:
+        """Launch over so many trees of the list, for each one launch after the other; threads take turns in it."""
+        pool = self.plants.thread_pool
+        threads = 1 if pool is None or count < MIN_TREES_PER_THREAD * pool.size else pool.size
+        if self._partition != (count, threads):
+            self._partition = (count, threads)
+            self._order[:count] = np.concatenate([np.arange(i, count, threads) for i in range(threads)])
+        if pool is None or threads == 1:
+            for launch in launches:
+                launch(count)
+            return
+        share = [len(range(i, count, threads)) for i in range(threads)]
+        first = [sum(share[:i]) for i in range(threads)]
+        pool.run([partial(_launch_all, launches, share[i], first[i], i) for i in range(threads)])
+
+    def _bind_launches(self) -> None:
+        """Bind every kernel to its arrays."""
+        parameters, plants, rigid = self._kernel_parameters, self.arrays, self.rigid_arrays
+        trees, bodies = plants.trees.struct, plants.bodies.struct
+        capsules, capsule_states = plants.capsules.struct, plants.capsule_states.struct
+        geoms, geom_states, actors = rigid.geoms.struct, rigid.geom_states.struct, rigid.actors.struct
+        tree_boxes, wood_boxes = self.tree_boxes.struct, self._wood_boxes.struct
+        actor_boxes, block_boxes = self._actor_boxes.struct, self._block_boxes.struct
+        order, candidates = share(self._order, wp.int32), self.candidates.struct
+        by_tree = {"index_list": "order", "partitions": self.plants.threads}
+
+        self._geom_aabbs = bind_launch(broadphase.geom_aabbs, [parameters, geoms, rigid.bodies.struct], [geom_states])
+        self._actor_aabbs = bind_launch(broadphase.actor_aabbs, [parameters, actors, geom_states], [actor_boxes])
+        self._tree_aabbs = bind_launch(
+            broadphase.tree_aabbs,
+            [parameters, capsules, order, trees, bodies],
+            [capsule_states, wood_boxes, tree_boxes],
+            **by_tree,
+        )
+        self._block_aabbs = bind_launch(
+            broadphase.block_aabbs, [share(self._blocks, wp.int32), tree_boxes], [block_boxes]
+        )
+        self._mark_near_trees = bind_launch(
+            broadphase.mark_near_trees,
+            [actors, trees, block_boxes, tree_boxes, actor_boxes, geom_states],
+            [share(self._is_near, wp.bool)],
+        )
+        self._find_rigid_contacts = bind_launch(
+            narrowphase_rigid.find_rigid_contacts,
+            [parameters, rigid.movable, capsules, geoms, order, trees, tree_boxes, bodies, capsule_states,
+             rigid.bodies.struct, geom_states, self._static_blocks.struct],
+            [candidates],
+            **by_tree,
+        )  # fmt: skip
+        self._find_plant_contacts = bind_launch(
+            narrowphase_plants.find_plant_contacts,
+            [parameters, capsules, order, share(self._sorted_rows, wp.int32), share(self.counters, wp.int32), trees,
+             tree_boxes, wood_boxes, bodies, capsule_states],
+            [candidates],
+            **by_tree,
+        )  # fmt: skip
+
+
+def _launch_all(launches: tuple[Launch, ...], count: int, first: int, partition: int) -> None:
+    """One thread's share of several launches."""
+    for launch in launches:
+        launch(count, first, partition)

@@ -1,0 +1,156 @@
+"""Solve of all contacts of a step at once: islands, Jacobians, Delassus matrix, projected Gauss-Seidel, warm start.
+
+The stages of :meth:`ImpulseSolver.solve` follow the kernels: ``islands``, ``jacobians``, ``delassus``,
+``projected_gauss_seidel`` (with the steps of ``newton``), ``forces``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
+from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.detection import ContactDetection
+from vinesim.physics.contact.scene_arrays import PlantArrays, RigidArrays
+from vinesim.physics.contact.shared_arrays import SharedArrays, share
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.rigid.rigid_world import RigidWorld
+
+REMOVED_GEOM = np.iinfo(np.int32).max
+"""Number that a warm start keeps for a geom that is gone."""
+
+
+class ImpulseSolver:
+    """Finds the impulses that keep plants and rigid bodies apart, and what they do to either side."""
+
+    def __init__(
+        self,
+        plants: ArticulationSolver,
+        rigid: RigidWorld,
+        arrays: PlantArrays,
+        parameters: PhysicsParameters,
+        kernel_parameters: structs.Parameters,
+    ) -> None:
+        self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
+        self._kernel_parameters = kernel_parameters
+        n = self.capacity = parameters.contact_capacity
+        self.contacts = SharedArrays.zeros(structs.Contacts, n)
+        self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
+        self.islands = SharedArrays.zeros(structs.Islands, n, start=np.zeros(n + 1, np.int32))
+        self._row_arrays = {
+            "plant_jacobian": np.zeros((3 * n, 12)),
+            "plant_response": np.zeros((3 * n, 12 * n)),
+            "delassus": np.zeros((3 * n, 3 * n)),
+            "newton_system": np.zeros((3 * n, 3 * n + 2)),
+            "velocity_free": np.zeros(3 * n),
+            "bias": np.zeros(3 * n),
+            "impulse": np.zeros(3 * n),
+        }
+        self._touched_bodies, self._wrench = np.zeros(2 * n + 1, np.int32), np.zeros((2 * n, 6))
+        self._body_response = np.zeros((2 * n, 6, 2 * n, 6), np.float32)
+        self.bodies = np.zeros(0, np.int32)
+        """Plant bodies in contact [n], sorted."""
+        self.wrenches = np.zeros((0, 6))
+        """[n, 6] N, N m on them, at their origins, world axes."""
+        self.rigid_force: np.ndarray | None = None
+        """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
+        self.sweeps = self.island_count = 0
+        """Of the last solve: sweeps that its slowest island took, and the number of islands."""
+
+    def set_rigid_world(
+        self, rigid_arrays: RigidArrays, detection: ContactDetection, previous: RigidArrays | None
+    ) -> None:
+        """Take over the rigid world after an actor came or went; the warm start follows the names of the geoms."""
+        self.rigid_arrays = rigid_arrays
+        if previous is not None:
+            at = {name: i for i, name in enumerate(rigid_arrays.names)}
+            other = self.warm_start.other
+            for k, geom in enumerate(other[: self.warm_start.count[0]].tolist()):
+                if geom >= 0:
+                    other[k] = at.get(previous.names[geom], REMOVED_GEOM)
+        size = (3 * self.capacity, self.rigid.mj_model.nv)
+        self.rows = SharedArrays(
+            structs.Rows, rigid_jacobian=np.zeros(size), rigid_response=np.zeros(size), **self._row_arrays
+        )
+        self.bind_launches(detection)
+
+    def clear(self) -> None:
+        """Forget the last solve, but for its warm start."""
+        self.bodies, self.wrenches, self.rigid_force = self.bodies[:0], self.wrenches[:0], None
+
+    def solve(self, count: int, counters: np.ndarray) -> None:
+        """Find the impulses of the first ``count`` contacts, and what they do to either side."""
+        n, row_count, rows = count, 3 * count, self.rows
+        self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
+        self._build_islands(1)
+        touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        self.bodies = bodies = self._touched_bodies[:touched].copy()
+        rigid_jacobian, rigid_response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
+        rigid_jacobian[:] = 0.0
+        rigid_response[:] = 0.0
+        self._write_contact_rows(n)
+
+        self._body_response[:touched, :, :touched] = self.plants.impulse_response(bodies)
+        geom_bodies = self.rigid_arrays.geoms.body[self.contacts.other[:n].clip(0)]
+        is_constrained = counters[structs.IS_CONSTRAINED] = self.rigid.is_constrained(geom_bodies)
+        self._inverse_mass_times_jacobian(row_count)
+        if is_constrained:
+            rigid_response[:] = self.rigid.impulse_response(rigid_jacobian).T
+        self._assemble_delassus(row_count)
+        self._solve_islands(island_count)
+        self.sweeps, self.island_count = int(self.islands.sweeps[:island_count].max()), island_count
+
+        self.warm_start.count[0] = n
+        self._store_warm_start(n)
+        self._accumulate_wrenches(touched)
+        self.wrenches = self._wrench[:touched].copy()
+        self.rigid_force = rows.impulse[:row_count] @ rigid_jacobian / -self.parameters.dt
+
+    def bind_launches(self, detection: ContactDetection) -> None:
+        """Bind every kernel to its arrays; to call again when ``detection`` has new arrays of candidates."""
+        p, parameters, rigid = self.parameters, self._kernel_parameters, self.rigid_arrays
+        capsules, bodies = self.arrays.capsules.struct, self.arrays.bodies.struct
+        geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
+        candidates, contacts = detection.candidates.struct, self.contacts.struct
+        groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
+        counters, touched = share(detection.counters, wp.int32), share(self._touched_bodies, wp.int32)
+        body_response = share(self._body_response, wp.float32).reshape((12 * self.capacity, -1))
+        self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
+        self._build_islands = bind_launch(
+            islands.build_islands,
+            [capsules, geoms, bodies, rigid_bodies, candidates],
+            [counters, touched, contacts, groups],
+        )
+        self._write_contact_rows = bind_launch(
+            jacobians.write_contact_rows,
+            [parameters, geoms, bodies, rigid_bodies, candidates, warm_start],
+            [contacts, rows],
+        )
+        self._inverse_mass_times_jacobian = bind_launch(
+            delassus.inverse_mass_times_jacobian,
+            [geoms, bodies, rigid_bodies, rigid.factors.struct, contacts, touched, counters, body_response],
+            [rows],
+        )
+        self._assemble_delassus = bind_launch(
+            delassus.assemble_delassus, [geoms, rigid_bodies, contacts, groups], [rows]
+        )
+        self._solve_islands = bind_launch(
+            projected_gauss_seidel.solve_islands,
+            [
+                parameters,
+                p.solver_sweeps,
+                p.solver_newton_steps,
+                p.solver_newton_contacts,
+                p.solver_tolerance,
+                contacts,
+            ],
+            [groups, rows],
+        )
+        self._store_warm_start = bind_launch(
+            forces.store_warm_start, [parameters, groups, rows], [contacts, warm_start]
+        )
+        self._accumulate_wrenches = bind_launch(
+            forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
+        )

@@ -1,0 +1,49 @@
+"""NumPy arrays that Warp kernels work on in place, grouped under the names of a Warp struct's fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+class SharedArrays:
+    """One NumPy array for each field of a Warp struct, and ``struct`` over the same memory.
+
+    The arrays are attributes; they stay where they are as long as this object lives.
+    """
+
+    def __init__(self, kind: Any, /, **arrays: np.ndarray) -> None:
+        """``kind``: the class decorated with ``wp.struct``. Raises ValueError for an array that is not contiguous."""
+        self.struct = kind()
+        for name, field in kind.vars.items():
+            data = arrays.pop(name)
+            shared = share(data, field.type.dtype)
+            setattr(self.struct, name, shared)
+            self.__dict__[name] = data
+        if arrays:
+            raise TypeError(f"{kind.key} has no field {', '.join(sorted(arrays))}")
+
+    @classmethod
+    def zeros(cls, kind: Any, /, *shape: int, **arrays: np.ndarray) -> SharedArrays:
+        """Arrays of zeros, each of ``shape``, for all fields that are not in ``arrays``."""
+        made = {name: zeros(field.type.dtype, shape) for name, field in kind.vars.items() if name not in arrays}
+        return cls(kind, **made, **arrays)
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        raise AttributeError(f"no array {name!r}")
+
+
+def share(data: np.ndarray, dtype: Any) -> wp.array:
+    """A Warp array over the memory of a NumPy array; ValueError if that is not contiguous."""
+    array = wp.array(data, dtype=dtype, device="cpu", copy=False)
+    if data.size and array.ptr != data.ctypes.data:
+        raise ValueError(f"an array of {data.shape} {data.dtype} is not contiguous: Warp would work on a copy")
+    return array
+
+
+def zeros(dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """NumPy zeros for a Warp array of ``shape``: vectors and matrices add their own dimensions."""
+    inner = tuple(getattr(dtype, "_shape_", ()))
+    return np.zeros(shape + inner, wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))

@@ -1,0 +1,131 @@
+"""Parameters of the drives: home positions, carried inertia, and gains where the TOML file gives none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import yourdfpy
+
+from vinesim import frames
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.kinematics import joint_limits
+from vinesim.robot.description.sidecar import JointGroup
+from vinesim.scene.values import Drive
+
+ACCELERATION_TIME = 0.02
+"""[s] In which full effort brings a drive to full speed if its armature is not given. GUESSED"""
+FULL_EFFORT_ANGLE = 0.05
+"""[rad] Position error at which a servo gives full effort if its gains are not given. GUESSED"""
+FULL_EFFORT_DISTANCE = 0.005
+"""[m] The same for a prismatic joint. GUESSED"""
+CENTRED_SHARE = 0.1
+"""A range whose middle is nearer to 0 than this share of the range counts as centred about 0."""
+
+
+def home_positions(driven: list[yourdfpy.Joint], groups: dict[str, JointGroup]) -> np.ndarray:
+    """Home [joint] rad or m of the driven joints: their groups', else the middle of the range."""
+    home = np.array([_default_home(joint) for joint in driven])
+    order = [joint.name for joint in driven]
+    for group in groups.values():
+        if group.home is not None:
+            home[[order.index(joint) for joint in group.joints]] = group.home
+    return home
+
+
+def _default_home(joint: yourdfpy.Joint) -> float:
+    """Middle of the range: away from limits, and elbows bent the way they bend. Zero if that is near or endless."""
+    if joint.type == "continuous":
+        return 0.0
+    limits = joint_limits(joint)
+    middle = 0.5 * (limits.lower + limits.upper)
+    return middle if abs(middle) > CENTRED_SHARE * (limits.upper - limits.lower) else 0.0
+
+
+def make_drives(
+    robot: yourdfpy.Robot, driven: list[yourdfpy.Joint], description: RobotDescription, notes: list[str]
+) -> tuple[Drive, ...]:
+    """The drives of the driven joints: gains of their groups, else derived ones, which is added to ``notes``."""
+    gains: dict[str, tuple[float, float]] = {}
+    armatures: dict[str, float] = {}
+    springs: dict[str, tuple[float, float]] = {}
+    for group in description.groups.values():
+        for i, joint in enumerate(group.joints):
+            if group.stiffness is not None and group.damping is not None:
+                gains[joint] = group.stiffness[i], group.damping[i]
+            if group.armature is not None:
+                armatures[joint] = group.armature[i]
+            if group.series_stiffness is not None and group.series_damping is not None:
+                springs[joint] = group.series_stiffness[i], group.series_damping[i]
+    inertia = _carried_inertia(robot, description)
+    derived = [joint.name for joint in driven if joint.name not in gains]
+    if derived:
+        notes.append(f"servo gains of {len(derived)} joints are derived from effort limits and inertia")
+    return tuple(
+        _make_drive(
+            joint, gains.get(joint.name), armatures.get(joint.name), springs.get(joint.name), inertia[joint.name]
+        )
+        for joint in driven
+    )
+
+
+def _make_drive(
+    joint: yourdfpy.Joint,
+    gains: tuple[float, float] | None,
+    armature: float | None,
+    spring: tuple[float, float] | None,
+    inertia: float,
+) -> Drive:
+    """One drive; ``inertia`` [kg m2 or kg] that it carries gives a derived servo its critical damping."""
+    limits = joint_limits(joint)
+    if armature is None:
+        armature = ACCELERATION_TIME * limits.effort / limits.velocity
+    if gains is None:
+        stiffness = limits.effort / (FULL_EFFORT_DISTANCE if joint.type == "prismatic" else FULL_EFFORT_ANGLE)
+        gains = stiffness, 2.0 * math.sqrt(stiffness * (inertia + armature))
+    return Drive(
+        joint=joint.name,
+        stiffness=gains[0],
+        damping=gains[1],
+        effort=limits.effort,
+        velocity=limits.velocity,
+        lower=limits.lower,
+        upper=limits.upper,
+        armature=armature,
+        series_stiffness=spring[0] if spring else 0.0,
+        series_damping=spring[1] if spring else 0.0,
+    )
+
+
+def _carried_inertia(robot: yourdfpy.Robot, description: RobotDescription) -> dict[str, float]:
+    """What each moving joint carries with the robot at home: mass [kg], or inertia about its origin [kg m2].
+
+    The inertia is the one about the worst axis through the joint, since arms bend: gains must suit any posture.
+    """
+    poses = description.link_poses(description.home)
+    above = {child: description.link_anchors[parent][0] for parent, child in description.moving_joints.frames}
+    bodies = [(link.name, link.inertial) for link in robot.links if link.inertial is not None and link.inertial.mass]
+    mass = np.array([inertial.mass for _, inertial in bodies])
+    centre = np.empty((len(bodies), 3))
+    own = np.zeros(len(bodies))
+    for i, (link, inertial) in enumerate(bodies):
+        offset = inertial.origin[:3, 3] if inertial.origin is not None else np.zeros(3)
+        centre[i] = frames.compose(poses[link], frames.pose(offset))[:3]
+        own[i] = np.linalg.norm(inertial.inertia, 2) if inertial.inertia is not None else 0.0
+    joint_types = {joint.name: joint.type for joint in robot.joints}
+    carried = {}
+    for name, (_, child) in zip(description.moving_joints.names, description.moving_joints.frames, strict=True):
+        distal = np.array([_is_distal(description.link_anchors[link][0], child, above) for link, _ in bodies])
+        if joint_types[name] == "prismatic":
+            carried[name] = float(mass[distal].sum())
+        else:
+            lever = centre[distal] - poses[child][:3]
+            carried[name] = float(mass[distal] @ (lever**2).sum(axis=1) + own[distal].sum())
+    return carried
+
+
+def _is_distal(link: str, joint_child: str, above: dict[str, str]) -> bool:
+    """Whether ``joint_child`` carries ``link``; ``above``: the moving link that carries each moving link."""
+    while link != joint_child and link in above:
+        link = above[link]
+    return link == joint_child

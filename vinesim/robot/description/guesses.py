@@ -1,0 +1,59 @@
+"""Joint groups, cameras and lidars guessed from the names in a URDF that has no TOML file."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Container
+
+from lxml import etree
+
+from vinesim.robot.description.sidecar import JointGroup, SensorMount
+
+
+def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGroup]:
+    """Groups from names in PAL style: ``arm_left_3_joint`` is of ``arm_left``, ``gripper_left_...`` of its gripper."""
+
+    def tool(group: str) -> str:
+        names = (group.replace("arm", "gripper") + "_grasping_link", group + "_tool_link")
+        return next((name for name in names if name in links), "")
+
+    groups: dict[str, list[str]] = {}
+    for joint in joints:
+        hand = re.match(r"(gripper|hand)_(left|right)", joint)
+        stem = hand.group() if hand else re.sub(r"(_lift)?(_?\d+)?(_joint)?$", "", joint)
+        groups.setdefault(stem or joint, []).append(joint)
+    return {name: JointGroup(joints=tuple(members), tool=tool(name)) for name, members in groups.items()}
+
+
+def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
+    """A D435 in the first optical frame (colour before others), else in front of the first link called a camera."""
+    links = [link.get("name", "") for link in root.iterfind("link")]
+    optical = [link for link in links if link.endswith("optical_frame")]
+    colour = [link for link in optical if re.search(r"rgb|color|colour", link)]
+    found = next(
+        iter(colour or optical or [link for link in links if re.search(r"camera.*_link$|camera$", link)]), None
+    )
+    if found is None:
+        notes.append("no camera: no link is called camera or optical")
+        return ()
+    name = re.sub(r"(_(rgb|color|colour|depth))?(_optical_frame|_link|_frame)$", "", found)
+    notes.append(f"a d435 is taken to sit in {found!r}")
+    if not optical:
+        found, link = f"{name}_optical_frame", found
+        etree.SubElement(root, "link", name=found)
+        joint = etree.SubElement(root, "joint", name=f"{name}_optical_joint", type="fixed")
+        etree.SubElement(joint, "parent", link=link)
+        etree.SubElement(joint, "child", link=found)
+        etree.SubElement(joint, "origin", xyz="0 0 0", rpy=f"{-math.pi / 2} 0 {-math.pi / 2}")
+    return (SensorMount(name, found, "d435"),)
+
+
+def guess_lidars(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
+    """A VLP-16 in the first link called a lidar or laser, one in front before others."""
+    links = [link.get("name", "") for link in root.iterfind("link")]
+    found = sorted((link for link in links if re.search(r"lidar|laser|velodyne", link)), key=lambda n: "front" not in n)
+    if not found:
+        return ()
+    notes.append(f"a vlp16 is taken to sit in {found[0]!r}")
+    return (SensorMount("lidar", found[0], "vlp16"),)

@@ -1,0 +1,109 @@
+"""Kinematics of a description: moving joints as arrays, and the moving link that carries each link."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import yourdfpy
+
+from vinesim import frames
+from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class MovingJoints:
+    """Every joint that moves, driven or mimicking, as arrays: a few array operations give all poses."""
+
+    names: tuple[str, ...]
+    frames: tuple[tuple[str, str], ...]
+    """(parent frame, child frame) of each."""
+    drive_index: np.ndarray
+    """[joint] index of the drive that moves it, its own or the one that it mimics."""
+    multiplier: np.ndarray
+    """[joint] 1"""
+    offset: np.ndarray
+    """[joint] rad or m"""
+    origin: np.ndarray
+    """[joint, 7] child in parent at position 0."""
+    translation: np.ndarray
+    """[joint, 3] translation of the child in its parent per metre; zero for a joint that turns."""
+    rotation: np.ndarray
+    """[joint, 4] quaternion of the origin times (axis, 0); zero for a joint that slides."""
+
+    def poses(self, position: np.ndarray) -> np.ndarray:
+        """Child in parent [joint, 7] for drive positions [drive] rad or m."""
+        q = self.multiplier * position[self.drive_index] + self.offset
+        half = 0.5 * q[:, None] * self.rotation.any(axis=1, keepdims=True)
+        poses = np.empty((len(q), 7))
+        poses[:, :3] = self.origin[:, :3] + self.translation * q[:, None]
+        poses[:, 3:] = self.origin[:, 3:] * np.cos(half) + self.rotation * np.sin(half)
+        return poses
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class JointLimits:
+    """Limits of one joint, infinite in position if it is continuous."""
+
+    lower: float
+    """[rad or m]"""
+    upper: float
+    """[rad or m]"""
+    effort: float
+    """[N m or N]"""
+    velocity: float
+    """[rad/s or m/s]"""
+
+
+def joint_limits(joint: yourdfpy.Joint) -> JointLimits:
+    """Limits of a driven joint; ValueError if one that it needs is missing."""
+    limit = joint.limit
+    if limit is None or limit.effort is None or limit.velocity is None:
+        raise ValueError(f"joint {joint.name!r} has no limits of effort and velocity")
+    if joint.type == "continuous":
+        return JointLimits(-math.inf, math.inf, limit.effort, limit.velocity)
+    if limit.lower is None or limit.upper is None:
+        raise ValueError(f"joint {joint.name!r} has no limits of position")
+    return JointLimits(limit.lower, limit.upper, limit.effort, limit.velocity)
+
+
+def moving_joints(robot: yourdfpy.Robot, driven: list[str]) -> MovingJoints:
+    """The joints of ``robot`` that move, as arrays; ``driven``: names of the drives, in the order of joint arrays."""
+    joints = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES]
+    origin = np.array([joint_origin(joint) for joint in joints])
+    axis = np.array([joint.axis / np.linalg.norm(joint.axis) for joint in joints])
+    sliding = np.array([[joint.type == "prismatic"] for joint in joints])
+    turn = np.concatenate([axis, np.zeros((len(joints), 1))], axis=1)
+    return MovingJoints(
+        names=tuple(joint.name for joint in joints),
+        frames=tuple((joint.parent, joint.child) for joint in joints),
+        drive_index=np.array([driven.index(joint.mimic.joint if joint.mimic else joint.name) for joint in joints]),
+        multiplier=np.array([joint.mimic.multiplier if joint.mimic else 1.0 for joint in joints]),
+        offset=np.array([joint.mimic.offset if joint.mimic else 0.0 for joint in joints]),
+        origin=origin,
+        translation=np.where(sliding, frames.rotate(origin[:, 3:], axis), 0.0),
+        rotation=np.where(sliding, 0.0, frames.multiply(origin[:, 3:], turn)),
+    )
+
+
+def link_anchors(base: str, order: list[yourdfpy.Joint]) -> dict[str, tuple[str, np.ndarray]]:
+    """Of every link the moving link (or the root ``base``) it is fixed to, and its pose [7] there.
+
+    ``order``: all joints from the root outwards.
+    """
+    anchors = {base: (base, frames.pose([0.0, 0.0, 0.0]))}
+    for joint in order:
+        if joint.type == "fixed":
+            anchor, offset = anchors[joint.parent]
+            anchors[joint.child] = (anchor, frames.compose(offset, joint_origin(joint)))
+        else:
+            anchors[joint.child] = (joint.child, frames.pose([0.0, 0.0, 0.0]))
+    return anchors
+
+
+def joint_origin(joint: yourdfpy.Joint) -> np.ndarray:
+    """Pose [7] of the child in the parent at joint position 0."""
+    if joint.origin is None:
+        return frames.pose([0.0, 0.0, 0.0])
+    return frames.pose(joint.origin[:3, 3], frames.from_matrix(joint.origin[:3, :3]))

@@ -1,0 +1,122 @@
+"""Loads a robot description: a URDF, and beside it a TOML file with what a URDF cannot express.
+
+    robot = load_description("vinebot")
+    rigid.add_robot(robot.to_spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
+
+The URDF is read by yourdfpy. The text that physics and ROS receive differs from the file in three ways: meshes are
+named by absolute path, wheels and casters are fixed (the base is driven as a whole), and shapes whose mesh format
+physics cannot read are replaced; :attr:`RobotDescription.notes` lists each change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import logging
+import pathlib
+
+import msgspec
+import numpy as np
+import yourdfpy
+from lxml import etree
+
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.drive_parameters import home_positions, make_drives
+from vinesim.robot.description.errors import DescriptionError, description_error
+from vinesim.robot.description.guesses import guess_cameras, guess_groups, guess_lidars
+from vinesim.robot.description.installed_files import find_installed
+from vinesim.robot.description.kinematics import joint_origin, link_anchors, moving_joints
+from vinesim.robot.description.meshes import resolve_meshes
+from vinesim.robot.description.sidecar import Sidecar, check_sidecar, read_sidecar
+from vinesim.robot.description.urdf_checks import check_joints, check_masses, check_tree
+from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES, check_numbers, fix_wheels, read_xml
+from vinesim.scene import data_files
+
+log = logging.getLogger(__name__)
+
+
+def load_description(name: str | pathlib.Path) -> RobotDescription:
+    """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
+
+    Raises :class:`DescriptionError` in one line if it cannot be simulated as it is.
+    """
+    file = _locate(str(name))
+    root = read_xml(file)
+    check_numbers(root, file)
+    notes: list[str] = []
+    resolve_meshes(root, file, notes)
+    fix_wheels(root, notes)
+    sidecar = read_sidecar(file.with_suffix(".toml"))
+    cameras = sidecar.cameras if sidecar.cameras is not None else guess_cameras(root, notes)
+    lidars = sidecar.lidars if sidecar.lidars is not None else guess_lidars(root, notes)
+    sidecar = msgspec.structs.replace(sidecar, cameras=cameras, lidars=lidars)
+    urdf = etree.tostring(root, encoding="unicode")
+    try:
+        parsed = yourdfpy.URDF.load(
+            io.BytesIO(urdf.encode()), build_scene_graph=False, load_meshes=False, filename_handler=lambda fname: fname
+        ).robot
+    except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
+        raise description_error(
+            file, f"not a URDF: {type(error).__name__} {error}", "give every link, joint and shape what URDF requires"
+        ) from error
+    order = check_tree(parsed, file)
+    check_joints(parsed, file)
+    check_masses(parsed, order, file, notes)
+    description = _assemble(parsed, order, file, urdf, sidecar, notes)
+    for note in description.notes:
+        log.info("%s: %s", file.name, note)
+    return description
+
+
+def _locate(name: str) -> pathlib.Path:
+    if name == "tiago_pro":
+        found = find_installed("example-robot-data/robots/tiago_pro_description/robots/tiago_pro.urdf")
+        if found is None:
+            raise DescriptionError("tiago_pro: its files are not installed; pip install vinesim[tiago]")
+        return found
+    try:
+        return data_files.find_data_file("robots", name, ".urdf").resolve()
+    except data_files.DataFileNotFound as error:
+        raise DescriptionError(f"{name}: {error}") from error
+
+
+def _assemble(
+    robot: yourdfpy.Robot,
+    order: list[yourdfpy.Joint],
+    file: pathlib.Path,
+    urdf: str,
+    sidecar: Sidecar,
+    notes: list[str],
+) -> RobotDescription:
+    """The description of a checked ``robot``; ``order``: its joints from the root outwards."""
+    base = order[0].parent
+    driven = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES and joint.mimic is None]
+    names = [joint.name for joint in driven]
+    anchors = link_anchors(base, order)
+    if not sidecar.groups:
+        sidecar = msgspec.structs.replace(sidecar, groups=guess_groups(names, anchors))
+    check_sidecar(sidecar, set(names), anchors, file.with_suffix(".toml"))
+    fixed = [joint for joint in robot.joints if joint.type == "fixed"]
+    description = RobotDescription(
+        name=robot.name,
+        file=file,
+        urdf=urdf,
+        base=base,
+        drives=(),
+        home=home_positions(driven, sidecar.groups),
+        groups=sidecar.groups,
+        moving_joints=moving_joints(robot, names),
+        fixed_frames=tuple((joint.parent, joint.child) for joint in fixed),
+        fixed_poses=np.array([joint_origin(joint) for joint in fixed]).reshape(-1, 7),
+        link_anchors=anchors,
+        cameras=sidecar.cameras or (),
+        lidars=sidecar.lidars or (),
+        imus=sidecar.imus,
+        wrenches=sidecar.wrenches,
+        cutters=sidecar.cutters,
+        base_limits=sidecar.base,
+        mass=sum(link.inertial.mass or 0.0 for link in robot.links if link.inertial is not None),
+        notes=(),
+    )
+    drives = make_drives(robot, driven, description, notes)
+    return dataclasses.replace(description, drives=drives, notes=tuple(notes))

@@ -1,0 +1,89 @@
+"""Meshes of a URDF: found, named by absolute path, and replaced where physics cannot read their format."""
+
+from __future__ import annotations
+
+import pathlib
+
+import numpy as np
+import yourdfpy
+from lxml import etree
+
+from vinesim.robot.description.errors import description_error
+from vinesim.robot.description.installed_files import find_installed
+
+MESH_FORMATS = (".stl", ".obj", ".msh")
+"""What MuJoCo reads; other meshes are replaced (Collada cannot be read by it)."""
+
+
+def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
+    """The file a mesh URI means: beside the URDF, in a folder above it that has the package's name, or in a wheel."""
+    path = uri.removeprefix("file://")
+    if not path.startswith("package://"):
+        found = file.parent / path
+        return found.resolve() if found.is_file() else None
+    path = path.removeprefix("package://")
+    inside = path.split("/", 1)[-1]
+    for above in file.parents:
+        for candidate in (above / path, above / inside):
+            if candidate.is_file():
+                return candidate.resolve()
+    return find_installed(path)
+
+
+def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
+    """Name meshes by absolute path; give shapes of unreadable format the link's touchable shapes instead."""
+    for mesh in root.iterfind("link//geometry/mesh"):
+        uri = mesh.get("filename", "")
+        found = find_mesh(uri, file)
+        if found is None:
+            raise description_error(
+                file, f"mesh {uri!r} is missing", "put it there, beside the URDF, or install its package"
+            )
+        mesh.set("filename", str(found))
+    unread: set[str] = set()
+
+    def readable(shape: etree._Element) -> bool:
+        mesh = shape.find("geometry/mesh")
+        suffix = pathlib.Path(mesh.get("filename")).suffix.lower() if mesh is not None else ".stl"
+        if suffix not in MESH_FORMATS:
+            unread.add(suffix)
+        return suffix in MESH_FORMATS
+
+    for link in root.iterfind("link"):
+        for shape in [shape for shape in link.iterfind("collision") if not readable(shape)]:
+            _replace_by_box(shape, file)
+        for shape in [shape for shape in link.iterfind("visual") if not readable(shape)]:
+            material = shape.find("material")
+            for solid in link.findall("collision"):
+                visual = etree.SubElement(link, "visual")
+                visual.extend(etree.fromstring(etree.tostring(part)) for part in solid)
+                if material is not None:
+                    visual.append(etree.fromstring(etree.tostring(material)))
+            link.remove(shape)
+    if unread:
+        formats = ", ".join(sorted(unread))
+        notes.append(f"meshes of format {formats} cannot be read: seen as collision shapes, touched as boxes")
+
+
+def _replace_by_box(shape: etree._Element, file: pathlib.Path) -> None:
+    """Replace the mesh of a shape by its bounding box."""
+    import trimesh
+
+    mesh = shape.find("geometry/mesh")
+    scale = np.array([float(value) for value in (mesh.get("scale") or "1 1 1").split()])
+    try:
+        lower, upper = trimesh.load(mesh.get("filename"), force="mesh").bounds * scale
+    except Exception as error:  # each format has errors of its own
+        raise description_error(
+            file, f"mesh {mesh.get('filename')!r} cannot be read ({error})", "convert it to STL or OBJ"
+        ) from error
+    origin = shape.find("origin")
+    values = dict(origin.attrib) if origin is not None else {}
+    turn = yourdfpy.URDF._parse_origin(etree.Element("origin", values))
+    centre = turn[:3, :3] @ (0.5 * (lower + upper)) + turn[:3, 3]
+    if origin is None:
+        origin = etree.SubElement(shape, "origin")
+    origin.set("xyz", " ".join(f"{value:.9g}" for value in centre))
+    geometry = shape.find("geometry")
+    geometry.remove(mesh)
+    etree.SubElement(geometry, "box", size=" ".join(f"{value:.9g}" for value in np.abs(upper - lower)))

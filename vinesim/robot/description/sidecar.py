@@ -1,0 +1,155 @@
+"""The TOML file beside a URDF: base limits, joint groups with gains, sensors, cutters.
+
+The attributes are the keys of the file, except ``armature``, ``series_stiffness`` and ``series_damping`` of a group,
+which the file calls ``rotor``, ``elastic`` and ``elastic_damping``.
+"""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Container, Iterable
+
+import msgspec
+
+from vinesim.robot.description.errors import description_error
+
+
+class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the base may be driven."""
+
+    linear: float = 0.5
+    """Largest speed [m/s]."""
+    angular: float = 0.8
+    """Largest rate of turn [rad/s]."""
+    linear_acceleration: float = 1.0
+    """[m/s2]"""
+    angular_acceleration: float = 2.0
+    """[rad/s2]"""
+    effort: tuple[float, float] = (800.0, 400.0)
+    """Largest force [N] and moment [N m]."""
+    timeout: float = 0.5
+    """Time without a command after which it stops [s]."""
+    slip: tuple[float, float] = (0.0, 0.0)
+    """Share of the tracks' travel that is lost on the ground, ahead and in turns; odometry measures the travel."""
+
+
+class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Joints that one controller moves; arrays are in the order of ``joints``."""
+
+    joints: tuple[str, ...]
+    stiffness: tuple[float, ...] | None = None
+    """Position gains [N m/rad or N/m]."""
+    damping: tuple[float, ...] | None = None
+    """Velocity gains [N m s/rad or N s/m]."""
+    armature: tuple[float, ...] | None = msgspec.field(name="rotor", default=None)
+    """Inertias of motor and gear seen from the joint [kg m2 or kg]."""
+    series_stiffness: tuple[float, ...] | None = msgspec.field(name="elastic", default=None)
+    """Stiffnesses of the springs between gear and joint [N m/rad or N/m]; without them the position gains count."""
+    series_damping: tuple[float, ...] | None = msgspec.field(name="elastic_damping", default=None)
+    """Their damping [N m s/rad or N s/m]."""
+    home: tuple[float, ...] | None = None
+    """[rad or m]"""
+    tool: str = ""
+    """Frame whose x axis points out of the hand, if the group is an arm."""
+
+    def arrays(self) -> dict[str, tuple[float, ...] | None]:
+        """Everything that has one value a joint, by its key in the file."""
+        return {
+            "stiffness": self.stiffness, "damping": self.damping, "rotor": self.armature,
+            "elastic": self.series_stiffness, "elastic_damping": self.series_damping, "home": self.home,
+        }  # fmt: skip
+
+
+class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sensor: its name in topics, the frame it sits in, and the file in ``data/cameras`` or ``data/lidars``."""
+
+    name: str
+    frame: str
+    type: str = ""
+
+
+class Cutter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The space between two blades: x along the blades, y from one to the other, z across their plane."""
+
+    group: str
+    """The gripper it belongs to."""
+    frame: str
+    """The link that carries it."""
+    half: tuple[float, float, float]
+    """Half edges of the space [m]; the second is how far to either side wood is caught."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Its centre in ``frame`` [m]."""
+
+
+class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file; None where a sensor list is to be guessed from the URDF."""
+
+    base: BaseLimits = BaseLimits()
+    groups: dict[str, JointGroup] = {}
+    cameras: tuple[SensorMount, ...] | None = None
+    lidars: tuple[SensorMount, ...] | None = None
+    imus: tuple[SensorMount, ...] = ()
+    wrenches: tuple[SensorMount, ...] = ()
+    cutters: tuple[Cutter, ...] = ()
+
+
+def read_sidecar(file: pathlib.Path) -> Sidecar:
+    """The file's content, defaults if there is no file; :class:`DescriptionError` if it has unknown or unfit keys."""
+    if not file.is_file():
+        return Sidecar()
+    try:
+        return msgspec.toml.decode(file.read_bytes(), type=Sidecar)
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise description_error(file, str(error), "see data/robots/vinebot.toml for what may be said") from error
+
+
+def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str], file: pathlib.Path) -> None:
+    """Raise :class:`DescriptionError` unless all names are ``driven`` joints or ``links`` and all values are fit."""
+    for name, group in sidecar.groups.items():
+        _check_group(name, group, driven, links, file)
+    _check_cutters(sidecar, links, file)
+    if not all(0.0 <= slip < 1.0 for slip in sidecar.base.slip):
+        raise description_error(file, f"slip of {sidecar.base.slip}", "give shares from 0 to below 1")
+    mounts: Iterable[SensorMount] = (
+        *(sidecar.cameras or ()), *(sidecar.lidars or ()), *sidecar.imus, *sidecar.wrenches
+    )  # fmt: skip
+    for mount in mounts:
+        if mount.frame not in links:
+            raise description_error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
+
+
+def _check_group(
+    name: str, group: JointGroup, driven: Container[str], links: Container[str], file: pathlib.Path
+) -> None:
+    for joint in group.joints:
+        if joint not in driven:
+            raise description_error(
+                file, f"group {name!r} names {joint!r}, which no drive moves", "name driven joints only"
+            )
+    for key, values in group.arrays().items():
+        if values is not None and len(values) != len(group.joints):
+            raise description_error(
+                file, f"group {name!r} has {len(values)} of {key} for {len(group.joints)} joints", "give one each"
+            )
+    if (group.series_stiffness is None) != (group.series_damping is None):
+        raise description_error(
+            file, f"group {name!r} gives only half of its springs", "give elastic and elastic_damping"
+        )
+    if min((*(group.series_stiffness or ()), *(group.series_damping or ()), 0.0)) < 0.0:
+        raise description_error(file, f"group {name!r} has a spring below zero", "give 0 or more")
+    if group.tool and group.tool not in links:
+        raise description_error(file, f"group {name!r} has the tool {group.tool!r}", "name a link of the URDF")
+
+
+def _check_cutters(sidecar: Sidecar, links: Container[str], file: pathlib.Path) -> None:
+    for cutter in sidecar.cutters:
+        if cutter.group not in sidecar.groups:
+            raise description_error(file, f"a cutter belongs to {cutter.group!r}", "name a group")
+        if cutter.frame not in links:
+            raise description_error(
+                file, f"the cutter of {cutter.group!r} sits in {cutter.frame!r}", "name a link of the URDF"
+            )
+        if min(cutter.half) <= 0.0:
+            raise description_error(
+                file, f"the cutter of {cutter.group!r} has a mouth of {cutter.half}", "give half edges above 0"
+            )

@@ -1,0 +1,138 @@
+"""Checks of a parsed URDF: one kinematic tree, joints with limits, bodies with mass and inertia."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+
+import numpy as np
+import yourdfpy
+
+from vinesim.robot.description.errors import description_error
+from vinesim.robot.description.kinematics import joint_limits, link_anchors
+from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
+
+
+def check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Joint]:
+    """The joints from the root outwards, or an error if they are not one tree."""
+    links = {link.name for link in robot.links}
+    for kind, things in (("link", robot.links), ("joint", robot.joints)):
+        names = [thing.name for thing in things]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise description_error(file, f"{kind} {twice[0]!r} is there twice", "rename one")
+    if "world" in links:
+        raise description_error(file, "a link is called 'world', which is the name of everybody's world", "rename it")
+    if not robot.joints:
+        raise description_error(file, "no joints", "give a robot with at least one joint that moves")
+    parent_of: dict[str, yourdfpy.Joint] = {}
+    children: dict[str, list[yourdfpy.Joint]] = {}
+    for joint in robot.joints:
+        for link in (joint.parent, joint.child):
+            if link not in links:
+                raise description_error(
+                    file, f"joint {joint.name!r} names a link {link!r} that is not there", "add it or rename"
+                )
+        if joint.child in parent_of:
+            other = parent_of[joint.child].name
+            raise description_error(
+                file,
+                f"link {joint.child!r} has two parents (joints {other!r} and {joint.name!r})",
+                "URDF is a tree: open the loop by removing one joint",
+            )
+        parent_of[joint.child] = joint
+        children.setdefault(joint.parent, []).append(joint)
+    roots = [link.name for link in robot.links if link.name not in parent_of]
+    if len(roots) > 1:
+        raise description_error(
+            file, f"links {roots[0]!r} and {roots[1]!r} both have no parent", "join them with a fixed joint"
+        )
+    order: list[yourdfpy.Joint] = []
+    waiting = list(children.get(roots[0], [])) if roots else []
+    while waiting:
+        joint = waiting.pop(0)
+        order.append(joint)
+        waiting.extend(children.get(joint.child, []))
+    if len(order) < len(robot.joints):
+        reached = {joint.name for joint in order}
+        lost = next(joint.name for joint in robot.joints if joint.name not in reached)
+        raise description_error(
+            file, f"joint {lost!r} is part of a kinematic loop", "URDF is a tree: remove one joint of the loop"
+        )
+    return order
+
+
+def check_joints(robot: yourdfpy.Robot, file: pathlib.Path) -> None:
+    names = {joint.name: joint for joint in robot.joints}
+    for joint in robot.joints:
+        where = f"joint {joint.name!r}"
+        if joint.type not in (*MOVABLE_JOINT_TYPES, "fixed"):
+            raise description_error(
+                file, f"{where} has the type {joint.type!r}", f"use one of fixed, {', '.join(MOVABLE_JOINT_TYPES)}"
+            )
+        if joint.type == "fixed":
+            continue
+        if not np.linalg.norm(joint.axis) > 1e-9:
+            raise description_error(file, f"{where} has a zero axis", "give a direction")
+        if joint.mimic is not None:
+            source = names.get(joint.mimic.joint)
+            if source is None or source.type not in MOVABLE_JOINT_TYPES or source.mimic is not None:
+                raise description_error(
+                    file, f"{where} mimics {joint.mimic.joint!r}", "let it mimic a joint that is driven itself"
+                )
+            continue
+        limit = joint.limit
+        needed = ("effort", "velocity") + (() if joint.type == "continuous" else ("lower", "upper"))
+        missing = [key for key in needed if limit is None or getattr(limit, key) is None]
+        if missing:
+            raise description_error(file, f"{where} moves without limits", f"give <limit> with {', '.join(missing)}")
+        limits = joint_limits(joint)
+        if limits.effort <= 0.0 or limits.velocity <= 0.0:
+            raise description_error(
+                file, f"{where} has effort {limits.effort:g} and velocity {limits.velocity:g}", "give both above 0"
+            )
+        if joint.type != "continuous" and not limits.lower < limits.upper:
+            raise description_error(
+                file, f"{where} has limits {limits.lower:g} to {limits.upper:g}", "give lower below upper"
+            )
+    if not any(joint.type in MOVABLE_JOINT_TYPES and joint.mimic is None for joint in robot.joints):
+        raise description_error(file, "no joint moves", "give a robot with at least one joint that moves")
+
+
+def check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: pathlib.Path, notes: list[str]) -> None:
+    """Whatever moves has a mass, and no inertia contradicts itself."""
+    carried: dict[str, float] = {}
+    turning: dict[str, float] = {}
+    anchors = link_anchors(order[0].parent, order)
+    lopsided = []
+    for link in robot.links:
+        inertial = link.inertial
+        if inertial is None or inertial.mass is None:
+            continue
+        mass, inertia = inertial.mass, inertial.inertia
+        if mass < 0.0 or not math.isfinite(mass):
+            raise description_error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give it its mass")
+        carried[anchors[link.name][0]] = carried.get(anchors[link.name][0], 0.0) + mass
+        own = float(np.abs(inertia).max()) if inertia is not None else 0.0
+        turning[anchors[link.name][0]] = turning.get(anchors[link.name][0], 0.0) + own
+        if inertia is not None and mass > 0.0:
+            moments = np.linalg.eigvalsh(inertia)
+            if moments[0] <= 0.0 and moments[2] > 0.0:
+                raise description_error(
+                    file,
+                    f"link {link.name!r} has principal moments {', '.join(f'{m:.2g}' for m in moments)} kg m2",
+                    "give an inertia that is positive definite",
+                )
+            if moments[0] + moments[1] < moments[2] * (1.0 - 1e-6):
+                lopsided.append(link.name)
+    for link in [order[0].parent, *(joint.child for joint in order if joint.type != "fixed")]:
+        if carried.get(link, 0.0) <= 0.0:
+            raise description_error(
+                file, f"link {link!r} moves but has no mass", "give it an <inertial> with a mass above 0"
+            )
+        if turning[link] <= 0.0:
+            raise description_error(
+                file, f"link {link!r} moves but has no inertia", "give it an <inertia> that is not all 0"
+            )
+    if lopsided:
+        notes.append(f"{len(lopsided)} inertias no real body has (triangle inequality), first {lopsided[0]!r}")

@@ -1,0 +1,77 @@
+"""URDF as XML: parsed, its numbers checked, its wheels fixed."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+import re
+
+from lxml import etree
+
+from vinesim.robot.description.errors import description_error
+
+MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
+"""Types of URDF joints that move about or along one axis."""
+
+SOLIDS = ("box", "sphere", "cylinder", "capsule", "mesh")
+NUMBER_COUNTS = {
+    ("origin", "xyz"): 3, ("origin", "rpy"): 3, ("axis", "xyz"): 3, ("mass", "value"): 1,
+    **{("inertia", key): 1 for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")},
+    **{("limit", key): 1 for key in ("lower", "upper", "effort", "velocity")},
+    ("mimic", "multiplier"): 1, ("mimic", "offset"): 1, ("box", "size"): 3, ("sphere", "radius"): 1,
+    **{(solid, key): 1 for solid in ("cylinder", "capsule") for key in ("radius", "length")}, ("mesh", "scale"): 3,
+}  # fmt: skip
+"""How many numbers an attribute has."""
+
+
+def read_xml(file: pathlib.Path) -> etree._Element:
+    try:
+        root = etree.fromstring(file.read_bytes(), etree.XMLParser(remove_comments=True, resolve_entities=False))
+    except etree.XMLSyntaxError as error:
+        raise description_error(
+            file, f"not well-formed XML: {error.msg}", "mend that line (is it a xacro? expand it)"
+        ) from error
+    if root.tag != "robot":
+        raise description_error(
+            file, f"its root is <{root.tag}>, not <robot>", "give a URDF (MJCF and SDF are not read)"
+        )
+    return root
+
+
+def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
+    """Every number is one, finite, as many as there must be, and every size is above zero."""
+    for element in root.iter(*{tag for tag, _ in NUMBER_COUNTS}):
+        for (tag, key), count in NUMBER_COUNTS.items():
+            text = element.get(key) if element.tag == tag else None
+            if text is None:
+                continue
+            owner = next((up for up in element.iterancestors() if up.get("name")), root)
+            where = f'<{tag} {key}="{text}"> of {owner.tag} {owner.get("name")!r}'
+            try:
+                numbers = [float(word) for word in text.split()]
+            except ValueError as error:
+                raise description_error(
+                    file, f"{where} is no number", "write decimal numbers (is it a xacro? expand it)"
+                ) from error
+            if len(numbers) != count:
+                raise description_error(file, f"{where} has {len(numbers)} of {count} numbers", "give all of them")
+            if not all(map(math.isfinite, numbers)):
+                raise description_error(file, f"{where} is not finite", "give a number")
+            if tag in SOLIDS and min(map(abs, numbers) if tag == "mesh" else numbers) <= 0.0:
+                raise description_error(file, f"{where} is no size", "give numbers above 0")
+
+
+def fix_wheels(root: etree._Element, notes: list[str]) -> None:
+    """Make wheels and casters fixed: the base is driven as one body."""
+    wheels = [
+        joint
+        for joint in root.iterfind("joint")
+        if joint.get("type") in MOVABLE_JOINT_TYPES and re.search(r"wheel|caster", joint.get("name", ""))
+    ]
+    for joint in wheels:
+        joint.set("type", "fixed")
+        for tag in ("axis", "limit", "mimic", "dynamics", "safety_controller"):
+            for element in joint.findall(tag):
+                joint.remove(element)
+    if wheels:
+        notes.append(f"{len(wheels)} wheel and caster joints are fixed: the base is driven as a whole")

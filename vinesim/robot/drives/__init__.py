@@ -1,0 +1,1 @@
+"""Robots in the world: joint servos, base, gripper, cutters, odometry, body sensors; copies of other clients' robots."""

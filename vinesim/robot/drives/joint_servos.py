@@ -1,0 +1,201 @@
+"""Joint servos: commands become set-points within the limits of the URDF, gains and efforts, once a step.
+
+A step of a position command becomes a ramp at the joint's largest velocity, as joint_limits of ros2_control does it.
+The servos themselves, with their effort limits, act in the physics.
+
+A series elastic drive is a motor behind a spring (CANOPIES D6.4, section 3.1). The motor's own control is taken to be
+fast: it turns to where the spring gives what position, velocity, effort or impedance control asks for. In
+:attr:`CommandInterface.MOTOR_POSITION` the motor itself holds a position, and the link deflects under its load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.robot.drives.commands import CommandInterface
+from vinesim.scene.values import Drive
+
+ACCELERATION_EFFORT_SHARE = 0.7
+"""Share of its effort that a drive may spend on acceleration: the rest carries weight and resists loads. GUESSED"""
+RIGID_DEFLECTION = 0.05
+"""[rad or m] Deflection at full effort of a drive for which neither spring nor servo stiffness is given. GUESSED"""
+MIN_DIVISOR = 1e-9
+"""Stiffness, inertia and velocity [SI units] are taken to be at least this where they divide."""
+
+
+class JointServos:
+    """The servos of one robot's driven joints; all arrays are [joint], in the order of ``drives``."""
+
+    def __init__(self, rigid: RigidWorld, name: str, drives: Sequence[Drive]) -> None:
+        """``name``: the robot's in ``rigid``."""
+        self._rigid, self._name, self._drives = rigid, name, tuple(drives)
+        self.lower_limit = np.array([drive.lower for drive in drives])
+        self.upper_limit = np.array([drive.upper for drive in drives])
+        """[joint] limits of position [rad or m]"""
+        self.max_velocity = np.array([drive.velocity for drive in drives])
+        """[joint] largest velocities [rad/s or m/s]"""
+        self.max_effort = np.array([drive.effort for drive in drives])
+        """[joint] largest efforts [N m or N]"""
+        self.series_stiffness = np.array(
+            [drive.series_stiffness or drive.stiffness or drive.effort / RIGID_DEFLECTION for drive in drives]
+        )
+        """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
+        self._series_damping = np.array(
+            [drive.series_damping if drive.series_stiffness else drive.damping for drive in drives]
+        )
+        self._stiffness = np.array([drive.stiffness for drive in drives])
+        self._damping = np.array([drive.damping for drive in drives])
+        self._is_compliant = np.zeros(len(drives), bool)
+        """[joint] whether gains were commanded, so that the physics must not add damping of its own"""
+        self._effort_limit = self.max_effort.copy()
+        self._finger_groups: dict[str, np.ndarray] = {}
+        """Fingers that move together: a gripper that drifts with what it holds would be two fingers otherwise."""
+        self.hold()
+
+    def hold(self) -> None:
+        """Drop all commands: position control at the present positions. Gains and effort limits stay."""
+        self.setpoint = self._rigid.joint_measurements(self._name)[0].copy()
+        """[joint] position that the servos are asked for [rad or m]"""
+        self.interface = np.full(len(self.setpoint), CommandInterface.POSITION)
+        """[joint] :class:`CommandInterface` by which each was commanded last"""
+        self._command = self.setpoint.copy()
+        self._velocity = np.zeros(len(self.setpoint))
+        self._rate = np.zeros(len(self.setpoint))
+        self._is_speed_limited = np.zeros(len(self.setpoint), bool)
+        self._gains_changed = True
+
+    # ------------------------------------------------------------------ commands
+
+    def command(self, joints: np.ndarray, values: np.ndarray, interface: CommandInterface) -> None:
+        """Command ``joints`` [k] (indices) by ``values`` [k] in the units of ``interface``, clipped to the limits."""
+        if interface == CommandInterface.POSITION:
+            values = np.clip(values, self.lower_limit[joints], self.upper_limit[joints])
+        elif interface == CommandInterface.VELOCITY:
+            values = np.clip(values, -self.max_velocity[joints], self.max_velocity[joints])
+        elif interface == CommandInterface.EFFORT:
+            values = np.clip(values, -self.max_effort[joints], self.max_effort[joints])
+        self._command[joints] = values
+        self._switch_interface(joints, interface)
+
+    def set_gains(self, joints: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
+        """Impedance of ``joints`` [k]: gains [k] N m/rad or N/m, and N m s/rad or N s/m."""
+        self._stiffness[joints], self._damping[joints] = stiffness, damping
+        self._is_compliant[joints] = True
+        self._gains_changed = True
+
+    def reset_gains(self, joints: np.ndarray) -> None:
+        """Restore the gains that the description gives to ``joints`` [k]."""
+        self._stiffness[joints] = [self._drives[j].stiffness for j in joints]
+        self._damping[joints] = [self._drives[j].damping for j in joints]
+        self._is_compliant[joints] = False
+        self._gains_changed = True
+
+    def group_fingers(self, group: str, fingers: np.ndarray, effort: float | None) -> None:
+        """Move ``fingers`` [k] about their common middle from now on, with at most ``effort`` [N m or N] each."""
+        self._finger_groups[group] = fingers
+        self._effort_limit[fingers] = (
+            self.max_effort[fingers] if effort is None else np.minimum(effort, self.max_effort[fingers])
+        )
+        self._gains_changed = True
+
+    def _switch_interface(self, joints: np.ndarray, interface: CommandInterface) -> None:
+        """Carry the set-points over from links to motors or back, so that nothing jumps."""
+        before = self.interface[joints] == CommandInterface.MOTOR_POSITION
+        if before.any() or interface == CommandInterface.MOTOR_POSITION:
+            position, _, effort, _ = self._rigid.joint_measurements(self._name)
+            motor = position + effort / self.series_stiffness
+            self.setpoint[joints] = np.where(
+                before == (interface == CommandInterface.MOTOR_POSITION),
+                self.setpoint[joints],
+                np.where(before, position[joints], motor[joints]),
+            )
+        self.interface[joints] = interface
+        self._gains_changed = True
+
+    # ------------------------------------------------------------------ each step
+
+    def update(self) -> None:
+        """Pass the set-points of the coming step to the servos in the physics."""
+        if self._gains_changed:
+            self._prepare_interfaces()
+        position, velocity = self._rigid.joint_state(self._name)
+        rate = self._advance_setpoints(position, velocity)
+        if self._gains_changed or self._gains_vary:
+            is_limited, damping = self._speed_limiters(velocity)
+            self._apply_gains(is_limited, damping)
+            rate = np.where(is_limited, np.copysign(self.max_velocity, velocity), rate)
+        self._velocity = velocity
+        self._rigid.command(self._name, self.setpoint, rate)
+
+    def _prepare_interfaces(self) -> None:
+        """Compute what changes only with the interfaces, gains and limits."""
+        self._in_effort = self.interface == CommandInterface.EFFORT
+        self._in_motor_position = self.interface == CommandInterface.MOTOR_POSITION
+        self._velocity_joints = np.flatnonzero(self.interface == CommandInterface.VELOCITY)
+        self._gains_vary = bool(self._in_effort.any() or self._in_motor_position.any())
+        """Whether gains depend on the state, so that they must be set in every step."""
+        self._active_stiffness = np.where(self._in_motor_position, self.series_stiffness, self._stiffness)
+        self._max_tracking_error = (
+            self._effort_limit / np.maximum(self._active_stiffness, MIN_DIVISOR) + self.max_velocity * self._rigid.dt
+        )
+        self._max_impulse = ACCELERATION_EFFORT_SHARE * self._rigid.dt * self._effort_limit
+
+    def _advance_setpoints(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Advance the set-points by a step; returns their rates [joint] rad/s or m/s."""
+        dt = self._rigid.dt
+        # A saturated servo gives no more when its error grows, but would overshoot when released: bound the error.
+        middle = position
+        if self._finger_groups:
+            middle = position.copy()
+            for fingers in self._finger_groups.values():
+                middle[fingers] = position[fingers].mean()
+        start = np.clip(self.setpoint, middle - self._max_tracking_error, middle + self._max_tracking_error)
+        wanted = (self._command - start) / dt
+        wanted[self._velocity_joints] = self._command[self._velocity_joints]
+        # Nor may the set-point accelerate faster than the drive can: a saturated servo would exceed the velocity.
+        gain = self._max_impulse / np.maximum(self._rigid.joint_inertia(self._name), MIN_DIVISOR)
+        slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.max_velocity)
+        fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.max_velocity)
+        rate = np.clip(wanted, slowest, fastest)
+        if self._gains_vary:
+            start, rate = np.where(self._in_effort, position, start), np.where(self._in_effort, 0.0, rate)
+        self.setpoint = np.clip(start + dt * rate, self.lower_limit, self.upper_limit)
+        rate = (self.setpoint - start) / dt
+        self._rate = np.where(self._in_effort, velocity, rate)
+        return rate
+
+    def _speed_limiters(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joints whose commanded effort would exceed their largest velocity [joint] bool, and the damping [joint]
+        N m s/rad or N s/m about that velocity which prevents it.
+
+        90 % of the velocity are free. The velocity is extrapolated by one step, and the brake is no stronger than the
+        commanded effort: a saturated servo does not see how the velocity falls within the step.
+        """
+        sign = np.copysign(1.0, velocity)
+        brake, along = 10.0 * self.max_effort / self.max_velocity, sign * self._command
+        predicted = sign * (2.0 * velocity - self._velocity)
+        is_near = (along > brake * (self.max_velocity - predicted)) | (
+            self._is_speed_limited & (np.abs(velocity) > 0.5 * self.max_velocity)
+        )
+        self._is_speed_limited = is_near & (along >= 0.0) & self._in_effort
+        spare = self.max_velocity - np.abs(velocity)
+        most = 0.8 * np.where(spare > 0.0, along, self.max_effort)
+        return self._is_speed_limited, np.minimum(brake, most / np.maximum(np.abs(spare), MIN_DIVISOR))
+
+    def _apply_gains(self, is_limited: np.ndarray, limiter_damping: np.ndarray) -> None:
+        """Give the servos in the physics the gains and efforts that the interfaces ask for."""
+        in_effort, in_motor_position = self._in_effort, self._in_motor_position
+        damping = np.where(in_motor_position, self._series_damping, self._damping)
+        effort = np.where(in_motor_position, -self._rigid.gravity_effort(self._name), 0.0)
+        self._rigid.set_gains(
+            self._name,
+            np.where(in_effort, 0.0, self._active_stiffness),
+            np.where(is_limited, limiter_damping, np.where(in_effort, 0.0, damping)),
+            np.where(in_effort & ~is_limited, self._command, effort),
+            limit=self._effort_limit,
+            exact=in_motor_position | (self._is_compliant & ~in_effort),
+        )
+        self._gains_changed = False

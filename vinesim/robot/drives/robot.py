@@ -1,0 +1,216 @@
+"""A robot that this client controls: commands in, limited set-points out, and what it measures of itself.
+
+robot = Robot(rigid, load_description("vinebot"), "robot_1")
+robot.command_position([0.3], ["torso_lift_joint"])
+robot.command_base(0.4, 0.0, time)
+...
+robot.control(time)           # before each step of physics
+sample = robot.sample(time)   # after it
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.plants.detachment import Blade
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.physics.step import Physics
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.body_sensors import BodySensors, elastic_sample
+from vinesim.robot.drives.commands import CommandError, CommandInterface
+from vinesim.robot.drives.joint_servos import JointServos
+from vinesim.robot.drives.robot_instance import RobotInstance
+from vinesim.scene.values import Contact, RobotSample, RobotUpdate
+
+Values = Sequence[float] | np.ndarray
+Joints = Sequence[str] | np.ndarray | None
+"""Names of driven joints, their indices, or None for all."""
+
+
+class Robot(RobotInstance):
+    """A robot that this client controls: the local robot of CANOPIES D6.4, section 5.2."""
+
+    def __init__(
+        self,
+        rigid: RigidWorld,
+        description: RobotDescription,
+        name: str = "",
+        index: int = 0,
+        pose: np.ndarray | None = None,
+    ) -> None:
+        """As :class:`RobotInstance`; it holds its joints at home until commanded."""
+        super().__init__(rigid, description, name, index, pose)
+        self._joint_index = {drive.joint: i for i, drive in enumerate(description.drives)}
+        self._cutters: dict[str, list[Blade]] = {}
+        self._physics: Physics | None = None
+        self._body_sensors = BodySensors(rigid, self.name, description)
+        self._servos = JointServos(rigid, self.name, description.drives)
+        self.lower_limit, self.upper_limit = self._servos.lower_limit, self._servos.upper_limit
+        """[joint] limits of position [rad or m]"""
+        self.max_velocity, self.max_effort = self._servos.max_velocity, self._servos.max_effort
+        """[joint] limits of velocity [rad/s or m/s] and effort [N m or N]"""
+        self.series_stiffness = self._servos.series_stiffness
+        """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
+        self._stop_base()
+
+    @property
+    def setpoint(self) -> np.ndarray:
+        """[joint] positions that the servos are asked for [rad or m]."""
+        return self._servos.setpoint
+
+    @property
+    def interface(self) -> np.ndarray:
+        """[joint] :class:`CommandInterface` by which each joint was commanded last."""
+        return self._servos.interface
+
+    def fit_cutters(self, physics: Physics) -> None:
+        """Give the robot the cutters of its description, to cut plants in ``physics``."""
+        self._physics = physics
+        for cutter in self.description.cutters:
+            blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
+            self._cutters.setdefault(cutter.group, []).append(blade)
+
+    def remove(self) -> None:
+        """Remove the robot and its cutters from the world."""
+        if self._physics is not None:
+            self._physics.remove_robot(self.name)
+        else:
+            super().remove()
+
+    def stop(self) -> None:
+        """Drop all commands; hold every joint and the base where they are."""
+        self._servos.hold()
+        self._stop_base()
+
+    def _stop_base(self) -> None:
+        self._base_goal = np.zeros(2)
+        self._base_velocity = np.zeros(2)
+        self._base_time = -np.inf
+
+    # ------------------------------------------------------------------ commands
+
+    def joint_indices(self, joints: Joints) -> np.ndarray:
+        """Indices of joints in joint arrays; :class:`CommandError` for a name that has no drive."""
+        if joints is None:
+            return np.arange(len(self.setpoint))
+        if isinstance(joints, np.ndarray):
+            return joints
+        try:
+            return np.array([self._joint_index[joint] for joint in joints], int)
+        except KeyError as error:
+            known = ", ".join(self._joint_index)
+            raise CommandError(f"{self.name} has no drive for {error.args[0]!r}; it drives: {known}") from None
+
+    def command_position(self, position: Values, joints: Joints = None) -> None:
+        """Go to positions [rad or m] as fast as the joints may; beyond a limit means to the limit."""
+        self._servos.command(*self._validated(position, joints), CommandInterface.POSITION)
+
+    def command_velocity(self, velocity: Values, joints: Joints = None) -> None:
+        """Move with velocities [rad/s or m/s] until the joints' limits."""
+        self._servos.command(*self._validated(velocity, joints), CommandInterface.VELOCITY)
+
+    def command_effort(self, effort: Values, joints: Joints = None) -> None:
+        """Transmit efforts [N m or N] in addition to the weight, which the drives carry; zero lets a joint be moved."""
+        self._servos.command(*self._validated(effort, joints), CommandInterface.EFFORT)
+
+    def command_motor_position(self, motor: Values, joints: Joints = None) -> None:
+        """Hold the motors at positions [rad or m]; each link deflects by its load over the series stiffness.
+
+        The weight is not compensated, as only the spring connects motor and link (CANOPIES D6.4, section 3.1).
+        """
+        self._servos.command(*self._validated(motor, joints), CommandInterface.MOTOR_POSITION)
+
+    def command_impedance(self, stiffness: Values, damping: Values, joints: Joints = None) -> None:
+        """Set the gains [N m/rad, N m s/rad or N/m, N s/m] of joints commanded by position or velocity.
+
+        CANOPIES D6.4, section 3.1. Kept until :meth:`reset_gains`; :meth:`stop` leaves them.
+        """
+        i, stiffness = self._validated(stiffness, joints)
+        _, damping = self._validated(damping, joints)
+        if (stiffness < 0.0).any() or (damping < 0.0).any():
+            raise CommandError(f"{self.name}: gains below zero would feed energy in; give 0 or more")
+        self._servos.set_gains(i, stiffness, damping)
+
+    def reset_gains(self, joints: Joints = None) -> None:
+        """Restore the gains of the description."""
+        self._servos.reset_gains(self.joint_indices(joints))
+
+    def command_gripper(self, group: str, opening: float, effort: float | None = None) -> None:
+        """Open a gripper's fingers to ``opening`` [m] between them (sum over prismatic fingers) or [rad].
+
+        ``effort`` [N or N m]: the most that each finger may give, the drives' own unless given. Objects between the
+        fingers are held by friction alone.
+        """
+        if group not in self.description.groups:
+            known = ", ".join(self.description.groups)
+            raise CommandError(f"{self.name} has no gripper {group!r}; its groups are: {known}")
+        fingers = self.description.joint_indices(group)
+        if effort is not None and not effort > 0.0:
+            raise CommandError(f"{self.name}: gripper effort {effort}; give more than 0, or none for all there is")
+        self.command_position(np.full(len(fingers), opening / len(fingers)), fingers)
+        self._servos.group_fingers(group, fingers, effort)
+
+    def command_cutter(self, group: str) -> None:
+        """Close the cutter of a gripper and open it again: what is between its blades in the next step is cut."""
+        if group not in self._cutters:
+            known = ", ".join(sorted(self._cutters)) or "none"
+            raise CommandError(f"{self.name} has no cutter at {group!r}; cutters fitted: {known}")
+        for blade in self._cutters[group]:
+            blade.close()
+
+    def command_base(self, linear: float, angular: float, time: float) -> None:
+        """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left; lapses after the timeout."""
+        if not np.isfinite([linear, angular]).all():
+            raise CommandError(f"{self.name}: base velocity ({linear}, {angular}) is not finite")
+        limits = self.description.base_limits
+        self._base_goal[:] = (
+            np.clip(linear, -limits.linear, limits.linear),
+            np.clip(angular, -limits.angular, limits.angular),
+        )
+        self._base_time = time
+
+    def _validated(self, values: Values, joints: Joints) -> tuple[np.ndarray, np.ndarray]:
+        """Indices [k] and finite values [k], or :class:`CommandError`."""
+        i, values = self.joint_indices(joints), np.asarray(values, float)
+        if values.shape != i.shape:
+            raise CommandError(f"{self.name}: {values.size} values for {len(i)} joints; give one each")
+        if not np.isfinite(values).all():
+            bad = self.description.joints[i[np.flatnonzero(~np.isfinite(values))[0]]]
+            raise CommandError(f"{self.name}: command for {bad!r} is not finite; give a number")
+        return i, values
+
+    # ------------------------------------------------------------------ each step
+
+    def control(self, time: float) -> None:
+        """Pass the set-points of the step that starts at ``time`` [s] to the physics; call it before the step."""
+        self._servos.update()
+        self._drive_base(time)
+        self._odometry(self.rigid.base_state(self.name)[0])
+
+    def _drive_base(self, time: float) -> None:
+        """Accelerate the base towards its commanded velocity, or towards standing once the command has lapsed."""
+        limits = self.description.base_limits
+        goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
+        change = self.rigid.dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
+        self._base_velocity += np.clip(goal - self._base_velocity, -change, change)
+        self.rigid.command_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
+
+    def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
+        """State of the robot at ``time`` [s], wrenches, IMUs and series elastic elements included."""
+        sample = super().sample(time, contacts)
+        return dataclasses.replace(
+            sample,
+            elements=elastic_sample(sample.joints, self.series_stiffness),
+            wrenches=self._body_sensors.wrenches(time, sample.contacts),
+            imus=self._body_sensors.imus(time),
+        )
+
+    def update(self, time: float) -> RobotUpdate:
+        """What other clients receive: actual joint states, never commands."""
+        position, velocity, _, _ = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
+        return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)

@@ -1,0 +1,75 @@
+"""A robot in the rigid world, whether this client controls it or another one does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.odometry import TrackOdometry
+from vinesim.scene.values import Contact, JointSample, RobotSample
+
+
+class RobotInstance:
+    """A robot of one description under one name in the rigid world; base class of local and remote robots."""
+
+    def __init__(
+        self,
+        rigid: RigidWorld,
+        description: RobotDescription,
+        name: str = "",
+        index: int = 0,
+        pose: np.ndarray | None = None,
+        *,
+        is_in_world: bool = False,
+    ) -> None:
+        """Add the robot to ``rigid`` at ``pose`` [7] (the origin unless given).
+
+        ``name``: the description's unless given. ``index``: number of its instance label.
+        ``is_in_world``: it was added to ``rigid`` already.
+        """
+        self.rigid = rigid
+        self.description = description
+        self.name = name or description.name
+        self._index = index
+        spec = description.to_spec(self.name, index, pose)
+        if not is_in_world:
+            rigid.add_robot(spec)
+        back = frames.conjugate(spec.pose[3:])
+        self._start = spec.pose[:3].copy()
+        self._start_turn = frames.to_matrix(back)
+        self._start_left = frames.multiply(back, np.eye(4)).T
+        """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
+        self._track_odometry = TrackOdometry(*description.base_limits.slip, spec.pose)
+
+    def remove(self) -> None:
+        """Remove the robot from the rigid world."""
+        self.rigid.remove_robot(self.name)
+
+    def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
+        """State of the robot at ``time`` [s]; of ``contacts`` only its own are kept."""
+        position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
+        base_q, base_qd = self.rigid.base_state(self.name)
+        return RobotSample(
+            actor=self.name,
+            joints=JointSample(time, self.description.joints, position, velocity, effort, contact),
+            base_q=base_q,
+            base_qd=base_qd,
+            odom_q=self._odometry(base_q),
+            transforms=self.description.moving_joints.frames,
+            transform_q=self.description.moving_joints.poses(position),
+            contacts=tuple(c for c in contacts if c.actor == self.name),
+        )
+
+    def frame_pose(self, frame: str) -> np.ndarray:
+        """World pose [7] of a link of the URDF, such as a sensor's frame."""
+        return self.rigid.link_pose(self.name, frame)
+
+    def _odometry(self, base_q: np.ndarray) -> np.ndarray:
+        """Pose [7] since the start as odometry measures it: exact, unless the tracks slip."""
+        if any(self.description.base_limits.slip):
+            return self._track_odometry.update(base_q)
+        return np.concatenate([self._start_turn @ (base_q[:3] - self._start), self._start_left @ base_q[3:]])

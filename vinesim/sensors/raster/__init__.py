@@ -1,0 +1,1 @@
+"""Rasterisers: which primitive each pixel of a camera sees."""

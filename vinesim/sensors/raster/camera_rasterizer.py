@@ -1,0 +1,158 @@
+"""Camera rasterisation on the CPU, or by the renderer of the scene: keys, depth, labels and primitive of every pixel."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from vinesim import frames
+from vinesim.kernels.raster import camera_raster, camera_raster_plants
+from vinesim.kernels.raster import primitives as shapes
+from vinesim.kernels.raster.pinhole import EMPTY_KEY, NEAR_DEPTH, Pinhole
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.values import CameraInfo
+from vinesim.sensors.raster.primitive_arrays import (
+    BOX,
+    CONE,
+    CYLINDER,
+    ELLIPSOID,
+    LEAF,
+    SPHEROID,
+    TRIANGLE,
+    PosedPrimitives,
+)
+
+MAX_DEPTH = 500.0
+"""Nothing is drawn beyond this depth [m]."""
+_KERNELS = (
+    (camera_raster_plants.raster_cones, (CONE,)),
+    (camera_raster_plants.raster_spheroids, (SPHEROID,)),
+    (camera_raster.raster_triangles, (TRIANGLE,)),
+    (camera_raster.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
+    (camera_raster_plants.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
+)
+_KERNEL_OF_KIND = np.array(
+    [next(i for i, (_, kinds) in enumerate(_KERNELS) if kind in kinds) for kind in range(TRIANGLE + 1)]
+)
+"""Which of these draws a kind."""
+
+
+def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
+    """Intrinsics and pose [7] of the optical frame as kernels need them."""
+    if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
+        raise ValueError(
+            f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; give positive ones"
+        )
+    pose = np.asarray(pose, float)
+    if not np.isfinite(pose).all():
+        raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")
+    lens = Pinhole()
+    lens.eye = wp.vec3(*map(float, pose[:3]))
+    lens.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
+    lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
+    lens.width, lens.height, lens.max_depth = int(info.width), int(info.height), MAX_DEPTH
+    wide = max(info.cx, info.width - info.cx) / info.fx
+    high = max(info.cy, info.height - info.cy) / info.fy
+    lens.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
+    return lens
+
+
+def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
+    """Intrinsics of the same view with ``samples`` squared pixels for each one."""
+    return dataclasses.replace(
+        info,
+        width=info.width * samples,
+        height=info.height * samples,
+        fx=info.fx * samples,
+        fy=info.fy * samples,
+        cx=samples * (info.cx + 0.5) - 0.5,
+        cy=samples * (info.cy + 0.5) - 0.5,
+    )
+
+
+class CameraRasterizer:
+    """Nearest primitive of every pixel; the buffers of one camera."""
+
+    def __init__(self, width: int, height: int, device: str = "cpu") -> None:
+        count = width * height
+        self.width, self.height, self.device = width, height, device
+        self.keys = wp.empty(count, dtype=wp.int64, device=device)
+        self._keys = self.keys.numpy() if device == "cpu" else None
+        self.primitive = wp.empty(count, dtype=wp.int32, device=device)
+        self.depth = wp.empty(count, dtype=float, device=device)
+        self.labels = wp.empty(count, dtype=wp.int32, device=device)
+        self._distance = wp.empty(0, dtype=float, device=device)
+
+    def draw(
+        self,
+        primitives: PosedPrimitives,
+        lens: Pinhole,
+        nearest: float = 0.0,
+        farthest: float = MAX_DEPTH,
+    ) -> None:
+        """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
+        if primitives.rasterizer is None:
+            distance = self.cluster_distances(primitives, lens)
+            seen = np.flatnonzero(distance < float(shapes.FAR))
+            self._rasterize(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
+        else:
+            primitives.rasterizer.rasterize(primitives, lens, None, self.keys)
+        run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        wp.launch(
+            camera_raster.resolve_keys,
+            self.width * self.height // run,
+            inputs=[
+                primitives.labels,
+                self.keys,
+                lens,
+                label(Organ.GROUND, 0),
+                float(nearest),
+                float(farthest),
+                -float("inf"),
+                float("inf"),
+                run,
+            ],
+            outputs=[self.primitive, self.depth, self.labels],
+            device=self.device,
+        )
+
+    def cluster_distances(self, primitives: PosedPrimitives, lens: Pinhole) -> np.ndarray:
+        """How near each cluster may come to the eye [cluster] m; :data:`shapes.FAR` if no pixel can see it."""
+        clusters = len(primitives.cluster_first)
+        if len(self._distance) != clusters:
+            self._distance = wp.empty(clusters, dtype=float, device=self.device)
+        wp.launch(
+            camera_raster.cull_clusters,
+            clusters,
+            inputs=[primitives.ball, lens],
+            outputs=[self._distance],
+            device=self.device,
+        )
+        return self._distance.numpy()
+
+    def coverage(self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray) -> np.ndarray:
+        """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
+        if primitives.rasterizer is None:
+            self._rasterize(primitives, lens, clusters)
+        else:
+            primitives.rasterizer.rasterize(primitives, lens, clusters, self.keys)
+        return self.keys.numpy().reshape(self.height, self.width) < int(EMPTY_KEY)
+
+    def _rasterize(self, primitives: PosedPrimitives, lens: Pinhole, seen: np.ndarray) -> None:
+        """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
+        self._keys.fill(int(EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
+        seen = np.asarray(seen, np.int32)
+        kind = primitives.cluster_kind[seen]
+        stage = _KERNEL_OF_KIND[kind]
+        for number, (kernel, _) in enumerate(_KERNELS):
+            mine = seen[stage == number]
+            if len(mine):
+                wp.launch(
+                    kernel,
+                    (len(mine), 1),
+                    inputs=[primitives.shapes, primitives.clusters, wp.array(mine, device=self.device), lens, 1],
+                    outputs=[self.keys],
+                    device=self.device,
+                )

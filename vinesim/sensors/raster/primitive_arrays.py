@@ -1,0 +1,72 @@
+"""What rasterisers and the scene agree on: kinds of primitives, their arrays, and what draws them."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.raster import primitives
+from vinesim.kernels.raster.pinhole import Pinhole
+
+CONE, SPHEROID, LEAF, BOX, ELLIPSOID, CYLINDER, TRIANGLE = (
+    int(k)
+    for k in (
+        primitives.CONE,
+        primitives.SPHEROID,
+        primitives.LEAF,
+        primitives.BOX,
+        primitives.ELLIPSOID,
+        primitives.CYLINDER,
+        primitives.TRIANGLE,
+    )
+)
+KINDS = {
+    "cone": CONE,
+    "spheroid": SPHEROID,
+    "leaf": LEAF,
+    "box": BOX,
+    "ellipsoid": ELLIPSOID,
+    "cylinder": CYLINDER,
+    "triangle": TRIANGLE,
+}
+"""Number of each kind of primitive, by name."""
+
+
+class PosedPrimitives(Protocol):
+    """Primitives posed in the world (:class:`vinesim.sensors.scene.primitives.Primitives`)."""
+
+    device: str
+    shapes: primitives.Shapes
+    clusters: primitives.Clusters
+    ball: wp.array
+    """[cluster] vec4: centre and radius of a bounding sphere [m]; the radius is negative where a cluster is hidden."""
+    labels: wp.array
+    """[primitive] int32, :func:`vinesim.scene.ids.label`."""
+    cluster_first: np.ndarray
+    """[cluster] int32, index of the first primitive."""
+    cluster_size: np.ndarray
+    """[cluster] int32, number of primitives."""
+    cluster_kind: np.ndarray
+    """[cluster] int32, one of :data:`KINDS`."""
+    pose_version: int
+    """Changes when any pose changes."""
+
+    @property
+    def rasterizer(self) -> PrimitiveRasterizer | None:
+        """What fills the keys of cameras; None: the kernels of :mod:`vinesim.kernels.raster.camera_raster`."""
+        ...
+
+
+class PrimitiveRasterizer(Protocol):
+    """Fills keys: depth [um] in the upper 32 bits, number of the primitive in the lower 32 bits."""
+
+    def rasterize(
+        self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array
+    ) -> None:
+        """Write the nearest primitive of every pixel to ``keys`` [pixel] int64.
+
+        ``clusters`` [k]: only these are drawn; all unless given.
+        """
+        ...
