@@ -57,7 +57,9 @@ class LocalHuman:
         if np.linalg.norm(way[_HEAD]) > self.physics.parameters.teleport_distance:
             velocity[:] = 0.0
         self._sent_points = points
-        pose = dataclasses.replace(self.pose.with_points(points), left_busy=self._is_busy(0), right_busy=self._is_busy(1))
+        pose = dataclasses.replace(
+            self.pose.with_points(points), left_busy=self._is_busy(0), right_busy=self._is_busy(1)
+        )
         return HumanUpdate(self.name, now, pose, velocity)
 
     def hand_wrenches_on(self, robots: Container[str]) -> dict[str, dict[str, np.ndarray]]:
