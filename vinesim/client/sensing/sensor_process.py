@@ -26,7 +26,7 @@ from vinesim.client.sensing.sensor_worker import (
     StepSnapshot,
     run_sensor_worker,
 )
-from vinesim.client.tasks.tasks import RosCommandHandler
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.robot import Robot
 from vinesim.ros import ros_setup
