@@ -101,6 +101,37 @@ def reflected_light(materials: Materials, light: Light, r: wp.vec3, sky: float) 
 
 
 @wp.func
+def specular_light(
+    materials: Materials, light: Light, s: Surface, kind: int, d: wp.vec3, n: wp.vec3, ndl: float, lit: float
+) -> wp.vec3:
+    """Highlight of the sun and reflection of the surroundings (Schlick's Fresnel term) against the unit ray ``d``.
+
+    ``n`` faces the ray, ``ndl`` is its cosine to the sun, ``lit`` the share of the sun's disc that is seen.
+    """
+    colour = wp.vec3(0.0, 0.0, 0.0)
+    grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
+    g2 = grazing * grazing
+    fresnel = s.specular + (1.0 - s.specular) * g2 * g2 * grazing * wp.min(s.specular * 14.0, 1.0) * 0.8
+    if lit > 0.0 and ndl > -0.05:
+        half = wp.normalize(light.sun - d)
+        peak = 1.0 - wp.max(wp.dot(n, half), 0.0)
+        if s.shininess * peak < 8.0:
+            colour += light.sun_colour * (
+                fresnel * wp.exp(-s.shininess * peak) * (s.shininess * 0.14 + 0.4) * lit * (ndl + 0.05)
+            )
+    if s.reflectivity * fresnel > 0.006:
+        r = d - n * (2.0 * wp.dot(n, d))
+        if kind == LEAF:
+            above = mix(light.canopy_colour * 0.45, light.sky_colour, s.sky * s.sky)
+            colour += mix(light.ground_colour, above, 0.5 + 0.5 * r[2]) * (
+                wp.min(fresnel, 0.16) * s.reflectivity * s.occlusion
+            )
+        else:
+            colour += reflected_light(materials, light, r, s.sky) * (fresnel * s.reflectivity * s.occlusion)
+    return colour
+
+
+@wp.func
 def shade_surface(
     materials: Materials,
     light: Light,
@@ -154,25 +185,7 @@ def shade_surface(
                 + ambient_light(light, -n, s.sky) * (0.30 * s.occlusion),
             )
     if s.specular > 0.0:
-        grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
-        g2 = grazing * grazing
-        fresnel = s.specular + (1.0 - s.specular) * g2 * g2 * grazing * wp.min(s.specular * 14.0, 1.0) * 0.8
-        if lit > 0.0 and ndl > -0.05:
-            half = wp.normalize(light.sun - d)
-            peak = 1.0 - wp.max(wp.dot(n, half), 0.0)
-            if s.shininess * peak < 8.0:
-                colour += light.sun_colour * (
-                    fresnel * wp.exp(-s.shininess * peak) * (s.shininess * 0.14 + 0.4) * lit * (ndl + 0.05)
-                )
-        if s.reflectivity * fresnel > 0.006:
-            r = d - n * (2.0 * wp.dot(n, d))
-            if kind == LEAF:
-                above = mix(light.canopy_colour * 0.45, light.sky_colour, s.sky * s.sky)
-                colour += mix(light.ground_colour, above, 0.5 + 0.5 * r[2]) * (
-                    wp.min(fresnel, 0.16) * s.reflectivity * s.occlusion
-                )
-            else:
-                colour += reflected_light(materials, light, r, s.sky) * (fresnel * s.reflectivity * s.occlusion)
+        colour += specular_light(materials, light, s, kind, d, n, ndl, lit)
     colour += s.albedo * s.emission
     return mix(colour, light.haze_colour, 0.6 * (1.0 - wp.exp(-t * 0.006)))
 

@@ -344,8 +344,20 @@ def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
     return wp.normalize(n)
 
 
+@wp.struct
+class SolidPoint:
+    """One point of a solid: what its material draws on."""
+
+    normal: wp.vec3
+    grain: wp.vec3
+    """Position across (x, y) and along (z) the grain of the material [m]."""
+    sky: float
+    """Share of the sky that is seen."""
+
+
 @wp.func
-def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: float) -> Surface:
+def solid_point(g: Shapes, materials: Materials, i: int, p: wp.vec3) -> SolidPoint:
+    """Normal, position in the grain and visible sky at point ``p`` [m] of primitive ``i``, of any kind but a leaf."""
     kind = g.kind[i]
     a4 = g.a[i]
     b4 = g.b[i]
@@ -393,10 +405,20 @@ def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
             n = wp.quat_rotate(q, wp.normalize(n))
         else:
             n = wp.normalize(wp.quat_rotate(q, wp.cw_div(grain, wp.cw_mul(half, half))))
-    material = materials.material[i]
-    tint = materials.tint[i]
-    s = diffuse_surface(n, tint, sky)
-    seed = c4[1]
+    o = SolidPoint()
+    o.normal = n
+    o.grain = grain
+    o.sky = sky
+    return o
+
+
+@wp.func
+def woody_surface(
+    materials: Materials, s: Surface, material: int, grain: wp.vec3, seed: float, p: wp.vec3, pixel: float
+) -> Surface:
+    """Canes, bark and posts: relief and colour by noise along the grain; ``pixel`` is the size of a pixel there [m]."""
+    tint = s.albedo
+    n = s.normal
     near = pixel < 0.004
     if material == CANE:
         if near:
@@ -428,7 +450,16 @@ def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
         )
         s.normal = wp.normalize(n + wp.vec3(fine[1] - 0.5, fine[2] - 0.5, 0.0) * 0.5)
         s.specular = 0.02
-    elif material == WIRE:
+    return s
+
+
+@wp.func
+def made_surface(materials: Materials, s: Surface, material: int, grain: wp.vec3, seed: float, pixel: float) -> Surface:
+    """What is manufactured, and skin: gloss, colour and folds by material."""
+    tint = s.albedo
+    n = s.normal
+    near = pixel < 0.004
+    if material == WIRE:
         s.specular = 0.35
         s.shininess = 30.0
         s.reflectivity = 0.5
@@ -480,6 +511,20 @@ def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
         s.reflectivity = 1.0
     elif material == STEM:
         s.transmission = tint * 0.3
+    return s
+
+
+@wp.func
+def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: float) -> Surface:
+    """Surface of primitive ``i``, of any kind but a leaf or a berry, at ``p`` [m]; ``pixel`` [m] as seen there."""
+    o = solid_point(g, materials, i, p)
+    material = materials.material[i]
+    seed = g.c[i][1]
+    s = diffuse_surface(o.normal, materials.tint[i], o.sky)
+    if material == CANE or material == BARK or material == POST:
+        s = woody_surface(materials, s, material, o.grain, seed, p, pixel)
+    else:
+        s = made_surface(materials, s, material, o.grain, seed, pixel)
     if material != WIRE:
-        s.occlusion = s.occlusion * (0.55 + 0.45 * smoothstep(0.0, 0.35, p[2] + wp.max(n[2], 0.0) * 0.35))
+        s.occlusion = s.occlusion * (0.55 + 0.45 * smoothstep(0.0, 0.35, p[2] + wp.max(o.normal[2], 0.0) * 0.35))
     return s
