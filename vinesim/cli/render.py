@@ -68,8 +68,8 @@ def run(
     frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
-        "depth": picture.depth_millimetres(frame.exact_depth),
-        "measured": picture.depth_millimetres(frame.depth),
+        "depth": depth_millimetres(frame.exact_depth),
+        "measured": depth_millimetres(frame.depth),
         "labels": formats.encode_labels(frame.labels),
         "overlay": formats.draw_overlay(frame.rgb, truths),
     }

@@ -263,6 +263,30 @@ def leaf_bounds(
     return o
 
 
+@wp.struct
+class LeafPixelFrame:
+    """Rays of pixels (x, y) in the frame and unit of a blade: from ``eye`` along dz + dx x + dy y."""
+
+    eye: wp.vec3
+    dx: wp.vec3
+    dy: wp.vec3
+    dz: wp.vec3
+
+
+@wp.func
+def leaf_pixel_frame(
+    lens: Pinhole, p: wp.vec3, side: wp.vec3, rib: wp.vec3, up: wp.vec3, size: float
+) -> LeafPixelFrame:
+    """Frame of a blade with its petiole's end ``p`` [m] and axes in the optical frame."""
+    inv = 1.0 / size
+    o = LeafPixelFrame()
+    o.eye = wp.vec3(-wp.dot(p, side), -wp.dot(p, rib), -wp.dot(p, up)) * inv
+    o.dx = wp.vec3(side[0], rib[0], up[0]) * (inv / lens.fx)
+    o.dy = wp.vec3(side[1], rib[1], up[1]) * (inv / lens.fy)
+    o.dz = wp.vec3(side[2], rib[2], up[2]) * inv - o.dx * lens.cx - o.dy * lens.cy
+    return o
+
+
 @wp.kernel
 def raster_leaves(
     # model
@@ -301,14 +325,8 @@ def raster_leaves(
                 bound = sphere_bounds(lens, p + rib * (0.25 * size), 1.45 * size)
             box = clip_to_image(lens, bound)
             if box[0] < box[1] and box[2] < box[3]:
-                inv = 1.0 / size
-                eye = wp.vec3(-wp.dot(p, side), -wp.dot(p, rib), -wp.dot(p, up)) * inv
-                dx = wp.vec3(side[0], rib[0], up[0]) * (inv / lens.fx)
-                dy = wp.vec3(side[1], rib[1], up[1]) * (inv / lens.fy)
-                dz = wp.vec3(side[2], rib[2], up[2]) * inv - dx * lens.cx - dy * lens.cy
-                smooth = wp.int32(0)
-                if size * lens.fx > p[2] * SMOOTH_SIZE:
-                    smooth = 1
+                f = leaf_pixel_frame(lens, p, side, rib, up, size)
+                smooth = wp.where(size * lens.fx > p[2] * SMOOTH_SIZE, 1, 0)
                 extent = leaf_extent(shapes.hull, number)
                 nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)
                 x = wp.int32(0)
@@ -335,18 +353,20 @@ def raster_leaves(
                     whole = (n + 7) // 8 * 8
                     m = wp.int32(0)
                     while m < whole:
-                        depths[m] = hit_leaf_rectangle(bend, extent, eye, dz + dx * float(xs[m]) + dy * float(ys[m]))
+                        depths[m] = hit_leaf_rectangle(
+                            bend, extent, f.eye, f.dz + f.dx * float(xs[m]) + f.dy * float(ys[m])
+                        )
                         m += 1
                     for k in range(n):
                         t = depths[k]
                         if t < lens.max_depth:
                             at = ys[k] * lens.width + xs[k]
-                            ray = dz + dx * float(xs[k]) + dy * float(ys[k])
+                            ray = f.dz + f.dx * float(xs[k]) + f.dy * float(ys[k])
                             if t < 0.0:
-                                t = hit_leaf(shapes.outline, number, bend, eye, ray, smooth)
+                                t = hit_leaf(shapes.outline, number, bend, f.eye, ray, smooth)
                                 depth_test(at, t, i, lens.max_depth, keys_out)
                             elif depth_key(t, i) < keys_out[at]:
-                                u = eye[0] + t * ray[0]
-                                v = eye[1] + t * ray[1]
+                                u = f.eye[0] + t * ray[0]
+                                v = f.eye[1] + t * ray[1]
                                 if inside_outline(shapes.outline, number, u, v, smooth):
                                     depth_test(at, t, i, lens.max_depth, keys_out)

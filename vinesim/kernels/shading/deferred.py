@@ -19,9 +19,9 @@ from vinesim.kernels.shading.materials import (
     mix,
     sample_bilinear,
     smoothstep,
-    solid_surface,
 )
 from vinesim.kernels.shading.shadow_maps import ShadowMap, sun_visibility
+from vinesim.kernels.shading.solid_materials import solid_surface
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -190,6 +190,45 @@ def shade_surface(
     return mix(colour, light.haze_colour, 0.6 * (1.0 - wp.exp(-t * 0.006)))
 
 
+@wp.func
+def surface_light(
+    shapes: Shapes,
+    materials: Materials,
+    light: Light,
+    near: ShadowMap,
+    far: ShadowMap,
+    lens: Pinhole,
+    i: int,
+    ray: wp.vec3,
+    z: float,
+    left: int,
+    top: int,
+    block: int,
+) -> wp.vec3:
+    """Light from primitive ``i`` (-2: the ground) at depth ``z`` [m] along ``ray``, for the block at (left, top) [px]."""
+    scale = wp.length(ray)
+    d = ray / scale
+    p = lens.eye + ray * z
+    footprint = z * float(block) / lens.fx
+    # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
+    f = 0.06711056 * float(left) + 0.00583715 * float(top)
+    f = 52.9829189 * (f - wp.floor(f))
+    turn = light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
+    kind = wp.int32(-1)
+    s = Surface()
+    if i >= 0:
+        kind = shapes.kind[i]
+        if kind == LEAF:
+            s = leaf_surface(shapes, materials, i, p, d, footprint)
+        elif kind == SPHEROID and materials.material[i] == BERRY:
+            s = berry_surface(shapes, materials, i, p, footprint)
+        else:
+            s = solid_surface(shapes, materials, i, p, footprint)
+    else:
+        s = ground_surface(materials, p, footprint, footprint * z * scale / lens.eye[2])
+    return shade_surface(materials, light, near, far, s, kind, p, d, z * scale, turn)
+
+
 @wp.kernel
 def shade_pixels(
     # model
@@ -207,7 +246,11 @@ def shade_pixels(
     # out
     radiance_out: wp.array(dtype=wp.vec3),
 ):
-    """One thread lights ``run`` neighbouring blocks, 1 or 2 pixels wide; there each primitive is lit once, at its middle."""
+    """One thread lights ``run`` neighbouring blocks, 1 or 2 pixels wide; there each primitive is lit once, at its middle.
+
+    primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; near, far: shadow maps;
+    block: [px]; radiance: [pixel] linear RGB.
+    """
     half = block - 1  # corners are told apart by bits: divisions would cost as much as the light
     across = (lens.width + half) >> half
     first = wp.tid() * run
@@ -246,31 +289,11 @@ def shade_pixels(
                 z = depth * per * 1.0e-6
                 if i == -2:
                     z = -lens.eye[2] / ray[2]
-                scale = wp.length(ray)
-                d = ray / scale
                 colour = wp.vec3(0.0, 0.0, 0.0)
                 if i == -1:
-                    colour = sky_radiance(light, d)
+                    colour = sky_radiance(light, ray / wp.length(ray))
                 else:
-                    p = lens.eye + ray * z
-                    footprint = z * float(block) / lens.fx
-                    # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
-                    f = 0.06711056 * float(left) + 0.00583715 * float(top)
-                    f = 52.9829189 * (f - wp.floor(f))
-                    turn = light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
-                    kind = wp.int32(-1)
-                    s = Surface()
-                    if i >= 0:
-                        kind = shapes.kind[i]
-                        if kind == LEAF:
-                            s = leaf_surface(shapes, materials, i, p, d, footprint)
-                        elif kind == SPHEROID and materials.material[i] == BERRY:
-                            s = berry_surface(shapes, materials, i, p, footprint)
-                        else:
-                            s = solid_surface(shapes, materials, i, p, footprint)
-                    else:
-                        s = ground_surface(materials, p, footprint, footprint * z * scale / lens.eye[2])
-                    colour = shade_surface(materials, light, near, far, s, kind, p, d, z * scale, turn)
+                    colour = surface_light(shapes, materials, light, near, far, lens, i, ray, z, left, top, block)
                 for k in range(c, corners):
                     x = left + (k & half)
                     y = top + (k >> half)

@@ -19,6 +19,7 @@ import numpy as np
 import vinesim
 from vinesim import frames
 from vinesim.scene.berries import VARIETIES
+from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
@@ -167,8 +168,8 @@ class VineyardRenderer:
         }
         images = {
             "images": frame.rgb,
-            "depth": picture.depth_millimetres(frame.exact_depth),
-            "measured": picture.depth_millimetres(frame.depth),
+            "depth": depth_millimetres(frame.exact_depth),
+            "measured": depth_millimetres(frame.depth),
             "ids": formats.encode_labels(frame.labels),
             "berries": formats.encode_berry_numbers(seen),
         }

@@ -14,10 +14,10 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.kernels.raster.primitives import FAR
+from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
-from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
@@ -232,7 +232,7 @@ def bunch_truths(
         pixel = None
         if attached:
             local = frames.rotate(frames.conjugate(seen.pose[3:]), cuts[bunch] - seen.pose[:3])
-            pixel = point_cloud.project_points(local, info) if local[2] > 0.0 else None
+            pixel = project_points(local, info) if local[2] > 0.0 else None
         found.append(
             BunchTruth(
                 bunch=bunch,
@@ -292,7 +292,7 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
     # as a difference, so that what did not move does not move by a rounding either
     still = frames.rotate(before[:, 3:], attached) + before[:, :3]
     moved[solid] += frames.rotate(after[:, 3:], attached) + after[:, :3] - still
-    there = point_cloud.project_points(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
+    there = project_points(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
     shift = np.full((info.height, info.width, 2), np.nan)
     shift[v, u] = there - np.stack([u, v], 1)
     shown = np.zeros((info.height, info.width), bool)
