@@ -9,9 +9,9 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
+from vinesim.scene.camera_geometry import measured_points, project_points
 from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.camera_geometry import measured_points, project_points
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import pinhole

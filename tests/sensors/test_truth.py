@@ -8,9 +8,9 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
+from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame, CameraInfo, RigidVisual
-from vinesim.scene.camera_geometry import project_points
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec

@@ -32,6 +32,7 @@ def run(
     renderer: str = "warp",
 ) -> int:
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
+    from vinesim.scene.camera_geometry import depth_millimetres
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
     from vinesim.scene.spec import load_scene, with_seed

@@ -29,7 +29,14 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 from vinesim import frames
 from vinesim.ros.commands.types import BaseVelocity, JointPositions, JointTrajectory
 from vinesim.ros.messages.transforms import split_time
-from vinesim.scene.camera_geometry import DISTORTION, DISTORTION_MODEL, POINT_DTYPE, depth_millimetres, intrinsic_matrix, write_points
+from vinesim.scene.camera_geometry import (
+    DISTORTION,
+    DISTORTION_MODEL,
+    POINT_DTYPE,
+    depth_millimetres,
+    intrinsic_matrix,
+    write_points,
+)
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
