@@ -1,3 +1,5 @@
+import time
+
 import numpy as np
 import pytest
 
@@ -67,3 +69,14 @@ def test_percentiles_are_of_the_work(clock):
     median, worst = pace.work_ms(50, 100)
     assert median == pytest.approx(1.0)
     assert worst == pytest.approx(9.0)
+
+
+def test_steps_come_at_100_hz_by_the_real_clock():
+    """F91: over a second, whatever the machine does beside; deadlines given up after a stall are counted."""
+    loop = RateLoop(0.01)
+    begun = time.perf_counter()
+    for _ in range(101):
+        loop.begin()
+        loop.end()
+    assert (100 + loop.dropped) / (time.perf_counter() - begun) == pytest.approx(100.0, rel=0.1)
+    assert loop.overruns <= 5

@@ -144,7 +144,7 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
 
 def options(file: pathlib.Path, out: pathlib.Path, **more) -> dict:
     given = {"connect": None, "listen": None, "world": "vineyard", "speed": 1.0, "start": 0.0, "end": None}
-    return given | {"file": file, "out": out, "place": None, "scene": None, "seed": None} | more
+    return given | {"file": file, "out": out, "pose": None, "scene": None, "seed": None} | more
 
 
 def test_a_replay_is_looked_at(robot_tape, tmp_path, capsys):

@@ -25,21 +25,17 @@ if ros_setup.unavailable_reason() is not None:
 
 import rclpy
 from geometry_msgs.msg import TwistStamped, WrenchStamped
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from tests.support.stock_node import TIMEOUT, StockNode, wait_until
 from vinesim.ros.commands.types import BaseVelocity, JointPositions
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
 from vinesim.ros.node import Node
 from vinesim.ros.tools.topic_monitor import TopicStats
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
-
-TIMEOUT = 120.0
-"""Longest wait for anything [s]; reached only by a failure."""
 
 REST = frames.pose(np.zeros(3))
 JOINTS = tuple(f"arm_left_{i}_joint" for i in range(1, 8))
@@ -53,13 +49,6 @@ def own_domain(monkeypatch, tmp_path_factory):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("log")))
-
-
-def wait_until(condition: Callable[[], object], meanwhile: Callable[[], object] = lambda: time.sleep(0.01)) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {TIMEOUT} s in vain"
-        meanwhile()
 
 
 def robot_sample(t: float, actor: str = "vinebot", contacts: tuple[Contact, ...] = ()) -> RobotSample:
@@ -113,28 +102,6 @@ def topic_monitor(*topics: str) -> Iterator[Callable[[], dict]]:
         if process.poll() is None:
             process.kill()
             process.communicate()
-
-
-class StockNode:
-    """A stock node with a context of its own."""
-
-    def __init__(self) -> None:
-        self._context = Context()
-        self._context.init([])
-        self.node = rclpy.create_node("stock_node", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-
-    def spin(self) -> None:
-        self._executor.spin_once(timeout_sec=0.05)
-
-    def __enter__(self) -> StockNode:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.shutdown()
 
 
 def test_large_messages_reach_another_process():

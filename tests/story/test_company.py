@@ -1,8 +1,11 @@
 """F54: one client moves several robots; each is an actor of its own to everybody else, and its topics have a prefix."""
 
+import contextlib
 import json
+import signal
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -17,6 +20,8 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
 DT = 0.01
+LONGEST = 300.0
+"""For a process to start, or to end [s]; reached only by a failure."""
 
 
 class Farm:
@@ -114,25 +119,42 @@ def test_robots_of_one_client_start_side_by_side_then_in_line():
 @pytest.mark.slow
 @pytest.mark.ros
 def test_each_has_its_topics_under_its_name():
-    """A stranger with stock rclpy hears both, each under its own prefix, and one clock."""
+    """A stock ROS node receives the topics of both, each under its own prefix, and one clock."""
     topics = [
         "/clock",
         *(f"/farm_{i}/{topic}" for i in (1, 2) for topic in ("joint_states", "mobile_base_controller/odom", "tf")),
     ]
-    witness = subprocess.Popen(
-        [sys.executable, "-m", "vinesim.ros.tools.topic_monitor", *(word for topic in topics for word in ("--topic", topic))],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        two = ["--robot", "vinebot", "--robot", "vinebot", "--name", "farm", "--seconds", "8", "--status", "none"]
-        done = subprocess.run(
-            [sys.executable, "-m", "vinesim.cli", "client", *two], capture_output=True, text=True, timeout=240
-        )
-        assert done.returncode == 0, done.stderr
-        heard, _ = witness.communicate(timeout=30)
-    finally:
-        witness.kill()
-    report = json.loads(heard)
+    asked = [word for topic in topics for word in ("--topic", topic)]
+    two = ["--robot", "vinebot", "--robot", "vinebot", "--name", "farm", "--status", "json"]
+    with contextlib.ExitStack() as stack:
+        monitor, client = (
+            stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE, text=True,
+                )
+            )
+            for command in (
+                ["vinesim.ros.tools.topic_monitor", *asked],
+                ["vinesim.cli", "client", *two],
+            )
+        )  # fmt: skip
+        for process in (monitor, client):
+            stack.callback(process.kill)
+        watchdog = threading.Timer(LONGEST, client.kill)
+        watchdog.start()
+        stack.callback(watchdog.cancel)
+        subscribed = None
+        for status in map(json.loads, client.stdout):
+            if subscribed is None and "joint_states" in status["topics"]:
+                subscribed = status["time"]
+            if subscribed is not None and status["time"] > subscribed + 5.0:
+                break
+        client.send_signal(signal.SIGINT)
+        _, errors = client.communicate(timeout=LONGEST)
+        assert client.returncode == 0, errors
+        received, _ = monitor.communicate(timeout=LONGEST)
+    report = json.loads(received)
     for topic in topics:
         assert report[topic]["count"] > 20, (topic, report)
     assert report["/clock"]["lost"] is not None, "one publisher"

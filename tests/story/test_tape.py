@@ -25,7 +25,7 @@ from vinesim.net.transport.access_control import Role
 from vinesim.net.transport.certificates import new as new_certificate
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
-PATIENCE = 20.0
+TIMEOUT = 120.0
 
 
 def command(*words: str) -> subprocess.Popen[str]:
@@ -42,7 +42,7 @@ def ended(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
     finally:
         if process.poll() is None:
             process.kill()
-        process.communicate(timeout=PATIENCE)
+        process.communicate(timeout=TIMEOUT)
 
 
 class Company:
@@ -53,7 +53,7 @@ class Company:
         self.number = 0
 
     def until(self, condition: Callable[[], object], what: str, each: Callable[[], None] = lambda: None) -> None:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not condition():
             assert time.monotonic() < end, f"waited in vain for {what}"
             self.number += 1
@@ -106,7 +106,7 @@ def story(tmp_path_factory) -> Iterator[tuple[str, pathlib.Path, float]]:
             )  # fmt: skip
             killed = time.time()
             recorder.send_signal(signal.SIGKILL)
-            recorder.wait(PATIENCE)
+            recorder.wait(TIMEOUT)
             state = [rest.joint_q for rest in rests(path)]
         assert len(state) == 1
         yield endpoint, path, killed
@@ -145,7 +145,7 @@ def test_a_second_recorder_leaves_the_first_ones_file_alone(story):
             lambda: alone.bend(1, 0.5 * np.sin(0.1 * company.number)),
         )  # fmt: skip
         recorder.send_signal(signal.SIGINT)
-        _, said = recorder.communicate(timeout=PATIENCE)
+        _, said = recorder.communicate(timeout=TIMEOUT)
     assert recorder.returncode == 0, said
     assert str(second) in said
     assert f"{path} is there already" in said
@@ -231,7 +231,7 @@ def count(endpoint: str, path: pathlib.Path | None, apart: float) -> list[int]:
                 there &= apart > 5.0 or recorder._near.get("ada", (None, None))[1] is not None
             return there
 
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not settled():
             assert time.monotonic() < end
             tick()

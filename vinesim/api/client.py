@@ -21,7 +21,7 @@ from vinesim.client.client import Client as RobotClient
 from vinesim.client.tasks.start_poses import start_pose
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.step import Physics
-from vinesim.robot.description import description
+from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.robot import Robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
@@ -58,7 +58,7 @@ class Client:
         """
         self.scene: Scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.model: Model = generate(self.scene)
-        described = description.load(robot)
+        described = load_description(robot)
         place = start_pose(self.scene, spawn) if pose is None else base_pose(pose)
         self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:

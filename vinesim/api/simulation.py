@@ -19,7 +19,7 @@ from vinesim.api.energy import Energy, Momentum, energy, momentum
 from vinesim.errors import UsageError
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
-from vinesim.robot.description import description
+from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.robot import Robot
 from vinesim.scene.builder import TreeBuilder
 from vinesim.scene.cane import CaneBuilder, assemble
@@ -103,6 +103,8 @@ class Simulation:
             self._detachments += self.physics.detachments
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
+        if self._loads:  # a tree that fell asleep under its load moves again
+            self.physics.wake(np.unique(self.model.body_tree[list(self._loads)]))
         self._loads.clear()
 
     @property
@@ -236,11 +238,11 @@ class Simulation:
         """Add a robot by the name of one in ``data/robots`` or the path of a URDF file.
 
         Args:
-            robot: name or path; :class:`~vinesim.robot.description.description.DescriptionError` if it cannot be used.
+            robot: name or path; :class:`~vinesim.robot.description.errors.DescriptionError` if it cannot be used.
             pose: (x, y, yaw) in m and rad, or [7] position and quaternion of the base.
             name: unique name of this robot; ``robot_0``, ``robot_1``, ... unless given.
         """
-        described = description.load(robot)
+        described = load_description(robot)
         index = len(self.robots)
         name = name or f"robot_{index}"
         if name in self.robots:

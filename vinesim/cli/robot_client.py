@@ -11,7 +11,7 @@ from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.client.tasks.tasks import DriveTo, LookAt, plan_task, validate_task_name
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.loader import load_description as load_robot
+from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.robot.tasks.task import Task
 from vinesim.ros.names import ros_name
@@ -20,7 +20,7 @@ from vinesim.ros.names import ros_name
 def run(options: ClientOptions) -> int:
     """Build the client from its options, step until told to stop, then write what was asked for; the exit code."""
     validate_task_name(options.job)
-    descriptions = [load_robot(robot) for robot in options.robot or ["vinebot"]]
+    descriptions = [load_description(robot) for robot in options.robot or ["vinebot"]]
     with ClientSession(options) as session:
         start = start_pose(session.scene, session.spawn, options.approach)
         begin, approach = None, options.approach

@@ -50,7 +50,7 @@ class Spectator(Client):
 
     picking = False  # it is told what parts
 
-    def _enter(
+    def _add_own_actor(
         self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
         height: float, bus: Bus,
     ) -> None:  # fmt: skip

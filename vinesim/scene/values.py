@@ -10,7 +10,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.scene.ids import Organ
+from vinesim.scene.ids import LABEL_STRIDE, Organ
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -366,6 +366,16 @@ class CameraFrame:
     exact_depth: np.ndarray | None = None
     """[height, width] float32 m along z, whatever the sensor can measure: no noise, no gaps; +Inf for the sky."""
 
+    @property
+    def organs(self) -> np.ndarray:
+        """[height, width] :class:`~vinesim.scene.ids.Organ` of each pixel; 0 is nothing."""
+        return self.labels // LABEL_STRIDE
+
+    @property
+    def instances(self) -> np.ndarray:
+        """[height, width] index of the bunch, box, tree or actor of each pixel, counted for each organ from 0."""
+        return self.labels % LABEL_STRIDE
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LidarScan:
@@ -389,6 +399,11 @@ class LidarScan:
     """[point] int32"""
     returned: np.ndarray | None = None
     """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
+
+    @property
+    def organs(self) -> np.ndarray:
+        """[point] :class:`~vinesim.scene.ids.Organ` that each point lies on."""
+        return self.labels // LABEL_STRIDE
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

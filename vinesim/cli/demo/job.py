@@ -12,7 +12,7 @@ from vinesim.cli.demo.processes import START_TIMEOUT, process_group
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.tasks.tasks import UnknownTask
-from vinesim.robot.description.loader import load_description as load_robot
+from vinesim.robot.description.loader import load_description
 from vinesim.ros import ros_setup
 from vinesim.scene.spec import load_scene, with_seed
 
@@ -33,7 +33,7 @@ def run_job(
     default_robot, done_key = JOBS[job]
     robot, scene = robot or default_robot, scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
-    load_robot(robot)  # refused once, and before any process starts
+    load_description(robot)  # refused once, and before any process starts
     out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
     with process_group() as group:

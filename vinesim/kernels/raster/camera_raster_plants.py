@@ -319,8 +319,7 @@ def raster_leaves(
             side = wp.cross(rib, up)
             o = leaf_bounds(lens, shapes, i, p, side, rib, up)
             bound = o.xy
-            z_low = o.depth
-            crossing = z_low < NEAR_DEPTH
+            crossing = o.depth < NEAR_DEPTH
             if crossing:
                 bound = sphere_bounds(lens, p + rib * (0.25 * size), 1.45 * size)
             box = clip_to_image(lens, bound)
@@ -328,7 +327,7 @@ def raster_leaves(
                 f = leaf_pixel_frame(lens, p, side, rib, up, size)
                 smooth = wp.where(size * lens.fx > p[2] * SMOOTH_SIZE, 1, 0)
                 extent = leaf_extent(shapes.hull, number)
-                nearest = wp.int64(int(wp.max(z_low, 0.0) * 1.0e6)) << wp.int64(32)
+                nearest = wp.int64(int(wp.max(o.depth, 0.0) * 1.0e6)) << wp.int64(32)
                 x = wp.int32(0)
                 y = box[2] - 1
                 last = wp.int32(0)

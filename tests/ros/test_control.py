@@ -1,0 +1,88 @@
+"""F55: messages of a stock ROS node move the joints and the base of a real client, which tells ROS of it."""
+
+# ruff: noqa: E402 (messages are imported only where ROS is installed)
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+from vinesim.ros import ros_setup
+
+pytestmark = pytest.mark.ros
+if ros_setup.unavailable_reason() is not None:
+    pytest.skip(str(ros_setup.unavailable_reason()), allow_module_level=True)
+
+from geometry_msgs.msg import TwistStamped
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from tests.support.contact_scenes import cane
+from tests.support.stock_node import StockNode, wait_until
+from vinesim.client.client import Client
+from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.client.tasks.tasks import RosCommandHandler
+from vinesim.net.transport.bus import MemoryHub
+from vinesim.robot.description.loader import load_description
+from vinesim.ros.node import Node
+from vinesim.scene.builder import assemble
+from vinesim.scene.spec import load_scene
+
+GOAL = 0.4
+"""Of the head's first joint [rad]."""
+
+
+@pytest.fixture
+def client() -> Client:
+    """One vinebot far from a single cane."""
+    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+    return Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
+
+
+def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch, tmp_path):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    robot = client.robot
+    head = robot.description.joints.index("head_1_joint")
+    received: list[JointState] = []
+
+    def head_of(message: JointState) -> float:
+        return message.position[message.name.index("head_1_joint")]
+
+    with Node("robot", robot.description.urdf, base=robot.description.base) as node, StockNode() as peer:
+        client.pre_step.append(RosCommandHandler(robot, node.commands))
+        client.post_step.append(
+            lambda c: node.publish_robot_state(c.physics.time, robot.sample(c.physics.time, c.physics.contacts))
+        )
+        peer.node.create_subscription(JointState, "/joint_states", received.append, 10)
+        arm = peer.node.create_publisher(JointTrajectory, "/head_controller/joint_trajectory", 10)
+        wheels = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)
+        wait_until(lambda: arm.get_subscription_count() and wheels.get_subscription_count(), peer.spin)
+        wait_until(lambda: node.has_subscribers("joint_states"), peer.spin)
+
+        def step() -> None:
+            client.tick()
+            peer.spin()
+
+        wait_until(lambda: received, step)
+        assert abs(head_of(received[-1])) < 0.05
+        point = JointTrajectoryPoint(positions=[GOAL])
+        point.time_from_start.sec = 1
+        arm.publish(JointTrajectory(joint_names=["head_1_joint"], points=[point]))
+        wait_until(lambda: abs(robot.rigid.joint_measurements("robot")[0][head] - GOAL) < 0.02, step)
+        wait_until(lambda: abs(head_of(received[-1]) - GOAL) < 0.02, step)
+
+        start = robot.rigid.base_state("robot")[0][:2].copy()
+        forward = TwistStamped()
+        forward.twist.linear.x = 0.5
+
+        def drive() -> None:
+            wheels.publish(forward)
+            step()
+            time.sleep(0.01)
+
+        wait_until(lambda: np.linalg.norm(robot.rigid.base_state("robot")[0][:2] - start) > 0.1, drive)

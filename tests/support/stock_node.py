@@ -1,0 +1,43 @@
+"""A stock rclpy node with a context of its own, as a peer of the node under test; import it only where ROS is installed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+
+TIMEOUT = 120.0
+"""Longest wait for anything [s]; reached only by a failure, also on a busy machine."""
+
+
+def wait_until(condition: Callable[[], object], meanwhile: Callable[[], object] = lambda: time.sleep(0.01)) -> None:
+    """Call ``meanwhile`` until ``condition`` holds, at most :data:`TIMEOUT`."""
+    deadline = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {TIMEOUT} s in vain"
+        meanwhile()
+
+
+class StockNode:
+    """A stock node with a context of its own."""
+
+    def __init__(self) -> None:
+        self._context = Context()
+        self._context.init([])
+        self.node = rclpy.create_node("stock_node", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def spin(self) -> None:
+        self._executor.spin_once(timeout_sec=0.05)
+
+    def __enter__(self) -> StockNode:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.shutdown()
