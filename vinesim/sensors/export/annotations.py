@@ -30,7 +30,7 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
     from pycocotools import mask as coco
 
     encoded = coco.encode(np.asfortranarray(mask, np.uint8))
-    return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}
+    return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}  # pyright: ignore[reportAttributeAccessIssue]  # bytes, not str
 
 
 def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:

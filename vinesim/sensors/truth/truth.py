@@ -200,7 +200,7 @@ def bunch_truths(
     fruit = fruit[np.isin(named[fruit], named[fruit][alone.cluster_distances(primitives, lens)[fruit] < float(FAR)])]
     fruit = fruit[primitives.clusters_shown()[fruit]]
     count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
-    posed = [getattr(primitives.shapes, k).numpy() for k in "ab"]
+    a, b = primitives.shapes.a.numpy(), primitives.shapes.b.numpy()
     loose = {one.index: k for k, one in enumerate(snapshot.visuals) if one.organ == Organ.BUNCH}
     cuts = {
         int(bunch): cut_point(model, snapshot.body_q, int(bunch))
@@ -220,14 +220,14 @@ def bunch_truths(
         visible = seen.labels[window] == label(Organ.BUNCH, bunch)
         parts = np.concatenate(
             [
-                np.arange(primitives.cluster_first[k], primitives.cluster_first[k] + primitives.cluster_size[k])
-                for k in mine
+                first + np.arange(size)
+                for first, size in zip(primitives.cluster_first[mine], primitives.cluster_size[mine], strict=True)
             ]
         )
         attached = bool(snapshot.bunch_attached[bunch])
         turn = (snapshot.body_q[model.bunch_body[bunch]] if attached else snapshot.visual_q[loose[bunch]])[3:]
         frame, size = _box_around(
-            *(p[parts] for p in posed), np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
+            a[parts], b[parts], np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
         )
         pixel = None
         if attached:
