@@ -10,7 +10,8 @@ import pytest
 from tests.physics.test_human_body import eva, put
 from tests.support.contact_scenes import bunch_scene, cane, gripper, probe
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import MAX_TIED_BODIES, MAX_TIES_PER_BODY, ArticulationSolver
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.human_body import THICK
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
@@ -126,14 +127,14 @@ def test_a_tie_holds_a_body_beside_its_own_ties():
 def test_so_many_can_be_held():
     model = assemble([cane((0.0, y, 2.0)) for y in range(2)])
     plants = ArticulationSolver(model, State.at_rest(model))
-    for _ in range(MAX_TIES_PER_BODY):
+    for _ in range(PhysicsParameters().max_hands_per_body):
         plants.add_tie(0, np.zeros(3), 1.0, 0.0)
-    with pytest.raises(ValueError, match=f"body 0 is held in {MAX_TIES_PER_BODY} places already"):
+    with pytest.raises(ValueError, match=f"body 0 is held in {PhysicsParameters().max_hands_per_body} places already"):
         plants.add_tie(0, np.zeros(3), 1.0, 0.0)
-    for body in range(1, MAX_TIED_BODIES):
+    for body in range(1, PhysicsParameters().max_held_bodies):
         plants.add_tie(body, np.zeros(3), 1.0, 0.0)
-    with pytest.raises(ValueError, match=f"body {MAX_TIED_BODIES} is one too many"):
-        plants.add_tie(MAX_TIED_BODIES, np.zeros(3), 1.0, 0.0)
+    with pytest.raises(ValueError, match=f"body {PhysicsParameters().max_held_bodies} is one too many"):
+        plants.add_tie(PhysicsParameters().max_held_bodies, np.zeros(3), 1.0, 0.0)
 
 
 def test_a_bunch_is_held_and_follows():

@@ -5,7 +5,8 @@ import pytest
 
 from tests.support.contact_scenes import bar
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import AIR_DENSITY, ArticulationSolver
+from vinesim.kernels.articulation.forces import AIR_DENSITY
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.wind import ROUND, Wind
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble

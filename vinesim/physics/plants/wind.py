@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import AIR_DENSITY, ArticulationSolver
+from vinesim.kernels.articulation.forces import AIR_DENSITY
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import GRAVITY
 
 GUST_WAVES = 48
