@@ -26,7 +26,7 @@ from vinesim.client.sensing.sensor_worker import (
     StepSnapshot,
     run_sensor_worker,
 )
-from vinesim.client.tasks.tasks import RosCommandHandler
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.robot import Robot
 from vinesim.ros import ros_setup
@@ -155,7 +155,7 @@ class SensorProcess:
                 self._unacknowledged.append((self._sent_snapshots, plants.trees))
 
     def _receive(self) -> None:
-        """Take the worker's messages: commands, statistics, acknowledgements; :class:`SensorProcessError` if it failed."""
+        """Take the worker's messages; :class:`SensorProcessError` if it has failed."""
         while self._has_message():
             try:
                 kind, value = self._pipe.recv()

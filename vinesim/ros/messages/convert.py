@@ -1,4 +1,4 @@
-"""Values to messages and back: pure functions, no node needed.
+"""Conversion of values to ROS messages and back: pure functions.
 
 Arrays go into a message through ``array.array``, which rosidl takes as it is (0.03 ms for a 0.9 MB picture; a list of
 numbers takes a thousand times as long). Stamps are the simulation time of the sample (REP-117/118 for what has no
@@ -79,7 +79,7 @@ def header(time: float, frame: str) -> Header:
 
 
 def clock(time: float) -> Clock:
-    """Simulation time [s] for those who run with use_sim_time."""
+    """Simulation time [s] for nodes with use_sim_time."""
     return Clock(clock=stamp(time))
 
 
@@ -95,7 +95,7 @@ def joint_state(sample: JointSample) -> JointState:
 
 
 def odometry(sample: RobotSample, base: str) -> Odometry:
-    """What the base believes of itself: pose in ``odom``, velocity in its own axes."""
+    """Odometry of the base: pose in ``odom``, velocity in its own axes."""
     message = Odometry(header=header(sample.joints.time, "odom"), child_frame_id=base)
     pose = message.pose.pose
     _set_vector(pose.position, sample.odom_q[:3])
@@ -140,7 +140,7 @@ def label_image(frame: CameraFrame) -> Image:
 
 
 def label_map() -> String:
-    """What labels mean, as JSON: ``label // stride`` is an organ, ``label % stride`` which one of them."""
+    """The meaning of labels as JSON: ``label // stride`` is an organ, ``label % stride`` which one of them."""
     organs = {str(int(organ)): organ.name.lower() for organ in Organ}
     return String(data=json.dumps({"stride": LABEL_STRIDE, "organs": organs}))
 
@@ -200,7 +200,7 @@ def lidar_cloud(scan: LidarScan) -> PointCloud2:
 
 
 def diagnostics(time: float, name: str, values: Mapping[str, object], healthy: bool) -> DiagnosticArray:
-    """Named figures of one part, and whether it is well."""
+    """Statistics of one component by name, and whether it is healthy."""
     status = DiagnosticStatus(name=name, level=DiagnosticStatus.OK if healthy else DiagnosticStatus.WARN)
     status.message = "well" if healthy else "behind"
     status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
@@ -208,7 +208,7 @@ def diagnostics(time: float, name: str, values: Mapping[str, object], healthy: b
 
 
 def base_velocity(message: TwistStamped) -> BaseVelocity:
-    """A wanted velocity of the base."""
+    """A commanded velocity of the base; :class:`CommandError` if it is not finite."""
     linear, angular = message.twist.linear, message.twist.angular
     velocity = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
     if not np.isfinite(velocity).all():
@@ -217,7 +217,7 @@ def base_velocity(message: TwistStamped) -> BaseVelocity:
 
 
 def joint_positions(message: Float64MultiArray, controller: str) -> JointPositions:
-    """Wanted positions of a forward controller."""
+    """Commanded positions of a forward controller; :class:`CommandError` if they are not finite."""
     positions = np.array(message.data, float)
     if not np.isfinite(positions).all():
         raise CommandError(f"{controller}: commanded positions are not finite: {positions.tolist()}")
