@@ -12,7 +12,7 @@ import numpy as np
 
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import DISTORTION, DISTORTION_MODEL, intrinsic_matrix
-from vinesim.scene.ids import ObjectKind, Organ, object_name
+from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
 
