@@ -92,7 +92,7 @@ def run(
 
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:
-    """The actors and crates that ``--robot``, ``--person`` and ``--crate`` describe; :class:`UsageError` if one is wrong."""
+    """The actors and crates of ``--robot``, ``--person`` and ``--crate``; :class:`UsageError` if one is wrong."""
     from vinesim.client.composition.composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
     from vinesim.robot.description.loader import load_description
     from vinesim.scene import appearance

@@ -28,9 +28,6 @@ FOLLOW_DISTANCE = 2.6
 FOLLOW_YAW = 0.7
 """Angle of the eyes beside the line straight behind that robot [rad]."""
 
-MIDDLE = 1.2
-"""... and at this height [m]."""
-
 
 def standing_view(x: float, y: float, heading: float) -> np.ndarray:
     """Pose [7] m, 1 of the eyes of a person who stands at (x, y) [m] and looks along ``heading`` [rad]."""
