@@ -24,7 +24,6 @@ from vinesim.scene.state import State
 from vinesim.scene.values import (
     Contact,
     HandSample,
-    Haptic,
     HumanPose,
     HumanSpec,
     Parting,
@@ -121,11 +120,6 @@ class Physics:
             return self.contact_solver.touched_trees
         held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.grasp_manager.contacts)
         return tuple(sorted({*self.contact_solver.touched_trees, *held}))
-
-    @property
-    def haptics(self) -> tuple[Haptic, ...]:
-        """What the controllers of people are to vibrate with after the last tick."""
-        return self.grasp_manager.haptics
 
     def update_kinematics(self) -> None:
         """Bring ``state.body_q`` from the start of the last tick to its end."""
