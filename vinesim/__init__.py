@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from vinesim.scene.cane import cane as cane
     from vinesim.scene.generation.vineyard import generate as generate
     from vinesim.scene.ids import Organ as Organ
-    from vinesim.scene.ids import unlabel as unlabel
     from vinesim.scene.model import Model as Model
     from vinesim.scene.physics_parameters import PhysicsParameters as PhysicsParameters
     from vinesim.scene.spec import Scene as Scene
@@ -66,7 +65,6 @@ _MODULES = {
     "generate": "scene.generation.vineyard",
     "load_scene": "scene.spec",
     "look_at": "api.sensors",
-    "unlabel": "scene.ids",
 }
 """Module of each public name, below this package."""
 
@@ -95,7 +93,6 @@ __all__ = [
     "generate",
     "load_scene",
     "look_at",
-    "unlabel",
 ]
 
 

@@ -210,5 +210,5 @@ def test_a_recording_of_a_replay_is_the_recording(tape, tmp_path):
         return [e.payload[14:] for e in recorded.messages if e.key == "c/0/0/ada"]
 
     assert bodies(again) == bodies(tape)
-    assert dataclasses.replace(again, entries=[]).metadata["digest"] == vineyard().digest()
+    assert dataclasses.replace(again, messages=[]).metadata["digest"] == vineyard().digest()
     assert isinstance(again.path, pathlib.Path)

@@ -179,7 +179,7 @@ def test_no_stiffness_blows_up(gate: RobotDescription, stiffness: float) -> None
     stand.push("leaf", np.zeros(3))
     swing = np.abs(stand.run(10.0)[:, 0])
     bound = 60.0 * 0.5 / stiffness
-    assert swing[:200].max() < 3.0 * bound
+    assert swing[:200].max() <= 2.0 * bound  # of a load that comes suddenly and goes at the worst moment
     assert swing[-200:].max() <= swing[:200].max() * 1.001
 
 
@@ -196,8 +196,8 @@ def test_against_a_pole_it_presses_as_its_stiffness_says(gate: RobotDescription,
         angle = stand.run(DT)[-1, 0]
         moments.append(stand.rigid.joint_measurements("anna")[3][0])
     touching = np.arctan2(0.3, 0.9) - np.arcsin(0.08 / np.hypot(0.3, 0.9))
-    assert angle == pytest.approx(touching, abs=0.005)
-    assert -moments[-1] == pytest.approx(stiffness * (0.6 - angle), rel=0.005)
+    assert angle == pytest.approx(touching, abs=5e-4)
+    assert -moments[-1] == pytest.approx(stiffness * (0.6 - angle), rel=1e-5)
     assert np.ptp(moments) < 1e-3 * abs(moments[-1])
 
 
@@ -213,7 +213,7 @@ def test_a_whole_arm_gives_way_by_f_over_k(vinebot: RobotDescription) -> None:
     end = stand.run(8.0)[-1, joints]
     moment = (stand.lever("arm_left_7_link").T @ force)[joints]
     assert np.abs(end - start).max() > 0.03
-    np.testing.assert_allclose(stiffness * (end - start), moment, rtol=0.02, atol=0.005)
+    np.testing.assert_allclose(stiffness * (end - start), moment, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(("joint", "stiffness", "zeta"), [(0, 80.0, 0.08), (3, 30.0, 0.15), (5, 40.0, 0.25)])
@@ -295,11 +295,11 @@ def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: RobotD
     pushed = stand.lever("arm_left_7_link").T @ force
     load = np.array([weight_beyond(stand, name) for name in ARM]) - pushed[joints]
     assert np.abs(load).max() > 10.0
-    np.testing.assert_allclose(elements.torque[joints], load, rtol=0.02, atol=0.02)
+    np.testing.assert_allclose(elements.torque[joints], load, rtol=1e-5, atol=1e-5)
     position = stand.rigid.joint_measurements("anna")[0][joints]
     springs = np.array([d.series_stiffness or d.stiffness for d in vinebot.drives])[joints]
-    np.testing.assert_allclose(springs * (motor - position), load, rtol=0.02, atol=0.02)
-    np.testing.assert_allclose(elements.motor[joints], motor, atol=1e-4)
+    np.testing.assert_allclose(springs * (motor - position), load, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(elements.motor[joints], motor, atol=1e-7)
     np.testing.assert_array_equal(elements.torque, elements.stiffness * elements.deflection)
     assert elements.names == vinebot.joints
 
@@ -309,13 +309,13 @@ def test_motor_command_is_followed_by_the_link(gate: RobotDescription) -> None:
     stand.robot.command_motor_position([0.4])
     stand.run(12.0)
     elements = stand.robot.sample(stand.time).elements
-    assert stand.rigid.joint_measurements("anna")[0][0] == pytest.approx(0.4, abs=1e-3)
-    assert elements.motor[0] == pytest.approx(0.4, abs=1e-3)
+    assert stand.rigid.joint_measurements("anna")[0][0] == pytest.approx(0.4, abs=1e-5)
+    assert elements.motor[0] == pytest.approx(0.4, abs=1e-5)
     stand.push("leaf", np.array([0.0, 20.0, 0.0]))  # turned away by 0.4 rad: its lever is 0.5 cos
     stand.run(12.0)
     elements, angle = stand.robot.sample(stand.time).elements, stand.rigid.joint_measurements("anna")[0][0]
-    assert elements.torque[0] == pytest.approx(-20.0 * 0.5 * np.cos(angle), rel=0.02)
-    assert angle - 0.4 == pytest.approx(20.0 * 0.5 * np.cos(angle) / 150.0, rel=0.02)
+    assert elements.torque[0] == pytest.approx(-20.0 * 0.5 * np.cos(angle), rel=1e-5)
+    assert angle - 0.4 == pytest.approx(20.0 * 0.5 * np.cos(angle) / 150.0, rel=1e-5)
 
 
 # ---------------------------------------------------------------------- F15, F17: effort and stiffness under a push
@@ -330,23 +330,24 @@ def test_effort_is_weight_less_j_transposed_f(vinebot: RobotDescription) -> None
     moment = stand.lever("arm_left_7_link").T @ force
     for name in ("torso_lift_joint", *ARM):
         i = stand.robot.joint_indices([name])[0]
-        assert effort[i] == pytest.approx(weight_beyond(stand, name) - moment[i], rel=0.02, abs=0.02), name
+        assert effort[i] == pytest.approx(weight_beyond(stand, name) - moment[i], rel=1e-5, abs=1e-5), name
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, -1)])
 def test_pose_is_held_against_50_newtons(vinebot: RobotDescription, direction: tuple[int, int, int]) -> None:
-    """F17: no further than the servos' stiffness says, J K^-1 J^T F to first order, and back after it."""
-    stand = Stand(vinebot)
-    start = stand.run(0.2)[-1]
+    """F17: at rest every servo's stiffness times its deflection is J^T F, that of the base included; and back after it."""
+    stand, link = Stand(vinebot), "arm_left_7_link"
+    start, base = stand.run(0.2)[-1], stand.rigid.base_state("anna")[0]
+    place = stand.robot.frame_pose(link)[:3]
     force = 50.0 * np.array(direction, float)
-    place = stand.robot.frame_pose("arm_left_7_link")[:3]
-    J = stand.lever("arm_left_7_link")
+    stand.push(link, force)
+    end = stand.run(2.0)[-1]
     stiffness = np.array([d.stiffness for d in vinebot.drives])
-    bound = np.linalg.norm(J @ ((J.T @ force) / stiffness)) + 0.004  # the tracks give, too
-    stand.push("arm_left_7_link", force)
-    stand.run(2.0)
-    moved = np.linalg.norm(stand.robot.frame_pose("arm_left_7_link")[:3] - place)
-    assert 1e-4 < moved < 1.3 * bound < 0.03
-    stand.push("arm_left_7_link", np.zeros(3))
+    np.testing.assert_allclose(stiffness * (end - start), stand.lever(link).T @ force, rtol=1e-6, atol=1e-6)
+    base_stiffness = vinebot.base_limits.effort[0] / stand.rigid.parameters.base_slip
+    offset = stand.rigid.base_state("anna")[0][:2] - base[:2]
+    np.testing.assert_allclose(base_stiffness * offset, force[:2], rtol=1e-6, atol=1e-6)
+    assert 1e-4 < np.linalg.norm(stand.robot.frame_pose(link)[:3] - place) < 3e-3
+    stand.push(link, np.zeros(3))
     back = stand.run(2.0)[-1]
-    np.testing.assert_allclose(back, start, atol=1e-4)
+    np.testing.assert_allclose(back, start, atol=1e-9)

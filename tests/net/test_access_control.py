@@ -157,7 +157,7 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
     with bus("ada", server, certs) as ada, bus("bob", server, certs) as bob, bus("guest", server, certs) as guest:
         for each in (ada, bob, guest):
             each.join(hello(each.name))
-        assert server._agreement.plan("vineyard") == SceneId("vsp", "D1")
+        assert server._admission.scene_of("vineyard") == SceneId("vsp", "D1")
         wait(
             lambda: all(each.alive() == {"ada", "bob", "guest"} for each in (ada, bob, guest)), "all to see each other"
         )
@@ -183,7 +183,7 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
         says = ada.publisher("fact/0/0/ada", reliable=True)
         wait(lambda: says.matching, "the server's ear")
         says.put(messages.encode_records([fact]))
-        wait(lambda: server.archive.count() == 1, "the fact to be kept")
+        wait(lambda: server.store.count() == 1, "the fact to be kept")
         ada.declare_queryable("hello/ada", lambda _: hello("ada"))
         guest.declare_queryable("hello/guest", lambda _: hello("guest"))
         answers: dict = {}

@@ -14,7 +14,7 @@ from vinesim.net.server.admission import PROVISIONAL_TIMEOUT, AdmissionControl, 
 
 def ask(agreement, name, digest="D1", *, world="w", session="", scene="vsp", now=0.0):
     session = session or name
-    agreement.came(world, name, session)
+    agreement.on_join(world, name, session)
     hello = messages.encode_hello(Hello(name, scene=scene, digest=digest))
     return agreement.answer(world, name, session, hello, now)
 

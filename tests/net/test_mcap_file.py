@@ -22,7 +22,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.human import WrenchMessage, encode_human, encode_wrenches
 from vinesim.net.recording import mcap_file
 from vinesim.net.recording.mcap_file import InvalidRecording, RecordingStopped, RecordingWriter, free_path, read
-from vinesim.physics.rigid.human_body import standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 

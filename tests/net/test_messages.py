@@ -285,7 +285,7 @@ def test_damaged_messages_raise_nothing_else(data):
         one_message(trees(rng, [3, 4])),
         one_message(cut(trees(rng, [3, 4]), [1, 2], rng)),
         messages.encode_objects(things(rng, 3), (0, 0))[0][0],
-        messages.encode_records([fact(), fact(thing=3)]),
+        messages.encode_records([fact(), fact(object=3)]),
         messages.encode_hello(Hello("a", urdf="<robot/>")),
         messages.encode_claims([(1, Claim(1, 2, "a"), True)]),
         messages.encode_time(1.0, 2.0),
@@ -320,7 +320,7 @@ def test_things_come_back_within_quantisation(seed, count, where, speed):
 @pytest.mark.parametrize("number", [5, 3 * ids.OBJECT_STRIDE])
 def test_a_thing_that_is_none_is_refused(number):
     batch = things(np.random.default_rng(0), 1)
-    (payload,), _ = messages.encode_objects(dataclasses.replace(batch, thing=np.array([number])), (0, 0))
+    (payload,), _ = messages.encode_objects(dataclasses.replace(batch, object=np.array([number])), (0, 0))
     with pytest.raises(MessageError, match="of no kind"):
         messages.decode_objects(payload, (0, 0))
     with pytest.raises(MessageError, match="bunch 17, this vineyard has 17"):
@@ -345,14 +345,14 @@ def test_trees_come_back_with_what_was_cut_off_them(seed, shapes):
 
 
 def fact(**change) -> messages.RetainedRecord:
-    usual = {"thing": ids.object_id(ids.ObjectKind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
+    usual = {"object": ids.object_id(ids.ObjectKind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
     return messages.RetainedRecord(
         **{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change}
     )
 
 
 def test_facts_come_back_as_they_were_said():
-    told = [fact(), fact(thing=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
+    told = [fact(), fact(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
     heard = messages.decode_records(messages.encode_records(told))
     assert heard == told
     assert heard[0].claim == Claim(3, 65535, "picker")
@@ -363,8 +363,8 @@ def test_facts_come_back_as_they_were_said():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"thing": 3 * ids.OBJECT_STRIDE}, "of no kind"),
-        ({"thing": -1}, "of no kind"),
+        ({"object": 3 * ids.OBJECT_STRIDE}, "of no kind"),
+        ({"object": -1}, "of no kind"),
         ({"authority": 65536}, "with claim"),
         ({"author": "a/b"}, "fact by 'a/b'"),
         ({"pose": (np.nan, 0, 0, 0, 0, 0, 1.0)}, "not finite"),

@@ -27,7 +27,7 @@ def fact(index=0, ownership=1, author="ada", cut=()):
 
 
 def hear(kept, fact, cell=(0, 0), world="w"):
-    kept.hear(f"{world}/fact/{cell[0]}/{cell[1]}/{fact.author}", messages.encode_records([fact]))
+    kept.submit(f"{world}/fact/{cell[0]}/{cell[1]}/{fact.author}", messages.encode_records([fact]))
 
 
 def told(kept, world="w"):

@@ -17,7 +17,7 @@ def fact(box: int, x: float = 0.0, author: str = "ada", authority: int = 1) -> R
 
 
 def heard(bus) -> list[tuple[str, int]]:
-    return [(key, len(messages.decode_records(payload))) for key, payload in bus.drain()]
+    return [(key, len(messages.decode_records(payload))) for key, payload in bus.poll()]
 
 
 def speak(hub: MemoryHub, telling: RetainedSync, ticks: int = 3) -> None:

@@ -394,7 +394,7 @@ def meet(one, other):
         def arrived(pose=pose, receiver=receiver, heard=heard):
             pose.put(b"pose")
             time.sleep(0.002)
-            heard.update(receiver.drain())
+            heard.update(receiver.poll())
             return len(heard) == 2
 
         wait(arrived, "a pose and an event")

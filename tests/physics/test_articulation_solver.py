@@ -10,7 +10,7 @@ import warp as wp
 
 from tests.support.clustered_trees import clustered, momenta, moving
 from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ONSET, ArticulationSolver
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers, DeviceUnavailable
 from vinesim.physics.plants.fault_guard import FaultGuard
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -156,12 +156,12 @@ def test_phi_is_one_after_a_touch_begins_and_when_brisk(plants: ArticulationSolv
     step(plants)
     assert used[:2].tolist() == pytest.approx([0.55, 0.55])
     seen = []
-    for _ in range(ONSET + 3):  # a lasting touch begins
+    for _ in range(6):  # a lasting touch begins
         plants.predict()
         seen.append(float(used[0]))
         plants.integrate(np.array([2]), np.array([[0.0, 0.0, 0.01, 0.0, 0.0, 0.0]]))
         assert used[1] == pytest.approx(0.55)
-    assert seen == pytest.approx([0.55] + [1.0] * ONSET + [0.55] * 2)
+    assert seen == pytest.approx([0.55] + [1.0] * 3 + [0.55] * 2)
     plants.state.joint_qd[6, 0] = 6.0
     plants.predict()
     assert used[1] == 1.0
@@ -589,8 +589,8 @@ def eventful(**options: object) -> tuple[list[bytes], np.ndarray]:
 
 
 def test_threads_and_copies_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinesim.physics.plants.articulation_solver.MIN_TREES_PER_THREAD", 0)
-    monkeypatch.setattr("vinesim.physics.plants.articulation_solver.MIN_INTEGRATED_TREES_PER_THREAD", 0)
+    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_TREES_PER_THREAD", 0)
+    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_INTEGRATED_TREES_PER_THREAD", 0)
     alone, response = eventful()
     copies = [{"buffers": DeviceBuffers("cpu", interleave=lanes)} for lanes in (1, 3)]
     for options in ({"threads": 2}, {"threads": 3}, *copies):
@@ -624,7 +624,7 @@ def test_shares_hold_like_numbers_of_bodies() -> None:
     plants = ArticulationSolver(model, State.at_rest(model), threads=3)
     plants.wake(np.arange(1, 40))
     plants.predict()
-    ends, trees = plants._share_ends, np.arange(1, 40)
+    ends, trees = plants._runner.partition_ends, np.arange(1, 40)
     assert (ends[0], ends[-1]) == (0, 39)
     shares = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(ends)]
     assert max(shares) - min(shares) <= 2 * model.tree_size.max()

@@ -149,7 +149,7 @@ def test_a_robot_that_joins_does_not_shake_a_grasp():
                 physics.remove_robot("bar")
             physics.step()
         runs.append(physics.snapshot().body_q[body])
-    np.testing.assert_allclose(runs[0], runs[1], atol=1e-6)
+    np.testing.assert_array_equal(runs[0], runs[1])
 
 
 def test_islands_do_not_feel_each_other():
@@ -168,7 +168,7 @@ def test_islands_do_not_feel_each_other():
             islands = max(islands, physics.contact_solver.impulses.island_count)
         assert islands == len(which)
         ends.append(physics.state.joint_q.copy())
-    np.testing.assert_allclose(ends[0], np.concatenate(ends[1:]), atol=1e-5)
+    np.testing.assert_array_equal(ends[0], np.concatenate(ends[1:]))
 
 
 def test_contacts_come_sorted_and_name_who_touches_what():
@@ -388,7 +388,7 @@ def scene_by_chance(seed: int) -> tuple[Physics, list[str]]:
     return physics, ["bar", "probe"]
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 2**31))
 def test_no_contact_pulls_nor_rubs_more_than_it_may_and_action_is_reaction(seed):
     physics, robots = scene_by_chance(seed)

@@ -40,7 +40,7 @@ def test_rows_of_listed_trees_go_over_and_come_back(memory: DeviceBuffers) -> No
     memory.add_body_rows("number", numbers, wp.int32)
     there = memory.arrays["place"].numpy()[memory.slots]
     np.testing.assert_array_equal(there, places)
-    go, come = (memory.row_copier(("place", "number"), "trees", back=back) for back in (False, True))
+    go, come = (memory.row_copier(("place", "number"), "trees", to_host=back) for back in (False, True))
     before = places.copy()
     places += 100.0
     numbers += 100
@@ -59,7 +59,7 @@ def test_rows_of_listed_trees_go_over_and_come_back(memory: DeviceBuffers) -> No
 
 def test_rows_that_name_bodies_are_translated(memory: DeviceBuffers) -> None:
     parent = np.array([-1, 0, -1, -1, 3, 3, -1, 6], np.int32)
-    memory.add_body_rows("parent", parent, wp.int32, points=True)
+    memory.add_body_rows("parent", parent, wp.int32, body_indices=True)
     there = memory.arrays["parent"].numpy()[memory.slots]
     np.testing.assert_array_equal(there, np.where(parent >= 0, memory.slots[parent], -1))
     parent[4] = -1

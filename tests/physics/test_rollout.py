@@ -33,7 +33,7 @@ def test_a_rollout_is_what_plants_do(fine: bool) -> None:
     if fine:
         plants.refine(np.arange(2))
     else:
-        rates[plants._clusters_of(np.arange(2))] = 0.0
+        rates[plants._clusters.clusters_of(np.arange(2))] = 0.0
     plants.state.joint_qd[:] = rates
     plants.body_load[:] = load
     rollout = Rollout(model, 17, checkpoint=7, fine=fine)
@@ -46,7 +46,9 @@ def test_a_rollout_is_what_plants_do(fine: bool) -> None:
         plants.integrate()
     plants.forward_kinematics()
     np.testing.assert_array_equal(track.body_q[-1], plants.state.body_q[rollout.watched])
-    assert len(rollout.watched) == (len(rates) if fine else len(rates) - len(plants._clusters_of(np.arange(2))))
+    assert len(rollout.watched) == (
+        len(rates) if fine else len(rates) - len(plants._clusters.clusters_of(np.arange(2)))
+    )
 
 
 def test_gradients_do_not_depend_on_checkpoints_or_history() -> None:

@@ -11,12 +11,14 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.kernels.shading import materials
-from vinesim.physics.rigid.human_body import BODY_PARTS, body_shapes, hand_shapes, standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.physics.rigid.human_shapes import BODY_PARTS, body_shapes, hand_shapes
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import CRATE_WALL
 from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance
 from vinesim.scene.appearance import AppearanceError
+from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import HumanSpec, Mesh, RigidVisual, Shape
 from vinesim.sensors.camera.camera import Camera
@@ -168,7 +170,7 @@ def test_every_surface_has_its_material() -> None:
     ],
 )
 def test_what_is_wrong_with_a_figure_is_said_in_one_line(tmp_path, line: str, words: str) -> None:
-    text = (appearance.find_data_file("figures", "worker", ".toml")).read_text()
+    text = find_data_file("figures", "worker", ".toml").read_text()
     file = tmp_path / "odd.toml"
     file.write_text(text[: text.index("[parts]")] + f"[parts]\n{line}\n")
     with pytest.raises(AppearanceError, match=words) as said:

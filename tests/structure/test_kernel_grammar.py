@@ -27,7 +27,7 @@ def fade(
 '''
 
 
-TO_DO = {"contact", "articulation"}
+TO_DO = {"contact"}
 """Folders of kernels whose docstrings and arguments are still to be brought to the grammar; empties, never grows."""
 
 

@@ -1,4 +1,4 @@
-"""What lies on the ground, weighed."""
+"""Weights of objects, from the contact forces under them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Canes, a bunch, a gripper and a bar: built for our physics, and for the peer that has all in MuJoCo."""
+"""Canes, a bunch, a gripper and a bar, for the physics and for its MuJoCo reference."""
 
 from __future__ import annotations
 
@@ -127,9 +127,9 @@ def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:
 
 
 def grasp(t: float) -> tuple[np.ndarray, float]:
-    """What the gripper is asked at time t: targets of its drives, and an extra pull on the hand [N].
+    """Commands of a grasp at time t [s]: set-points of the gripper's drives, and an extra force on the hand [N].
 
-    Close, lift 10 cm, move 20 cm aside, be pulled down, let go.
+    Close, lift 10 cm, move 20 cm aside, be pulled down, release.
     """
 
     def ramp(a: float, b: float) -> float:

@@ -16,7 +16,8 @@ from vinesim.robot.drives.robot import Robot
 from vinesim.scene.values import CameraFrame, CameraInfo, LidarScan
 from vinesim.sensors.camera import camera as rgbd
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
-from vinesim.sensors.export import dataset, images
+from vinesim.sensors.export import images
+from vinesim.sensors.export.dataset import resized_intrinsics
 from vinesim.sensors.lidar import lidar
 
 
@@ -42,7 +43,7 @@ class Camera:
             seed: see ``name``.
         """
         self.spec = rgbd.CameraSpec.load(kind)
-        self.info: CameraInfo = dataset.sized(self.spec, size)
+        self.info: CameraInfo = resized_intrinsics(self.spec, size)
         """Intrinsics."""
         self._name, self._quality, self._seed = name, quality, seed
         self._camera: rgbd.Camera | None = None

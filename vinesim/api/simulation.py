@@ -103,6 +103,8 @@ class Simulation:
             self._detachments += self.physics.detachments
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
+        if self._loads:  # a tree that fell asleep under its load moves again
+            self.physics.wake(np.unique(self.model.body_tree[list(self._loads)]))
         self._loads.clear()
 
     @property

@@ -1,6 +1,7 @@
-"""Touched plants beside MuJoCo C: the same canes, hands and bar, contacts on for both, in one process, taking turns.
+"""Time of contacts beside MuJoCo: the same canes, grippers and bar in both, in one process, in turns.
 
-And the whole tick of a vineyard, one robot or ten, twenty trees awake, ten thousand bunches: whose time it takes.
+And the time of a whole step of a vineyard with one robot and with ten, twenty trees awake and ten thousand bunches, by
+stages.
 """
 
 from __future__ import annotations
@@ -25,29 +26,34 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement, RobotSpec
 
 CANE_COUNTS = (64, 256)
+STEPS_PER_ROUND = (20, 5)
+"""Steps between two turns, for each of the numbers of canes."""
 LIFTED_CANES = 12
 HELD_CANES = (14, 20, 26, 32)
+"""Numbers of the canes whose bunch a gripper holds."""
+SETTLE_STEPS = 150
+"""Steps before the measurement: the grippers close, bar and grippers lift."""
 SCENE = "tendone"
 ROBOT_COUNTS = (1, 10)
 ROBOT_POSITION = (15.5, 17.2)
-"""Of the robot in the block: its arms reach into the row behind it [m]."""
+"""[m] x, y of the first robot in the block: its arms reach into the row behind it."""
 AWAKE_TREES = 20
 MEASURED_STEPS, WARM_UP_STEPS = 1000, 100
 
 
 def contact_measurements() -> Iterator[Measurement]:
-    """Canes with their bunches, all awake: a bar lifts twelve, four hands hold a bunch each."""
+    """Canes with their bunches, all awake: a bar lifts twelve, four grippers hold a bunch each."""
     robots = [
         scenes.bar("bar", 0, LIFTED_CANES),
         *(scenes.gripper(f"hand{i}", scenes.bunch_center(i)) for i in HELD_CANES),
     ]
-    for canes, ticks in zip(CANE_COUNTS, (20, 5), strict=True):
+    for canes, steps in zip(CANE_COUNTS, STEPS_PER_ROUND, strict=True):
         case = f"{canes} canes and bunches, {LIFTED_CANES} lifted, {len(HELD_CANES)} held"
-        yield from _compare_with_mujoco(case, "contact", scenes.cane_row(canes), robots, ticks)
+        yield from _compare_with_mujoco(case, "contact", scenes.cane_row(canes), robots, steps)
 
 
 def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
-    """One hand and the vine it holds, beside the peer; then the shipped block with one ``robot`` and with ten.
+    """One gripper and the vine it holds, beside MuJoCo; then the shipped block with one ``robot`` and with ten.
 
     The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
     on the headland. All swing their joints.
@@ -62,14 +68,11 @@ def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurem
 
 
 def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> Iterator[Measurement]:
-    """Tick by tick, and stage by stage, each with its own clock."""
+    """Times of single steps and of their stages, by the code that they belong to."""
     physics = Physics(model)
     for i in range(count):
-        pose = (
-            frames.pose([*ROBOT_POSITION, 0.0], frames.from_yaw(0.5 * np.pi))
-            if i == 0
-            else frames.pose([4.0 * i, -6.0, 0.0])
-        )
+        position = [4.0 * i, -6.0, 0.0] if i else [*ROBOT_POSITION, 0.0]
+        pose = frames.pose(np.array(position), frames.from_yaw(0.0 if i else 0.5 * np.pi))
         home = robot.home if i else raised
         physics.add_robot(dataclasses.replace(robot, name=f"robot_{i}", index=i, pose=pose, home=home))
         physics.rigid.command_base(f"robot_{i}", (0.3, 0.0, 0.3) if i else (0.0, 0.0, 0.0))
@@ -91,22 +94,23 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
             seconds[i, :-1], seconds[i, -1] = np.diff(marks), marks[-1] - marks[0]
             contacts += len(physics.contacts)
     milliseconds = 1e3 * seconds
-    whose = np.array([_share_of(name) for name, _ in physics.stages])
+    owner = np.array([_stage_owner(name) for name, _ in physics.stages])
     awake, bunches = len(physics.plants.awake), len(model.bunch_body)
     case = f"{count} robot{'s' * (count > 1)}, {awake} trees awake, {bunches} bunches, {contacts / MEASURED_STEPS:.0f} contacts"
     for share, text in (("", "tick"), ("MuJoCo", "MuJoCo's share"), ("ours", "ours"), ("rest", "the rest")):
-        of = milliseconds[:, :-1][:, whose == share].sum(1) if share else milliseconds[:, -1]
+        of = milliseconds[:, :-1][:, owner == share].sum(1) if share else milliseconds[:, -1]
         for name, percent in (("p50", 50), ("p99", 99)):
             yield Measurement("tick", f"{case}: {text}, {name}", float(np.percentile(of, percent)), "ms/tick")
 
 
-def _share_of(stage: str) -> str:
-    """Rigid stages call MuJoCo and do little else; plants, wind and contacts are ours; the rest hands over."""
-    room = stage.split(":")[0]
-    return {"rigid": "MuJoCo", "plants": "ours", "contacts": "ours", "wind": "ours"}.get(room, "rest")
+def _stage_owner(stage: str) -> str:
+    """``MuJoCo`` for stages that do little but call it, ``ours`` for plants, wind and contacts, ``rest`` for others."""
+    part = stage.split(":")[0]
+    return {"rigid": "MuJoCo", "plants": "ours", "contacts": "ours", "wind": "ours"}.get(part, "rest")
 
 
 def _swing_joints(physics: Physics, robot: RobotSpec, raised: np.ndarray, tick: int) -> None:
+    """Command all joints of all robots to swing by 0.05 rad."""
     for i, name in enumerate(physics.rigid.robots):
         wave = 0.05 * np.sin(0.05 * tick + i)
         physics.rigid.command(name, (robot.home if i else raised) + wave)
@@ -114,7 +118,7 @@ def _swing_joints(physics: Physics, robot: RobotSpec, raised: np.ndarray, tick: 
 
 @contextlib.contextmanager
 def _one_core() -> Iterator[None]:
-    """Keep this process on one core, where the system lets it."""
+    """Keep this process on one core, where the system permits it."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -126,8 +130,11 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _compare_with_mujoco(case: str, bench: str, model, robots: list[RobotSpec], ticks: int) -> Iterator[Measurement]:
-    theirs = MujocoScene(model, robots)
+def _compare_with_mujoco(
+    case: str, bench: str, model: Model, robots: list[RobotSpec], steps: int
+) -> Iterator[Measurement]:
+    """Step the same scene here (with one thread and two) and in MuJoCo, in turns of ``steps``."""
+    reference = MujocoScene(model, robots)
     ours = [Physics(model)]
     if len(model.tree_first) > 1:
         ours.append(Physics(model, threads=2))
@@ -135,26 +142,26 @@ def _compare_with_mujoco(case: str, bench: str, model, robots: list[RobotSpec], 
         for robot in robots:
             physics.add_robot(robot)
         scenes.keep_awake(physics, np.arange(len(model.tree_first)))
-    for world in (*ours, theirs):
-        for i in range(150):  # grasp, and lift
+    for world in (*ours, reference):
+        for i in range(SETTLE_STEPS):
             _command(world.rigid, robots, i)
             world.step()
-    clock = [150] * (len(ours) + 1)
-    met = np.zeros((len(clock), 2))
+    tick = [SETTLE_STEPS] * (len(ours) + 1)
+    contacts = np.zeros((len(tick), 2))  # samples, sum
 
-    def steps(which: int) -> None:
-        world = (*ours, theirs)[which]
-        for _ in range(ticks):
-            _command(world.rigid, robots, clock[which])
+    def run(which: int) -> None:
+        world = (*ours, reference)[which]
+        for _ in range(steps):
+            _command(world.rigid, robots, tick[which])
             world.step()
-            clock[which] += 1
-        met[which] += 1, (world.plant_contact_count() if isinstance(world, MujocoScene) else len(world.contacts))
+            tick[which] += 1
+        contacts[which] += 1, (world.plant_contact_count() if isinstance(world, MujocoScene) else len(world.contacts))
 
-    seconds = scenes.interleaved_medians(*(lambda i=i: steps(i) for i in range(len(clock))))
-    counts = met[:, 1] / met[:, 0]
-    peer = 1e3 * seconds[-1] / ticks
+    seconds = scenes.interleaved_medians(*(lambda i=i: run(i) for i in range(len(tick))))
+    counts = contacts[:, 1] / contacts[:, 0]
+    peer = 1e3 * seconds[-1] / steps
     for i, threads in enumerate(("one thread", "two threads")[: len(ours)]):
-        value = 1e3 * seconds[i] / ticks
+        value = 1e3 * seconds[i] / steps
         text = f"{case}; {counts[i]:.0f} contacts, peer {counts[-1]:.0f}; {threads}"
         yield Measurement(
             bench, text, value, "ms/tick", f"MuJoCo {mujoco.mj_versionString()} discrete", peer, peer / value
@@ -162,7 +169,7 @@ def _compare_with_mujoco(case: str, bench: str, model, robots: list[RobotSpec], 
 
 
 def _command(rigid: RigidWorld, robots: list[RobotSpec], tick: int) -> None:
-    """The bar, 4 cm above its start, and the hands, closed and lifted by 2 cm, go up and down by a centimetre."""
+    """Move the bar 4 cm up and the closed grippers 2 cm, then all up and down by a centimetre."""
     wave = 0.01 * np.sin(0.06 * tick)
     for robot in robots:
         if len(robot.drives) == 1:

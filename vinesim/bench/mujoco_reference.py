@@ -1,4 +1,4 @@
-"""The same plants, or the whole scene, in MuJoCo: the peer that tests and benchmarks hold our solver against.
+"""The same plants, or the whole scene, in MuJoCo: the reference of tests and benchmarks.
 
 MuJoCo's ball joint has one stiffness for all axes, so each joint takes its first bending stiffness; for an exact
 comparison build trees whose springs are isotropic.
@@ -14,7 +14,7 @@ from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, build_static_world
+from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, build_static_world, contact_friction
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -24,7 +24,8 @@ from vinesim.scene.values import RobotSpec
 def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None = None) -> mujoco.MjModel:
     """All trees of ``model`` as ball-joint chains under ``integrator="discrete"``, contacts off.
 
-    ``damping`` [body] N m s/rad replaces the model's: our solver takes off what its scheme adds, MuJoCo does not.
+    ``damping`` [body] N m s/rad replaces the model's: our solver subtracts the damping that its scheme adds, MuJoCo does
+    not.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = dt
@@ -59,11 +60,12 @@ def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[
 class MujocoScene:
     """A scene of plants and robots wholly in MuJoCo: one world, ball joints, a capsule or spheres for every body.
 
-    Robots meet plants; plants do not meet each other (they may in ours: that is work the peer is spared). ``rigid``
-    takes commands as ever. The scheme of ``discrete`` adds dt K of damping, which is taken off, down to nothing.
+    Robots touch plants; plants do not touch each other (in ours they may, so MuJoCo has less to compute). Commands are
+    given to ``rigid``, as to that of a :class:`vinesim.physics.step.Physics`. The scheme of ``discrete`` adds dt K of
+    damping, which is subtracted from the model's, down to zero.
 
-    ``contact_time_constant`` [s] is the time constant of every contact; the default of MuJoCo, 0.02, is soft: at 3 m/s it lets things
-    overlap by centimetres.
+    ``contact_time_constant`` [s] of every contact (solref); the default of MuJoCo, 0.02, is soft: at 3 m/s bodies overlap
+    by centimetres.
     """
 
     def __init__(
@@ -76,7 +78,7 @@ class MujocoScene:
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         for bit, robot in enumerate(robots, FIRST_ACTOR):
-            RobotBody(robot, bit).attach(spec)
+            RobotBody(robot, bit, mine.parameters).add_to(spec)
         made = _add_plants(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
         shapes = plant_capsules(model)
         for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
@@ -85,7 +87,7 @@ class MujocoScene:
                 kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
             made[body].add_geom(
                 type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
-                friction=ROUGH, solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
+                friction=contact_friction(mine.parameters.friction), solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
             )  # fmt: skip
         world = spec.compile()
         if contact_time_constant is not None:

@@ -1,4 +1,4 @@
-"""Plants beside MuJoCo C on the same scene, in the same process, taking turns: medians of interleaved runs.
+"""Time of plants without contacts beside MuJoCo on the same scene, in one process, in turns: medians.
 
 The scene: canes of 16 bodies (1 m, 8 mm, 5 GPa, 800 kg/m^3), each with a bunch of 0.5 kg on its tip.
 """
@@ -41,7 +41,7 @@ def cane_scene(count: int) -> Model:
 
 
 def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
-    """Plants with their first trees awake and every kernel warm."""
+    """A solver with its first trees awake and every kernel loaded."""
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(awake))
     run_steps(plants, 5)
@@ -49,14 +49,14 @@ def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
 
 
 def run_steps(plants: ArticulationSolver, count: int) -> None:
-    """Whole ticks without contacts."""
+    """Whole steps without contacts."""
     for _ in range(count):
         plants.predict()
         plants.integrate()
 
 
 def plant_measurements() -> Iterator[Measurement]:
-    """64 canes awake, touched by nobody, on one thread and on two."""
+    """64 canes awake, without contacts, on one thread and on two."""
     ticks = 40
     model = cane_scene(CANE_COUNT)
     whole = warmed_up_solver(model, CANE_COUNT)

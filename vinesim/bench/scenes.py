@@ -1,4 +1,4 @@
-"""What the benches of physics step: rows of canes with bunches, hands that hold some, a bar that lifts others.
+"""Scenes of the physics benches: rows of canes with bunches, grippers that hold some, a bar that lifts others.
 
 A cane is a metre of wood, 12 mm thick (5 GPa, 800 kg/m^3) in 16 bodies, level at rest, and on its tip hangs a bunch of
 0.5 kg on a peduncle of 8 cm in two bodies.
@@ -19,10 +19,11 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import Drive, RobotSpec
 
 SPACING = 0.15
-"""Between canes [m]."""
+"""[m] Between canes."""
 HEIGHT = 2.0
+"""[m] Of the canes above ground."""
 BUNCH_CENTER = 0.085
-"""From the bunch's stalk to its middle [m]."""
+"""[m] From the bunch's stalk to its middle."""
 
 
 def cane_with_bunch(side: float) -> TreeBuilder:
@@ -43,7 +44,7 @@ def cane_with_bunch(side: float) -> TreeBuilder:
 
 
 def cane_row(count: int) -> Model:
-    """Canes side by side, the first at y = 0. Copies of one: ten thousand grow in seconds."""
+    """Canes side by side, the first at y = 0. All are copies of one, so ten thousand are built in seconds."""
     one = cane_with_bunch(0.0)
     trees = []
     for i in range(count):
@@ -54,7 +55,7 @@ def cane_row(count: int) -> Model:
 
 
 def bunch_center(cane: int) -> np.ndarray:
-    """Middle of a resting bunch [3] m."""
+    """Centre [3] m of the bunch of one cane at rest."""
     return np.array([1.0, SPACING * cane, HEIGHT - 0.08 - BUNCH_CENTER])
 
 
@@ -73,7 +74,10 @@ def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0")
 
 
 def gripper(name: str, at: np.ndarray) -> RobotSpec:
-    """Two flat fingers open by 17 cm about a point; drives: lift, and one for each finger (0.05 is a firm grasp)."""
+    """A gripper with two flat fingers, 17 cm apart about the point ``at`` [3] m.
+
+    Drives [m]: lift, and one for each finger (0.05 is a firm grasp).
+    """
     finger = "<collision><geometry><box size='0.02 0.04 0.07'/></geometry></collision>"
     urdf = (
         f'<robot name="hand"><link name="base_footprint">{_inertial(50.0)}</link>'
@@ -92,7 +96,7 @@ def gripper(name: str, at: np.ndarray) -> RobotSpec:
 
 
 def bar(name: str, first: int, count: int) -> RobotSpec:
-    """A bar across so many canes, 3 cm below them and 0.6 m from their clamps; its drive lifts it."""
+    """A bar across ``count`` canes, 3 cm below them and 0.6 m from their clamps; its drive lifts it [m]."""
     length = SPACING * count
     urdf = (
         f'<robot name="bar"><link name="base_footprint">{_inertial(50.0)}</link><link name="bar">{_inertial(6.0)}'
@@ -105,14 +109,14 @@ def bar(name: str, first: int, count: int) -> RobotSpec:
 
 
 def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
-    """Wake some trees and let nothing fall asleep again."""
+    """Wake some trees [k] and let no tree fall asleep again."""
     physics.sleep_monitor.quiet = -1.0
     physics.plants.wake(trees)
     return physics
 
 
 def interleaved_medians(*works: Callable[[], None], rounds: int = 9) -> list[float]:
-    """Median seconds of each work, all taking turns so that the machine's moods hit all alike."""
+    """Median time [s] of each of some works, run in turns, so that changes of the machine's load meet all alike."""
     seconds = np.zeros((rounds, len(works)))
     for row in seconds:
         for i, work in enumerate(works):

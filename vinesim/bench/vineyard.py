@@ -1,4 +1,4 @@
-"""What sleepers cost, and a whole tick of a vineyard of ten thousand bunches: twenty trees awake, one robot."""
+"""Time of sleeping plants, and of a whole step of a vineyard of ten thousand bunches: twenty trees awake, one robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MEASURED_STEPS = 1000
 
 
 def sleeping_measurements(robot: RobotSpec) -> Iterator[Measurement]:
-    """Twenty canes with none, a thousand and ten thousand asleep beside them; then the budget of ``robot``'s client."""
+    """Twenty awake canes beside none, a thousand and ten thousand asleep; then the block of ten thousand bunches."""
     worlds = []
     for sleepers in (0, *SLEEPING_TREES):
         physics = Physics(scenes.cane_row(AWAKE_TREES + sleepers))
@@ -44,7 +44,7 @@ def sleeping_measurements(robot: RobotSpec) -> Iterator[Measurement]:
 
 
 def _measure_tendone(robot: RobotSpec) -> Iterator[Measurement]:
-    """The shipped tendone, one tick at a time: median and 99th percentile on one core."""
+    """The shipped scene ``tendone`` with one ``robot``: median and 99th percentile of a step."""
     model = generate(load_scene("tendone"))
     physics = Physics(model)
     physics.add_robot(robot)

@@ -83,7 +83,7 @@ class ThreadPool:
     """
 
     def __init__(self, size: int) -> None:
-        """``size``: how many work at once, the caller of :meth:`share` included."""
+        """``size``: how many work at once, the caller of :meth:`run` included."""
         self.size = size
         self._work: list[Callable[[], None] | None] = [None] * size
         self._failed: list[BaseException] = []
@@ -93,7 +93,7 @@ class ThreadPool:
             self._start[i].acquire()
             self._done[i].acquire()
             loop = (self._work, self._failed, self._start[i], self._done[i], i)
-            threading.Thread(target=_wait_and_work, args=loop, name=f"crew {i}", daemon=True).start()
+            threading.Thread(target=_wait_and_work, args=loop, name=f"thread pool {i}", daemon=True).start()
 
     def run(self, works: Sequence[Callable[[], None]]) -> None:
         """Do all of ``works`` [at most ``size``] at once and return when all are done."""

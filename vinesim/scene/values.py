@@ -10,7 +10,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.scene.ids import Organ
+from vinesim.scene.ids import LABEL_STRIDE, Organ
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -161,10 +161,10 @@ class HumanSpec:
     """At the start."""
     height: float = 1.75
     """[m] It gives the limbs their lengths."""
-    stiffness: float = 100.0
-    """Force of a touching hand per offset from its controller [N/m] (CANOPIES D6.4, section 3.1.1)."""
-    force: float = 100.0
-    """The most that a hand can do [N]."""
+    stiffness: float | None = None
+    """Force of a hand in contact per offset from its controller [N/m]; None: ``PhysicsParameters.hand_stiffness``."""
+    force: float | None = None
+    """Largest force of a hand [N]; None: ``PhysicsParameters.hand_force``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -366,6 +366,16 @@ class CameraFrame:
     exact_depth: np.ndarray | None = None
     """[height, width] float32 m along z, whatever the sensor can measure: no noise, no gaps; +Inf for the sky."""
 
+    @property
+    def organs(self) -> np.ndarray:
+        """[height, width] :class:`~vinesim.scene.ids.Organ` of each pixel; 0 is nothing."""
+        return self.labels // LABEL_STRIDE
+
+    @property
+    def instances(self) -> np.ndarray:
+        """[height, width] index of the bunch, box, tree or actor of each pixel, counted for each organ from 0."""
+        return self.labels % LABEL_STRIDE
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LidarScan:
@@ -389,6 +399,11 @@ class LidarScan:
     """[point] int32"""
     returned: np.ndarray | None = None
     """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
+
+    @property
+    def organs(self) -> np.ndarray:
+        """[point] :class:`~vinesim.scene.ids.Organ` that each point lies on."""
+        return self.labels // LABEL_STRIDE
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Carrying what belongs to some trees between two memories that keep it in unlike order."""
+"""Copies of the rows of some trees between two memories that order them differently."""
 
 import warp as wp
 
@@ -22,7 +22,11 @@ def copy_rows(
     # out
     addresses_out: wp.array(dtype=wp.uint64),
 ):
-    """Copy one word of four bytes: of one listed tree (``threads`` each), of one array (from its ``starts`` on)."""
+    """One thread copies one word of four bytes: of one listed tree (``threads`` each), of one array.
+
+    starts, widths: [array] first thread of an array within a tree, and words of one row. addresses, addresses_out:
+    [array] pointers of source and target, of rows ``pitch`` and ``pitch_there`` apart.
+    """
     slot = wp.tid() / threads
     thread = wp.tid() - slot * threads
     tree = trees[slot]

@@ -1,19 +1,20 @@
-"""Rigid shapes as plants touch them: MuJoCo's geoms with the names of those whom they belong to."""
+"""Rigid geoms that plants collide with: MuJoCo's geoms, and the actor and link that each belongs to."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import mujoco
 import numpy as np
 
 PLANE_HALF_SIZE = 1e6
-"""[m] The ground reaches so far from the middle."""
+"""[m] Half edge of the box around the ground."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RigidGeoms:
-    """Rigid shapes that plants can touch, sorted by MuJoCo geom."""
+    """Rigid geoms that plants can touch, sorted by MuJoCo geom."""
 
     id: np.ndarray
     """[geom] index in MuJoCo's geom arrays."""
@@ -26,10 +27,11 @@ class RigidGeoms:
     half: np.ndarray
     """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`PLANE_HALF_SIZE` and no height."""
     center: np.ndarray
-    """[geom, 3] middle of the shape in the geom's frame (not zero for meshes)."""
+    """[geom, 3] m, centre of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
     """[geom] of the bounding sphere about the middle."""
     friction: np.ndarray
+    """[geom] Coulomb coefficient."""
     dof: np.ndarray
     """[geom] last degree of freedom that moves it (-1: none); its ancestors follow ``dof_parentid``."""
     root: np.ndarray
@@ -39,19 +41,19 @@ class RigidGeoms:
 
 
 def movable_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> RigidGeoms:
-    """What touches anything of the MuJoCo bodies in ``owner``, which tells actor and link of each."""
+    """The colliding geoms of some MuJoCo bodies; ``owner`` maps their numbers to actor and link."""
     ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)) & (m.geom_contype != 0))
     return _of(m, ids, [owner[body] for body in m.geom_bodyid[ids].tolist()])
 
 
 def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
-    """Ground, poles and trunks: MuJoCo's first geoms, whoever comes and goes."""
+    """Ground, poles and trunks: MuJoCo's first geoms, independent of the actors that join and leave."""
     ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
     return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 
 
 def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> RigidGeoms:
-    """What there is to know of some geoms; ``names``: actor and link of each."""
+    """The properties of some geoms ``ids`` [k]; ``names``: actor and link of each."""
     last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1).tolist()
     for body, parent in enumerate(m.body_parentid.tolist()):  # parents come first
         if last[body] < 0:
@@ -86,8 +88,9 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
 
 def concatenate(first: RigidGeoms, second: RigidGeoms) -> RigidGeoms:
     """The geoms of one list, then those of another."""
-    both = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in dataclasses.fields(RigidGeoms)}
-    return RigidGeoms(**{k: a + b if isinstance(a, tuple) else np.concatenate([a, b]) for k, (a, b) in both.items()})
+    names = [field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link")]
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+    return RigidGeoms(actor=first.actor + second.actor, link=first.link + second.link, **arrays)
 
 
 def persistent_names(geoms: RigidGeoms) -> list[tuple[str, str, int]]:

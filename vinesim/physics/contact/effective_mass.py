@@ -1,4 +1,4 @@
-"""How impulses change velocities within one tick, from MuJoCo's sparse arrays."""
+"""Effective mass of the rigid world within one step, from MuJoCo's sparse arrays: inertia, servos and constraints."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
 
 
 class EffectiveMass:
-    """H = M^ + Jc^T D Jc: implicit servos, and the stiffness of the native constraints that are active now.
+    """H = M^ + Jc^T D Jc: mass with implicit servos, and the stiffness of MuJoCo's constraints that are active now.
 
-    These are limits, mimics, a robot against a pole. Only the kinematic trees concerned are factored.
+    These are joint limits, mimic joints, and contacts of a robot with a pole. Only the kinematic trees concerned are
+    factored.
     """
 
     def __init__(self, world: mujoco.MjModel) -> None:
@@ -21,7 +22,10 @@ class EffectiveMass:
         self._each = np.arange(world.ntree, dtype=np.int32)
 
     def impulse_response(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
-        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T."""
+        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
+
+        Raises numpy.linalg.LinAlgError if H is singular.
+        """
         dofs = self._coupled(d, J)
         block = self._blocks.get(dofs.tobytes())
         if block is None:
@@ -31,16 +35,16 @@ class EffectiveMass:
         return change
 
     def island_labels(self, d: mujoco.MjData) -> np.ndarray:
-        """[MuJoCo kinematic tree] a label that two share if a force on one may move the other in this tick."""
+        """[MuJoCo kinematic tree] a label that two share if a force on one may move the other in this step."""
         m = self._world
         if d.nefc == 0:
             return self._each
         return np.where(d.tree_island >= 0, m.ntree + d.tree_island, self._each) if d.nisland else 0 * self._each
 
     def is_constrained(self, d: mujoco.MjData, bodies: np.ndarray) -> bool:
-        """Whether native constraints that are active now bind one of these MuJoCo bodies [k].
+        """Whether active constraints of MuJoCo bind one of these MuJoCo bodies [k].
 
-        If not, the metric of the tick is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.
+        If not, the effective mass is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.
         """
         if d.nefc == 0:
             return False
@@ -48,7 +52,7 @@ class EffectiveMass:
         return d.nisland == 0 or bool((d.tree_island[tree[tree >= 0]] >= 0).any())
 
     def _coupled(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
-        """Degrees of freedom [k] that feel an impulse along ``J``: its trees and those in constraint with them."""
+        """Degrees of freedom [k] that an impulse along ``J`` moves: of its trees and of those constrained to them."""
         m = self._world
         touched = np.zeros(m.ntree, bool)
         touched[m.dof_treeid[J.any(axis=0)]] = True
@@ -59,7 +63,7 @@ class EffectiveMass:
 
 
 class _Block:
-    """The metric of one tick for some degrees of freedom, gathered from MuJoCo's sparse arrays."""
+    """The effective mass of some degrees of freedom, as a dense matrix."""
 
     def __init__(self, world: mujoco.MjModel, dofs: np.ndarray) -> None:
         self.count = len(dofs)
@@ -78,7 +82,7 @@ class _Block:
             H[self.row, self.column] = d.qH[self.entry]
             np.fill_diagonal(H, 1.0)
             H = H.T @ (H / diagonal[:, None])
-        else:  # nothing implicit in the whole world: MuJoCo leaves the factor unset and M^ is M
+        else:  # nothing is implicit in the whole world: MuJoCo leaves the factor unset, and M^ is M
             H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]
         if d.nefc:
             state = d.efc_state

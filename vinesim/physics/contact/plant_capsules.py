@@ -96,7 +96,8 @@ def nearest_body(
     its clusters move. None if nothing is nearer than ``max_distance`` [m].
     """
     c = capsules
-    at = np.concatenate([np.arange(c.tree_start[tree], c.tree_start[tree + 1]) for tree in trees])
+    first, end = c.tree_start[trees].tolist(), c.tree_start[trees + 1].tolist()
+    at = np.concatenate([np.arange(*ends) for ends in zip(first, end, strict=True)])
     is_fine = state.tree_fine[model.body_tree[c.body[at]]]
     at = at[(c.level[at] == 0) | (c.level[at] == 1 + is_fine)]
     collides = c.bunch[at] < 0

@@ -114,16 +114,16 @@ class DeviceBuffers:
             shared = wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
         self.arrays[name], self.host[name] = shared, data
 
-    def add_body_rows(self, name: str, data: np.ndarray, dtype: type, *, points: bool = False) -> None:
+    def add_body_rows(self, name: str, data: np.ndarray, dtype: type, *, body_indices: bool = False) -> None:
         """An array with a row of four-byte numbers for each body, written by both sides.
 
-        See :meth:`row_copier` and :meth:`upload`. ``points``: its numbers are bodies, or negative.
+        See :meth:`row_copier` and :meth:`upload`. ``body_indices``: its numbers are bodies, or negative.
         """
         if not self.has_copies:
             self.add_shared(name, data, dtype)
             return
         self.host[name], self._dtypes[name] = data, dtype
-        self._points |= {name} if points else set()
+        self._points |= {name} if body_indices else set()
         self.arrays[name] = wp.zeros(self.slot_count, dtype=dtype, device=self.device)
         self.upload([name])
 
@@ -139,8 +139,8 @@ class DeviceBuffers:
             there[self.slots] = np.where(data >= 0, self.slots[data], data) if name in self._points else data
             self.arrays[name].assign(there)
 
-    def row_copier(self, names: tuple[str, ...], trees: str, *, back: bool = False) -> Callable[[int], None]:
-        """A function of n that carries rows of the first n ``trees`` to the device, or ``back`` to the host.
+    def row_copier(self, names: tuple[str, ...], trees: str, *, to_host: bool = False) -> Callable[[int], None]:
+        """A function of n that copies rows of the first n ``trees`` to the device, or to the host (``to_host``).
 
         Nothing happens where both sides share their memory.
         """
@@ -150,7 +150,7 @@ class DeviceBuffers:
         starts = np.append(0, np.cumsum(widths * self._largest))
         here = (1, "host_first", [self.host[name].ctypes.data for name in names])
         there = (self.pitch, "tree_first", [self.arrays[name].ptr for name in names])
-        (pitch, first, source), (pitch_there, first_there, target) = (there, here) if back else (here, there)
+        (pitch, first, source), (pitch_there, first_there, target) = (there, here) if to_host else (here, there)
         ints = [wp.array(x, dtype=wp.int32, device=self.device) for x in (starts, widths)]
         addresses = [wp.array(np.array(x, np.uint64), dtype=wp.uint64, device=self.device) for x in (source, target)]
         a, threads = self.arrays, int(starts[-1])

@@ -20,25 +20,22 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.articulation import dynamics
-from vinesim.physics.plants.articulation_solver import (
-    FAST_JOINT_RATE,
-    FAULT_JOINT_RATE,
-    MAX_JOINT_RATE,
-    ArticulationSolver,
-)
+from vinesim.kernels.articulation import integration, kinematics, prediction, structs
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.plants.articulation_solver import ArticulationSolver, kernel_parameters
 from vinesim.physics.plants.device_buffers import DeviceBuffers, find_device
-from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
-_FREE, _INTEGRATE, _PLACE = (
+_PREDICT, _INTEGRATE, _FORWARD_KINEMATICS = (
     wp.kernel(kernel.func, module="vinesim.physics.plants.rollout", enable_backward=True)
-    for kernel in (dynamics.predict, dynamics.integrate, dynamics.forward_kinematics)
+    for kernel in (prediction.predict, integration.integrate, kinematics.forward_kinematics)
 )
-_STILL = ("body_load", "body_wrench")
+_STRUCT = type(structs.JointState)
+_DEFAULTS = PhysicsParameters()
+_ZERO_INPUTS = ("body_load", "body_wrench")
 """Inputs that are zero unless given."""
-_COUNTER = "tree_onset"
+_COUNTER = "tree_euler_steps"
 """The state that is no number to differentiate by, and counts on where it stands."""
 _PARAMETERS = ("joint_stiffness", "joint_damping", "body_mass", "body_inertia", "body_product", "body_load")
 
@@ -99,13 +96,13 @@ class Rollout:
         *,
         watched: np.ndarray | None = None,
         fine: bool = False,
-        dt: float = 0.01,
-        phi: float = 0.55,
+        dt: float = _DEFAULTS.dt,
+        phi: float = _DEFAULTS.phi,
         checkpoint: int = 50,
         device: str = "cpu",
-        fast_rate: float = FAST_JOINT_RATE,
-        max_rate: float = MAX_JOINT_RATE,
-        fault_rate: float = FAULT_JOINT_RATE,
+        fast_rate: float = _DEFAULTS.fast_joint_rate,
+        max_rate: float = _DEFAULTS.max_joint_rate,
+        fault_rate: float = _DEFAULTS.fault_joint_rate,
         geometric_stiffness: bool = True,
     ) -> None:
         if ticks < 1 or checkpoint < 1 or not dt > 0.0 or not 0.5 <= phi <= 1.0:
@@ -121,9 +118,7 @@ class Rollout:
             find_device(device),
         )
         self.state = State.at_rest(model)
-        plants = ArticulationSolver(
-            model, self.state, buffers=DeviceBuffers("cpu")
-        )  # what the kernels are given there they are given here
+        plants = ArticulationSolver(model, self.state, buffers=DeviceBuffers("cpu"))  # for the arrays of its kernels
         if fine:
             plants.refine(np.arange(len(model.tree_first)))
         self._host = plants.buffers.host
@@ -135,10 +130,8 @@ class Rollout:
             raise ValueError(f"body {body} is a berry cluster that rides on its bunch: watch that, or give fine=True")
         self._slots = min(checkpoint, ticks)
         trees = len(model.tree_first)
-        self._given = {
-            "dt": dt, "brisk": fast_rate, "limit": max_rate, "bound": fault_rate, "tension": float(geometric_stiffness),
-            "gravity": wp.vec3(GRAVITY), "pitch": 1,
-        }  # fmt: skip
+        parameters = kernel_parameters(_DEFAULTS, dt, fast_rate, max_rate, fault_rate, geometric_stiffness)
+        self._given: dict[str, Any] = parameters | {"pitch": 1}
         self._arrays = {
             "trees": wp.array(np.arange(trees), dtype=wp.int32, device=self.device),
             "tree_phi": wp.array(np.full(trees, phi), dtype=float, device=self.device),
@@ -235,9 +228,9 @@ class Rollout:
                 there[count] = carried[name]
                 _fill(self._stacks[name].grad, there)
             self._ends[count - 1][1].launch()
-            for prediction, move in reversed(self._ticks[:count]):
-                move[1].launch()
-                prediction[1].launch()
+            for predict, integrate in reversed(self._steps[:count]):
+                integrate[1].launch()
+                predict[1].launch()
             carried = {name: self._stacks[name].grad.numpy()[0].copy() for name in self._states}
         by = {name: self._arrays[name].grad.numpy().astype(float) for name in _PARAMETERS}
         start = self._checkpoints[0]["joint_q"].astype(float)
@@ -256,32 +249,44 @@ class Rollout:
     # memory and launches
 
     def _record(self) -> None:
-        """Arrays for every tick of a segment, and the launches that work on them, there and back."""
-        self._states = tuple(
-            arg.label.removesuffix("_out") for arg in _INTEGRATE.adj.args
-            if arg.label.startswith("joint_") and arg.label.endswith("_out")
-        )  # fmt: skip
-        for arg in _INTEGRATE.adj.args:
-            if (name := arg.label.removesuffix("_out")) in self._states:
-                self._stacks[name] = self._zeros(name, arg.type.dtype, self._slots + 1)
+        """Arrays for every step of a segment, and the launches that work on them, there and back."""
+        self._states = tuple(structs.JointState.vars)
+        for name, field in structs.JointState.vars.items():
+            self._stacks[name] = self._zeros(name, field.type.dtype, self._slots + 1)
         self._stacks[_COUNTER] = self._zeros(_COUNTER, wp.int32, self._slots + 1)
-        self._ticks = [(self._launch(_FREE, slot), self._launch(_INTEGRATE, slot)) for slot in range(self._slots)]
-        self._ends = [self._launch(_PLACE, slot + 1, end=True) for slot in range(self._slots)]
+        self._steps = [(self._launch(_PREDICT, slot), self._launch(_INTEGRATE, slot)) for slot in range(self._slots)]
+        self._ends = [self._launch(_FORWARD_KINEMATICS, slot + 1, end=True) for slot in range(self._slots)]
         self._last = (self._arrays["end body_q"], self._arrays["end body_qd"])
 
-    def _launch(self, kernel: wp.Kernel, slot: int, end: bool = False) -> tuple[wp.Launch, wp.Launch]:
-        """The launch of one kernel in one tick, and its adjoint."""
+    def _launch(self, kernel: Any, slot: int, end: bool = False) -> tuple[Any, Any]:
+        """The launch of one kernel in one step, and its adjoint."""
         values = [self._argument(kernel, arg, slot, end) for arg in kernel.adj.args]
-        adjoints = [value.grad if isinstance(value, wp.array) else None for value in values]
-        common = {"dim": len(self.model.tree_first), "inputs": values, "device": self.device, "record_cmd": True}
+        adjoints = [self._adjoint(arg, value) for arg, value in zip(kernel.adj.args, values, strict=True)]
+        common: dict[str, Any] = {"dim": len(self.model.tree_first), "inputs": values, "device": self.device}
+        common |= {"record_cmd": True}
         return wp.launch(kernel, **common), wp.launch(kernel, adj_inputs=adjoints, adjoint=True, **common)
 
-    def _argument(self, kernel: wp.Kernel, arg: Any, slot: int, end: bool) -> Any:
-        """What an argument of this name is in one tick; what no tick changes is among the plants' arrays."""
+    def _argument(self, kernel: Any, arg: Any, slot: int, end: bool) -> Any:
+        """What an argument is in one step: a struct filled field by field, an array, or a number."""
         name, written = arg.label.removesuffix("_out"), arg.label.endswith("_out")
+        if not isinstance(arg.type, _STRUCT):
+            return self._value(kernel, name, arg.type, written, slot, end)
+        filled = arg.type()
+        for field, var in arg.type.vars.items():
+            setattr(filled, field, self._value(kernel, field, var.type, written, slot, end))
+        return filled
+
+    def _adjoint(self, arg: Any, value: Any) -> Any:
+        """Where an argument's derivatives are: a struct's arrays bring their own."""
+        if isinstance(arg.type, _STRUCT):
+            return arg.type()
+        return value.grad if isinstance(value, wp.array) else None
+
+    def _value(self, kernel: Any, name: str, kind: Any, written: bool, slot: int, end: bool) -> Any:
+        """What an argument or field of this name is in one step; what no step changes is among the solver's arrays."""
         if name in self._given:
             return self._given[name]
-        dtype = arg.type.dtype
+        dtype = kind.dtype
         if name in self._states or name == _COUNTER:
             return self._stacks[name][slot + written]
         counter = dtype in (wp.int32, wp.bool)
@@ -299,7 +304,7 @@ class Rollout:
         return self._arrays[name]
 
     def _input(self, name: str, dtype: Any) -> wp.array:
-        if name in _STILL:
+        if name in _ZERO_INPUTS:
             return self._zeros(name, dtype)
         return wp.array(self._host[name], dtype=dtype, device=self.device, requires_grad=name in _PARAMETERS)
 
@@ -318,10 +323,10 @@ class Rollout:
         for name, value in self._checkpoints[segment].items():
             _fill(self._stacks[name][0], value)
         counter = self._stacks[_COUNTER]
-        for slot, (prediction, move) in enumerate(self._ticks[:count]):
-            prediction[0].launch()
+        for slot, (predict, integrate) in enumerate(self._steps[:count]):
+            predict[0].launch()
             wp.copy(counter[slot + 1], counter[slot])
-            move[0].launch()
+            integrate[0].launch()
         self._ends[count - 1][0].launch()
         self._at = segment
 

@@ -1,0 +1,356 @@
+"""The public interface: it loads lazily, and its energies, momenta, tips and damping are those of independent formulas."""
+
+import ast
+import inspect
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import vinesim
+from vinesim import frames
+from vinesim.errors import UsageError
+from vinesim.net.codec import messages
+from vinesim.net.recording import mcap_file
+
+G = 9.81
+EI = 5e9 * np.pi / 4.0 * 0.004**4
+"""[N m^2] of the default cane."""
+
+
+# ---------------------------------------------------------------- names
+
+
+def test_import_takes_milliseconds_and_loads_nothing_else():
+    script = (
+        "import sys, time; start = time.process_time(); import vinesim; spent = time.process_time() - start; "
+        "heavy = {'numpy', 'warp', 'mujoco', 'zenoh', 'cv2', 'msgspec'} & set(sys.modules); "
+        "assert spent < 0.3, spent; assert not heavy, heavy; assert 'Simulation' in dir(vinesim)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=pathlib.Path(vinesim.__file__).parents[1])
+
+
+def test_every_public_name_loads_and_is_documented():
+    assert set(vinesim.__all__) == {*vinesim._MODULES, "__version__"}
+    for name in vinesim._MODULES:
+        assert inspect.getdoc(getattr(vinesim, name)), name
+
+
+def test_type_checkers_see_the_same_names():
+    tree = ast.parse(pathlib.Path(vinesim.__file__).read_text())
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    seen = {}
+    for line in block.body:
+        assert isinstance(line, ast.ImportFrom)
+        for alias in line.names:
+            assert alias.asname == alias.name  # a re-export
+            module = f"{line.module}.frames" if alias.name == "frames" else line.module
+            seen[alias.name] = module.removeprefix("vinesim.")
+    assert seen == vinesim._MODULES
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(AttributeError, match=r"no attribute 'Simulator'; it offers .*Simulation"):
+        vinesim.Simulator  # noqa: B018
+
+
+# ---------------------------------------------------------------- canes
+
+
+def test_a_fresh_cane_does_not_hover():
+    """A straight cane is not in equilibrium: it starts awake, sags and falls asleep in another shape."""
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(tip_mass=0.05, damping_ratio=0.5))
+    assert simulation.awake.tolist() == [0]
+    start = simulation.tip()
+    np.testing.assert_allclose(start, [1.0, 0.0, 1.0], atol=1e-6)
+    simulation.step(600)
+    assert simulation.awake.tolist() == []
+    assert start[2] - simulation.tip()[2] > 0.1
+
+
+def test_what_is_in_equilibrium_stays_asleep():
+    drawn = vinesim.CaneBuilder(tip_mass=0.05, shape="equilibrium")
+    moving = vinesim.CaneBuilder(tip_mass=0.05)
+    assert vinesim.Simulation([drawn, moving]).awake.tolist() == [1]
+    simulation = vinesim.Simulation("demo")
+    assert len(simulation.awake) == 0
+    assert len(vinesim.Simulation(drawn, sleep=False).awake) == 0
+
+
+def test_the_tip_of_a_loaded_cane_is_on_the_elastica():
+    """Tip load P L^2 / EI = 1, light cane: the tip is at x 0.94357 L, 0.30172 L below (Bisshopp and Drucker, 1945)."""
+    light = vinesim.CaneBuilder(segments=48, density=1.0, tip_mass=EI / G, damping_ratio=1.0)
+    simulation = vinesim.Simulation(light, sleep=False)
+    simulation.step(1500)
+    x, _, z = simulation.tip()
+    assert x == pytest.approx(0.94357, abs=1e-3)
+    assert 1.0 - z == pytest.approx(0.30172, abs=1e-3)
+
+
+@pytest.mark.parametrize("ratio", [0.02, 0.1])
+def test_the_damping_ratio_is_that_of_the_decrement(ratio):
+    """Pulled sideways and released: the logarithm of successive peaks falls by 2 pi ratio / sqrt(1 - ratio^2)."""
+    cane = vinesim.CaneBuilder(length=0.5, tip_mass=0.05, damping_ratio=ratio, shape="equilibrium")
+    simulation = vinesim.Simulation(cane, sleep=False)
+    simulation.apply_wrench(simulation.tip_body(), (0.0, 1.0, 0.0), at=simulation.tip())
+    simulation.step(1)
+    way = []
+    for _ in range(200):
+        simulation.step()
+        way.append(simulation.tip()[1])
+    way = np.array(way)
+    inner = np.flatnonzero((np.abs(way[1:-1]) > np.abs(way[:-2])) & (np.abs(way[1:-1]) >= np.abs(way[2:]))) + 1
+    left, top, right = np.abs(way[inner - 1]), np.abs(way[inner]), np.abs(way[inner + 1])
+    peaks = (top + (left - right) ** 2 / (8.0 * (2.0 * top - left - right)))[:7]  # of the parabola through three
+    decrement = -np.polyfit(0.5 * np.arange(len(peaks)), np.log(peaks), 1)[0]  # two peaks a period
+    assert decrement / np.hypot(2.0 * np.pi, decrement) == pytest.approx(ratio, rel=0.03)
+    period = 2.0 * np.mean(np.diff(inner[:7])) * simulation.dt
+    assert 2.0 * np.pi / period == pytest.approx(cane.first_mode() * np.sqrt(1.0 - ratio**2), rel=0.03)
+
+
+def test_the_first_mode_is_that_of_the_beam():
+    """Euler-Bernoulli: 1.8751^2 sqrt(EI / m L^4) without, and about sqrt(3 EI / (M + 0.2357 m) L^3) with a tip mass."""
+    per_length = 800.0 * np.pi * 0.004**2
+    bare = vinesim.CaneBuilder(segments=64).first_mode()
+    assert bare == pytest.approx(1.87510**2 * np.sqrt(EI / per_length), rel=1e-3)
+    laden = vinesim.CaneBuilder(segments=64, tip_mass=0.4).first_mode()
+    assert laden == pytest.approx(np.sqrt(3.0 * EI / (0.4 + 0.2357 * per_length)), rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ({"length": -1.0}, r"cane: length is -1.0; give a finite number above 0"),
+        ({"radius": (0.01, 0.0)}, r"cane: radius\[1\] is 0.0; give a finite number above 0"),
+        ({"tip_mass": float("nan")}, r"cane: tip_mass is nan; give a finite number of 0 or more"),
+        ({"segments": 0}, r"cane: segments is 0; give 1 or more"),
+        ({"damping_ratio": 0.1, "beta": 0.01}, r"damping_ratio 0.1 and beta 0.01 are given; give one"),
+        ({"damping_ratio": 0.1, "base": "pinned"}, r"'pinned', so it has no bending mode"),
+        ({"shape": "equilibrium", "base": "pinned"}, r"'pinned' carries no moment"),
+        ({"bends": np.zeros((3, 3))}, r"bends has the shape \(3, 3\); give \[16, 3\]"),
+        ({"pose": (0.0, 0.0, 1.0)}, r"pose has the shape \(3,\); give position and quaternion"),
+    ],
+)
+def test_a_bad_cane_is_refused_in_one_line(field, message):
+    with pytest.raises(ValueError, match=message) as error:
+        vinesim.cane(**field)
+    assert "\n" not in str(error.value)
+
+
+def test_a_drawn_bend_is_the_slack_shape():
+    """A quarter circle of 1 m, drawn with equal bends; without weight it stays where it was drawn."""
+    bends = np.zeros((32, 3))
+    bends[1:, 2] = 0.5 * np.pi / 32
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(segments=32, bends=bends, shape="equilibrium"))
+    radius = 2.0 / np.pi
+    np.testing.assert_allclose(simulation.tip(), [radius, radius, 1.0], atol=0.02)
+
+
+# ---------------------------------------------------------------- energy and momentum
+
+
+def test_energy_of_a_pendulum():
+    """One rigid rod on a pin, 90 degrees: m L^2 omega^2 / 6 and m g z from the tip's path; their sum stays, to 1 %."""
+    rod = vinesim.CaneBuilder(length=1.5, segments=1, base="pinned", density=700.0, pose=(0, 0, 2, 0, 0, 0, 1))
+    simulation = vinesim.Simulation(rod, parameters=vinesim.PhysicsParameters(phi=0.5), sleep=False)
+    mass = 700.0 * np.pi * 0.004**2 * 1.5
+    begin = simulation.energy()
+    assert begin.kinetic == 0.0
+    assert begin.gravitational == pytest.approx(mass * G * 2.0, rel=1e-5)
+    tips, seen = [simulation.tip()], [begin]
+    for _ in range(300):
+        simulation.step()
+        tips.append(simulation.tip())
+        seen.append(simulation.energy())
+    tips = np.array(tips)
+    assert tips[:, 2].min() < 0.51  # it has swung through
+    speed = np.linalg.norm(tips[2:] - tips[:-2], axis=1) / (2.0 * simulation.dt)
+    kinetic = mass * speed**2 / 6.0  # the tip moves at L omega
+    # a chord is shorter than the arc by (omega dt)^2 / 6, less than a tenth of a percent here
+    np.testing.assert_allclose([e.kinetic for e in seen[1:-1]], kinetic, rtol=0.01, atol=1e-4)
+    height = 2.0 + 0.5 * (tips[:, 2] - 2.0)
+    np.testing.assert_allclose([e.gravitational for e in seen], mass * G * height, rtol=1e-4)
+    assert [e.elastic for e in seen] == [0.0] * len(seen)
+    swing = mass * G * 0.75
+    assert np.ptp([e.total for e in seen]) < 0.01 * swing
+
+
+def test_energy_of_an_undamped_cane_is_kept():
+    """Released straight, phi 1/2, 10 s: kinetic, elastic and gravitational energy pass into each other, total to 2 %."""
+    cane = vinesim.CaneBuilder(length=0.6, tip_mass=0.02)
+    simulation = vinesim.Simulation(cane, parameters=vinesim.PhysicsParameters(phi=0.5), sleep=False)
+    seen = [simulation.energy()]
+    for _ in range(1000):
+        simulation.step()
+        seen.append(simulation.energy())
+    exchanged = np.ptp([e.gravitational for e in seen])
+    assert max(e.kinetic for e in seen) > 0.2 * exchanged
+    assert max(e.elastic for e in seen) > 0.8 * exchanged
+    assert np.ptp([e.total for e in seen]) < 0.02 * exchanged
+
+
+def test_elastic_energy_is_the_work_of_the_load():
+    """Small deflection under a tip weight: the energy of the beam is P^2 L^3 / 6 EI (Clapeyron)."""
+    mass = 0.1 * EI / G  # P L^2 / EI = 0.1
+    cane = vinesim.CaneBuilder(segments=48, density=1.0, tip_mass=mass, damping_ratio=1.0)
+    simulation = vinesim.Simulation(cane, sleep=False)
+    simulation.step(1000)
+    assert simulation.energy().elastic == pytest.approx((mass * G) ** 2 / (6.0 * EI), rel=0.01)
+
+
+def test_momentum_of_a_floating_tree():
+    """Cut off and thrown: momentum grows by F t + m g t, angular momentum by r x F t + r_com x m g t."""
+    cane = vinesim.CaneBuilder(length=0.6, tip_mass=0.05, pose=(0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 1.0))
+    simulation = vinesim.Simulation(cane, sleep=False)
+    simulation.cut(0)
+    mass = float(simulation.model.body_mass.sum())
+    body, force, dt = simulation.tip_body(), np.array([0.5, 2.0, 1.0]), simulation.dt
+    point = simulation.tip()
+    simulation.apply_wrench(body, force, at=point)
+    before, centre = simulation.momentum(), center_of_mass(simulation)
+    simulation.step()
+    after = simulation.momentum()
+    weight = np.array([0.0, 0.0, -mass * G])
+    np.testing.assert_allclose(after.linear - before.linear, dt * (force + weight), atol=1e-5)
+    moment = np.cross(point, force) + np.cross(centre, weight)
+    np.testing.assert_allclose(after.angular - before.angular, dt * moment, atol=5e-4)
+    path = [center_of_mass(simulation)]
+    for _ in range(20):
+        simulation.step()
+        path.append(center_of_mass(simulation))
+    found = simulation.momentum().linear
+    np.testing.assert_allclose(found, after.linear + 20 * dt * weight, atol=1e-4)
+    mean = mass * (path[-1] - path[0]) / (20 * dt)  # half way between the momenta at both ends
+    np.testing.assert_allclose(mean, 0.5 * (after.linear + found), atol=0.01)
+
+
+def center_of_mass(simulation) -> np.ndarray:
+    """[3] m, summed body by body from poses."""
+    model = simulation.model
+    poses = [simulation.body_pose(body) for body in range(len(model.body_mass))]
+    centres = [pose[:3] + frames.rotate(pose[3:], com) for pose, com in zip(poses, model.body_com, strict=True)]
+    return np.average(centres, axis=0, weights=model.body_mass)
+
+
+# ---------------------------------------------------------------- simulation
+
+
+def test_a_wrench_wakes_its_tree_and_ends_with_the_step():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(shape="equilibrium", damping_ratio=0.5))
+    assert len(simulation.awake) == 0
+    start = simulation.tip()
+    simulation.apply_wrench(simulation.tip_body(), (0.0, 0.2, 0.0))
+    simulation.apply_wrench(simulation.tip_body(), (0.0, 0.2, 0.0))
+    assert simulation.awake.tolist() == [0]
+    simulation.step(300)
+    held = simulation.tip()[1]
+    bent = 0.4 / 3.0 / EI  # P L^3 / 3 EI, applied 1/32 L before the tip
+    assert held == pytest.approx(bent * (1.0 - 1.5 / 32.0), rel=0.05)
+    simulation.step(600)
+    np.testing.assert_allclose(simulation.tip(), start, atol=2e-3)
+    assert not simulation.physics.plants.body_load.any()
+
+
+def test_a_written_pose_is_seen_at_once_and_moves():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(shape="equilibrium"))
+    simulation.snapshot()
+    simulation.state.joint_q[0] = frames.exp(np.array([0.0, 0.0, 0.3]))
+    simulation.wake()
+    assert simulation.tip()[1] == pytest.approx(np.sin(0.3), abs=0.02)
+    np.testing.assert_array_equal(simulation.snapshot().body_q, simulation.state.body_q)
+    before = simulation.tip()
+    simulation.step(5)
+    assert simulation.tip()[1] < before[1] - 0.01
+    assert simulation.time == pytest.approx(0.05)
+
+
+def test_a_robot_bends_a_cane_that_stands_in_its_way():
+    upwards = frames.pose(np.array([1.0, 0.0, 0.0]), frames.from_x_axis(np.array([0.0, 0.0, 1.0])))
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(length=1.2, pose=upwards, damping_ratio=0.1), dt=0.01)
+    robot = simulation.add_robot("vinebot", name="picker")
+    assert isinstance(robot, vinesim.Robot)
+    contacts = []
+    for _ in range(320):
+        robot.command_base(0.2, 0.0, simulation.time)
+        simulation.step()
+        contacts += simulation.contacts
+    assert {contact.actor for contact in contacts} == {"picker"}
+    assert sum(contact.force[0] for contact in contacts) < -10.0  # on the robot, against its way
+    assert simulation.tip()[0] > 1.05
+    with pytest.raises(UsageError, match="robot 'picker' exists already; give another name"):
+        simulation.add_robot("vinebot", name="picker")
+
+
+def test_what_was_picked_is_a_detachment():
+    simulation = vinesim.Simulation(vinesim.load_scene("demo", seed=3))
+    simulation.pick(2)
+    simulation.step(2)
+    assert [one.bunch for one in simulation.detachments] == [2]
+    simulation.step()
+    assert simulation.detachments == ()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda s: s.tip(1), "tree 1 does not exist; give 0 to 0"),
+        (lambda s: s.body_pose(99), "body 99 does not exist; give 0 to 15"),
+        (lambda s: s.pick(0), "bunch 0 does not exist"),
+        (lambda s: s.apply_wrench(0, (1.0, 2.0)), r"force is \(1.0, 2.0\); give three finite numbers \[N\]"),
+        (lambda s: s.add_robot("vinebot", (1.0, 2.0)), r"pose is \[1.0, 2.0\]; give \(x, y, yaw\)"),
+        (lambda s: vinesim.Lidar().scan(s), "no place, or two; give either a pose"),
+        (lambda s: vinesim.look_at((0, 0, 0), (0, 0, 0)), "give two points"),
+        (lambda s: vinesim.Simulation([1.0]), "cannot simulate a list; give a scene, a model or cane builders"),
+    ],
+)
+def test_bad_use_is_refused_in_one_line(call, message):
+    simulation = vinesim.Simulation(vinesim.CaneBuilder())
+    with pytest.raises(UsageError, match=message) as error:
+        call(simulation)
+    assert "\n" not in str(error.value)
+
+
+# ---------------------------------------------------------------- sensors, recordings, clients
+
+
+def test_cameras_and_lidars_see_the_simulation_as_it_moves():
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(radius=0.02, shape="equilibrium"))
+    camera, pose = vinesim.Camera("pinhole", size=(64, 48)), vinesim.look_at((0.5, -0.6, 1.0), (0.5, 0.0, 1.0))
+    frame = camera.render(simulation, pose)
+    assert frame.rgb.shape == (48, 64, 3)
+    cane = frame.organs == vinesim.Organ.CANE
+    assert frame.depth[cane].min() == pytest.approx(0.58, abs=0.005)
+    simulation.state.joint_q[0] = frames.exp(np.array([0.0, 0.0, 1.2]))
+    simulation.wake()
+    assert (camera.render(simulation, pose).organs == vinesim.Organ.CANE).sum() < 0.7 * cane.sum()
+    scan = vinesim.Lidar("vlp16").scan(simulation, (0.0, -2.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    assert len(scan.xyz) == len(scan.organs) > 100
+
+
+def test_a_recording_is_read_message_by_message(tmp_path):
+    path = tmp_path / "run.mcap"
+    hello = messages.encode_hello(messages.Hello(name="ada", kind="spectator", scene="demo", digest="0" * 16, index=1))
+    with mcap_file.Recording(path, {"scene": "demo"}) as file:
+        file.put(1_000_000_000, "live/ada", b"1")
+        file.put(1_500_000_000, "hello/ada", hello)
+    recording = vinesim.Recording(path)
+    assert recording.info["scene"] == "demo"
+    assert (recording.actors, len(recording), recording.damage) == (["ada"], 2, "")
+    assert recording.duration == pytest.approx(0.5)
+    first, second = recording
+    assert (first.time, first.actor, first.data["live"]) == (0.0, "ada", True)
+    assert (second.key, second.data["kind"]) == ("hello/ada", "spectator")
+
+
+def test_a_client_alone_drives_its_robot():
+    with vinesim.Client("demo", name="ada", pose=(-2.0, 0.0, 0.0)) as client:
+        for _ in range(100):
+            client.robot.command_base(0.3, 0.0, client.time)
+            client.step()
+        assert client.time == pytest.approx(1.0)
+        assert client.remote_actors == ()
+        assert client.actor_pose("ada")[0] > -1.85
+        with pytest.raises(KeyError, match="no actor 'bob'; there are: ada"):
+            client.actor_pose("bob")

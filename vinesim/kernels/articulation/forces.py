@@ -1,0 +1,97 @@
+"""Forces on single bodies: springs and the stiffness that loads lend to levers, ties, drag of the air."""
+
+import warp as wp
+
+from vinesim.kernels.articulation.spatial import logarithm
+from vinesim.kernels.articulation.structs import AppliedForces, ArticulationModel
+
+wp.set_module_options({"enable_backward": False})
+
+AIR_DENSITY = wp.constant(1.2)
+"""[kg/m^3] of air at 20 degrees and sea level"""
+
+
+@wp.func
+def tension_stiffness(lever: wp.vec3, force: wp.vec3):
+    """Stiffness [N m/rad] against turning that a steady force lends to a lever it draws out; none if it pushes."""
+    along_lever = wp.dot(lever, force)
+    stiffness = wp.mat33()
+    if along_lever > 0.0:
+        share = along_lever / wp.dot(lever, lever)
+        stiffness = along_lever * wp.identity(n=3, dtype=float) - share * wp.outer(lever, lever)
+    return stiffness
+
+
+@wp.func
+def shear_stiffness(lever: wp.vec3, force: wp.vec3):
+    """The rest of the symmetric part of (d.F) 1 - d F^T, beside :func:`tension_stiffness`: of pushing, and of shear."""
+    return (
+        wp.dot(lever, force) * wp.identity(n=3, dtype=float)
+        - 0.5 * (wp.outer(lever, force) + wp.outer(force, lever))
+        - tension_stiffness(lever, force)
+    )
+
+
+@wp.func
+def spring_moment(frame: wp.mat33, stiffness: wp.vec3, q: wp.quat, share: float):
+    """A share of the moment [N m] that a spring bears, in world axes; ``frame`` holds the joint's axes."""
+    return share * (frame * wp.cw_mul(stiffness, logarithm(q)))
+
+
+@wp.func
+def residual_damping(damping: float, stiffness: float, phi: float, dt: float):
+    """Damping [N s/m] that is left to add when the scheme damps a spring as if beta were larger by (2 phi - 1) dt."""
+    return wp.max(damping - (2.0 * phi - 1.0) * dt * stiffness, 0.0)
+
+
+@wp.func
+def tie_force(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3, phi: float, dt: float):
+    """Force [N] of a tie whose point moves on at its present speed; ``damping`` is the residual one."""
+    return -stiffness * (stretch + phi * dt * speed) - damping * speed
+
+
+@wp.func
+def drag_coefficient(area: float, wind: wp.vec3):
+    """Drag per relative speed [N s/m] of a drag area Cd A [m^2] in a wind [m/s] relative to it."""
+    return 0.5 * AIR_DENSITY * area * wp.length(wind)
+
+
+@wp.func
+def tie_and_drag_wrench(
+    k: int,
+    dt: float,
+    phi: float,
+    air: wp.vec3,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    pose: wp.transform,
+    motion: wp.spatial_vector,
+    acceleration: wp.spatial_vector,
+):
+    """What ties and air did to body k in the last step: force [N], moment about its origin [N m].
+
+    The same forces as in the implicit solve, evaluated with the acceleration that it found.
+    """
+    velocity = wp.spatial_top(motion)
+    omega = wp.spatial_bottom(motion)
+    a = wp.spatial_top(acceleration)
+    alpha = wp.spatial_bottom(acceleration)
+    wrench = wp.spatial_vector()
+    area = model.body_drag[k]
+    if area > 0.0:
+        com = wp.quat_rotate(wp.transform_get_rotation(pose), model.body_com[k])
+        wind = air - velocity - wp.cross(omega, com)
+        force = drag_coefficient(area, wind) * (wind - dt * (a + wp.cross(alpha, com)))
+        wrench += wp.spatial_vector(force, wp.cross(com, force))
+    ties = model.tie_span[k]
+    for t in range(ties[0], ties[1]):
+        point = wp.quat_rotate(wp.transform_get_rotation(pose), model.tie_point[t])
+        stretch = wp.transform_get_translation(pose) + point - forces.tie_anchor[t]
+        stiffness = model.tie_stiffness[t]
+        damping = residual_damping(model.tie_damping[t], stiffness, phi, dt)
+        implicit_mass = phi * dt * (phi * dt * stiffness + damping)
+        swing = wp.cross(omega, point)
+        force = tie_force(stiffness, damping, stretch, velocity + swing, phi, dt)
+        force = force - implicit_mass * (a + wp.cross(alpha, point) + wp.cross(omega, swing))
+        wrench += wp.spatial_vector(force, wp.cross(point, force))
+    return wrench

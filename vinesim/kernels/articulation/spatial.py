@@ -1,0 +1,66 @@
+"""Rotations and inertias: exponential map, rotated tensors, point masses."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def exponential(v: wp.vec3):
+    """Quaternion of the rotation vector v [rad]."""
+    square = wp.dot(v, v)
+    half_sinc = 0.5 - square * (1.0 / 48.0 - square * (1.0 / 3840.0))
+    cosine = 1.0 - square * (1.0 / 8.0 - square * (1.0 / 384.0))
+    if square > 0.1:
+        angle = wp.sqrt(square)
+        half_sinc = wp.sin(0.5 * angle) / angle
+        cosine = wp.cos(0.5 * angle)
+    return wp.quat(half_sinc * v[0], half_sinc * v[1], half_sinc * v[2], cosine)
+
+
+@wp.func
+def logarithm(q: wp.quat):
+    """Rotation vector [rad] of the unit quaternion q, the short way round."""
+    v = wp.vec3(q[0], q[1], q[2])
+    w = q[3]
+    if w < 0.0:
+        v = -v
+        w = -w
+    square = wp.dot(v, v)
+    scale = 2.0 + square * (1.0 / 3.0 + square * (3.0 / 20.0 + square * (5.0 / 56.0)))  # 2 asin(s) / s
+    if square > 0.02:
+        sine = wp.sqrt(square)
+        scale = 2.0 * wp.atan2(sine, w) / sine
+    return scale * v
+
+
+@wp.func
+def rotated_diagonal(frame: wp.mat33, v: wp.vec3):
+    """The matrix that is diag(v) in the axes of frame (its columns): frame diag(v) frame^T."""
+    x = wp.vec3(frame[0, 0], frame[1, 0], frame[2, 0])
+    y = wp.vec3(frame[0, 1], frame[1, 1], frame[2, 1])
+    return v[2] * wp.identity(n=3, dtype=float) + (v[0] - v[2]) * wp.outer(x, x) + (v[1] - v[2]) * wp.outer(y, y)
+
+
+@wp.func
+def cross_rows(A: wp.mat33, d: wp.vec3):
+    """A [d]x: every row of A crossed with d."""
+    return wp.matrix_from_rows(wp.cross(A[0], d), wp.cross(A[1], d), wp.cross(A[2], d))
+
+
+@wp.func
+def point_mass_inertia(mass: float, lever: wp.vec3):
+    """Moment of inertia about the origin [kg m^2] of a point mass at a lever."""
+    return mass * (wp.dot(lever, lever) * wp.identity(n=3, dtype=float) - wp.outer(lever, lever))
+
+
+@wp.func
+def world_inertia(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
+    """Inertia in world axes from its diagonal and its entries yz, zx, xy in the body's axes."""
+    inertia = rotated_diagonal(rotation, moments)
+    if wp.length_sq(products) > 0.0:
+        mixed = wp.mat33(
+            0.0, products[2], products[1], products[2], 0.0, products[0], products[1], products[0], 0.0
+        )  # fmt: skip
+        inertia = inertia + rotation * mixed * wp.transpose(rotation)
+    return inertia

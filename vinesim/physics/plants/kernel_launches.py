@@ -1,0 +1,211 @@
+"""Kernels of the articulation solver, each bound once to its arrays, and the transfers of rows around them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.articulation import structs
+from vinesim.kernels.articulation.floating_components import correct_floating_momentum
+from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
+from vinesim.kernels.articulation.integration import integrate
+from vinesim.kernels.articulation.joint_wrench import joint_wrench
+from vinesim.kernels.articulation.kinematics import forward_kinematics
+from vinesim.kernels.articulation.prediction import predict
+from vinesim.kernels.launch import bind_launch
+
+if TYPE_CHECKING:
+    from vinesim.physics.plants.articulation_solver import ArticulationSolver
+
+Launch = Callable[..., None]
+
+STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
+"""Rows that are carried to the device before every prediction."""
+DEVICE_RESULTS = (
+    "body_q", "body_qd", "joint_xd_free", "joint_qd_free", "body_acceleration", "body_qd_free", "body_impulse",
+)  # fmt: skip
+"""Rows that kernels write, or that are carried over when they are needed."""
+SCRATCH = {
+    wp.vec3: ("lever", "tension", "Du"),
+    wp.quat: ("axes",),
+    wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "root_inverse_mass"),
+    wp.transform: ("after_q",),
+    wp.spatial_vector: (
+        "bias", "subtree_wrench", "added_acceleration", "before", "after_qd", "impact_acceleration", "impact_velocity",
+    ),
+}  # fmt: skip
+"""Rows that only kernels see."""
+
+
+class KernelLaunches:
+    """Launches of the articulation kernels on the arrays of one solver.
+
+    Arrays of the model are constants. What has a row for each body a GPU keeps a copy of, see
+    :mod:`vinesim.physics.plants.device_buffers`: :data:`STEP_INPUTS`, :data:`DEVICE_RESULTS`, and all others, which
+    :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is.
+    """
+
+    def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], threads: int) -> None:
+        """``parameters``: numbers of :class:`vinesim.kernels.articulation.structs.SolverParameters` but gravity."""
+        self.buffers, self._threads = solver.buffers, threads
+        self.changed = False
+        """Whether model rows (parents, masses, springs) differ from the device's copies."""
+        self._seldom: list[str] = []
+        self._register_arrays(solver)
+        self._record_transfers()
+        self.parameters = self.fill(structs.SolverParameters, **parameters)
+        self._record_step(self.parameters)
+        self._record_impact(
+            self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
+        )
+        self.response_capacity = self.joint_capacity = 0
+
+    # ------------------------------------------------------------------ arrays
+
+    def _register_arrays(self, solver: ArticulationSolver) -> None:
+        buffers, model = self.buffers, solver.model
+        buffers.set_layout(model.tree_first, model.tree_size)
+        buffers.add_constant("tree_pose", model.tree_pose, wp.transform)
+        for dtype, arrays in solver.kernel_arrays().items():
+            for name, data in arrays.items():
+                if name.startswith(("body_", "joint_", "tie_span")):
+                    buffers.add_body_rows(name, data, dtype, body_indices=name in ("body_parent", "body_root"))
+                    self._seldom += [name] if name not in DEVICE_RESULTS + STEP_INPUTS else []
+                else:
+                    buffers.add_shared(name, data, dtype)
+        for dtype, names in SCRATCH.items():
+            for name in names:
+                buffers.add_scratch(name, dtype)
+        trees = len(model.tree_first)
+        buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
+
+    def upload_changed(self) -> None:
+        """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
+        if self.changed:
+            self.buffers.upload(self._seldom)
+            self.changed = False
+
+    def fill(self, struct: Any, **values: Any) -> Any:
+        """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named so."""
+        filled, arrays = struct(), self.buffers.arrays
+        values = {"pitch": self.buffers.pitch} | values
+        for field in struct.vars:
+            value = values.get(field, field)
+            setattr(filled, field, arrays[value] if isinstance(value, str) else value)
+        return filled
+
+    def record(self, kernel: Any, *arguments: object, **options: Any) -> Launch:
+        """Bind a kernel; a string among the arguments names an array."""
+        given = [self.buffers.arrays[value] if isinstance(value, str) else value for value in arguments]
+        return bind_launch(kernel, given, [], device=str(self.buffers.device), **options)
+
+    # ------------------------------------------------------------------ transfers of the listed trees' rows
+
+    def _record_transfers(self) -> None:
+        def copier(trees: str, *names: str, to_host: bool = False) -> Callable[[int], None]:
+            return self.buffers.row_copier(names, trees, to_host=to_host)
+
+        self.upload_step = copier("stepping", *STEP_INPUTS)
+        self.download_prediction = copier("stepping", "body_q", "body_qd", "body_qd_free", to_host=True)
+        self.upload_wrenches = copier("stepping", "body_wrench")
+        self.download_joints = copier(
+            "stepping", "joint_x", "joint_xd", "joint_q", "joint_qd", "body_acceleration", to_host=True
+        )
+        self.upload_subset_joints = copier("subset", "joint_x", "joint_xd", "joint_q", "joint_qd")
+        self.download_subset_bodies = copier("subset", "body_q", "body_qd", to_host=True)
+        self.upload_impact = copier("subset", *STEP_INPUTS, "body_impulse")
+        self.upload_impact_rates = copier("subset", "joint_xd_free", "joint_qd_free")
+        self.download_impact_rates = copier("subset", "joint_xd_free", "joint_qd_free", to_host=True)
+
+    # ------------------------------------------------------------------ kernels
+
+    def _record_step(self, parameters: Any) -> None:
+        fill, record, s = self.fill, self.record, structs
+        self._model, self._forces = fill(s.ArticulationModel), fill(s.AppliedForces)
+        joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
+        scratch, prediction = fill(s.Scratch), fill(s.Prediction)
+        partitioned = {"index_list": "trees", "partitions": self._threads}
+        self.predict = record(
+            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", self._forces, joints, "phi_used",
+            self._bodies, self._factors, scratch, prediction, **partitioned,
+        )  # fmt: skip
+        self.integrate = record(
+            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", joints, prediction, "tree_rate",
+            "tree_euler_steps", joints, **partitioned,
+        )  # fmt: skip
+        self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
+        self.apply_wrenches = record(
+            apply_wrenches, parameters.dt, self._model, "subset", "body_wrench", self._factors, fill(s.WrenchScratch),
+            scratch, prediction,
+        )  # fmt: skip
+        self.correct_floating_momentum = record(
+            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", self._forces,
+            self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
+        )  # fmt: skip
+
+    def _record_impact(self, parameters: Any) -> None:
+        """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""
+        fill, s = self.fill, structs
+        joints, scratch = fill(s.JointState), fill(s.Scratch)
+        prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
+        self.factor_impact = self.record(
+            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", self._forces, joints, "impact_phi",
+            self._bodies, self._factors, scratch, prediction, index_list="trees",
+        )  # fmt: skip
+        self.apply_impulses = self.record(
+            apply_wrenches, 1.0, self._model, "subset", "body_impulse", self._factors, fill(s.WrenchScratch), scratch,
+            prediction,
+        )  # fmt: skip
+
+    def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
+        """Response [n, 6, n, 6] of some bodies [n] to unit impulses on them; a view, good until the next call."""
+        n, buffers = len(bodies), self.buffers
+        if n > self.response_capacity or self.response_capacity == 0:
+            self._record_response(max(2 * self.response_capacity, n, 16))
+        self._response_bodies[:n] = buffers.slots[bodies]
+        self._respond(n)
+        buffers.synchronize()
+        return self._response[:n, :, :n]
+
+    def _record_response(self, capacity: int) -> None:
+        self.response_capacity, buffers = capacity, self.buffers
+        self._response_bodies = buffers.pinned(np.zeros(capacity, np.int32))
+        self._response = buffers.pinned(np.zeros((capacity, 6, capacity, 6), np.float32))
+        buffers.add_shared("response_bodies", self._response_bodies, wp.int32)
+        buffers.add_shared("response", self._response, float)
+        stride = buffers.max_tree_extent
+        matrix: Any = wp.mat33
+        columns = {
+            name: wp.empty(capacity * stride, dtype=matrix, device=buffers.device)
+            for name in structs.ResponseColumns.vars
+        }
+        self._respond = self.record(
+            impulse_response, self._model, stride, "response_bodies", self._factors,
+            self.fill(structs.ResponseColumns, **columns), "response",
+        )  # fmt: skip
+
+    def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
+        """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
+        n, buffers = len(bodies), self.buffers
+        if n > self.joint_capacity:
+            self._record_joint_wrench(max(2 * self.joint_capacity, n, 16))
+        self._joint_bodies[:n] = buffers.slots[bodies]
+        self._sum_joint_wrenches(n)
+        buffers.synchronize()
+        return self._joint_wrench[:n].copy()
+
+    def _record_joint_wrench(self, capacity: int) -> None:
+        self.joint_capacity, buffers = capacity, self.buffers
+        self._joint_bodies = buffers.pinned(np.zeros(capacity, np.int32))
+        self._joint_wrench = buffers.pinned(np.zeros((capacity, 6), np.float32))
+        wrench: Any = wp.spatial_vector
+        buffers.add_shared("joint_bodies", self._joint_bodies, wp.int32)
+        buffers.add_shared("joint_wrench", self._joint_wrench, wrench)
+        self._sum_joint_wrenches = self.record(
+            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", self._forces, self._bodies,
+            "body_acceleration", "joint_wrench",
+        )  # fmt: skip

@@ -1,0 +1,82 @@
+"""Ties: springs and dampers that hold bodies at points of the world, the model's and those of hands.
+
+The ties of a body are adjacent in the arrays of the kernels. So behind the model's ties there are equal spans for bodies
+that are held: a body gets one, its own ties are copied to the front of it, and its hands take the places behind them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.model import Model
+
+
+class TieTable:
+    """All ties of a solver.
+
+    Args:
+        model: its ties come first, sorted by body.
+        max_bodies: so many bodies can be held at once,
+        max_hands: each in so many places.
+    """
+
+    def __init__(self, model: Model, max_bodies: int, max_hands: int) -> None:
+        self._max_bodies, self._max_hands, self._model_ties = max_bodies, max_hands, len(model.tie_body)
+        bodies = len(model.body_mass)
+        self._max_model_ties = int(np.bincount(model.tie_body, minlength=bodies).max(initial=0))
+        self._span_size = self._max_model_ties + max_hands
+        room = max_bodies * self._span_size
+        self.anchor = np.append(model.tie_anchor, np.zeros((room, 3), np.float32), 0)
+        """Where ties are held [tie, 3] m, in the world."""
+        self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
+        """[tie] N/m; a tie of zero does nothing."""
+        self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
+        """[tie] N s/m"""
+        self.point = np.append(model.tie_point, np.zeros((room, 3), np.float32), 0)
+        """[tie, 3] m in the body's frame."""
+        ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
+        self.span = np.stack([ends[:-1], ends[1:]], -1)
+        """[body, 2] first tie of a body and the one after its last."""
+        self._model_span = self.span.copy()
+        self._slot_of: dict[int, int] = {}
+
+    def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
+        """Tie a body with world pose [7] at a point [3] m of its frame, where that is now; returns the tie.
+
+        :class:`ValueError` if too many bodies are held, or this one in too many places.
+        """
+        if body not in self._slot_of:
+            self._give_span(body)
+        start = self._hands_start(body)
+        spare = np.flatnonzero(self.stiffness[start : start + self._max_hands] == 0.0)
+        if len(spare) == 0:
+            raise ValueError(f"body {body} is held in {self._max_hands} places already; let go of one")
+        tie = start + int(spare[0])
+        self.anchor[tie] = pose[:3] + frames.rotate(pose[3:], np.asarray(point, float))
+        self.point[tie], self.stiffness[tie], self.damping[tie] = point, stiffness, damping
+        return tie
+
+    def remove(self, body: int, tie: int) -> None:
+        """Undo a tie of :meth:`add`."""
+        self.stiffness[tie] = self.damping[tie] = 0.0
+        start = self._hands_start(body)
+        if not self.stiffness[start : start + self._max_hands].any():
+            del self._slot_of[body]
+            self.span[body] = self._model_span[body]
+
+    def _hands_start(self, body: int) -> int:
+        return self._model_ties + self._span_size * self._slot_of[body] + self._max_model_ties
+
+    def _give_span(self, body: int) -> None:
+        free = [i for i in range(self._max_bodies) if i not in self._slot_of.values()]
+        if not free:
+            raise ValueError(f"body {body} is one too many: {self._max_bodies} are held already, let go of one")
+        self._slot_of[body] = free[0]
+        own = slice(*self._model_span[body].tolist())
+        start = self._model_ties + self._span_size * free[0]
+        here = slice(start, start + own.stop - own.start)
+        for values in (self.anchor, self.stiffness, self.damping, self.point):
+            values[start : start + self._span_size] = 0.0
+            values[here] = values[own]
+        self.span[body] = start, start + self._span_size

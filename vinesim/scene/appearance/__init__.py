@@ -1,0 +1,25 @@
+"""What people and crates look like: shapes read from ``data/figures``, in the frames of the links that carry them.
+
+An appearance does not depend on the renderer: a part is a few round cones, ellipsoids, boxes, cylinders and lofts (meshes
+through rings), each with a colour and a surface by name. The bodies that touch are others, and belong to the physics.
+"""
+
+from vinesim.scene.appearance.crates import crate_shapes
+from vinesim.scene.appearance.human import FINGERS, PHALANGES, HumanModel, Limbs, load_human_model
+from vinesim.scene.appearance.lofts import smooth_normals
+from vinesim.scene.appearance.postures import apply_posture, posture_names
+from vinesim.scene.appearance.shapes import SURFACES, AppearanceError
+
+__all__ = [
+    "FINGERS",
+    "PHALANGES",
+    "SURFACES",
+    "AppearanceError",
+    "HumanModel",
+    "Limbs",
+    "apply_posture",
+    "crate_shapes",
+    "load_human_model",
+    "posture_names",
+    "smooth_normals",
+]

@@ -1,0 +1,80 @@
+"""Postures of people by name: where head, hands, hips and feet are, from ``data/figures/postures.toml``."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.appearance.shapes import AppearanceError, Point, Table
+from vinesim.scene.data_files import find_data_file
+from vinesim.scene.toml_loader import load_toml
+from vinesim.scene.values import HumanPose
+
+
+class Palm(Table, frozen=True):
+    """Where a hand is."""
+
+    at: Point
+    """[m]"""
+    along: Point
+    """Where the fingers point."""
+    back: Point
+    """Where the back of the hand faces."""
+    bent: tuple[float, float, float, float, float]
+    """Thumb, index, middle, ring and little finger, 0 to 1."""
+
+
+class Posture(Table, frozen=True):
+    """Positions of a person's tracked points [m], feet about the origin, facing along x."""
+
+    head: Point | None = None
+    tilt: float = 0.0
+    """Of the head [rad], positive looks down."""
+    hips: Point | None = None
+    left: Palm | None = None
+    right: Palm | None = None
+    left_foot: Point | None = None
+    right_foot: Point | None = None
+
+
+class PostureFile(Table, frozen=True):
+    height: float
+    postures: dict[str, Posture]
+
+
+@functools.cache
+def _load_postures() -> PostureFile:
+    return load_toml(find_data_file("figures", "postures", ".toml"), PostureFile, AppearanceError)
+
+
+def posture_names() -> tuple[str, ...]:
+    """Names that :func:`apply_posture` knows."""
+    return tuple(_load_postures().postures)
+
+
+def apply_posture(standing: HumanPose, name: str, height: float) -> HumanPose:
+    """The pose of a person of this height [m] in a posture of ``data/figures/postures.toml``.
+
+    ``standing`` is the same person upright: it gives the place and all points that the posture leaves out.
+    :class:`AppearanceError` if there is no posture of that name.
+    """
+    file = _load_postures()
+    if name not in file.postures:
+        raise AppearanceError(f"posture {name!r} is unknown; give one of: {', '.join(file.postures)}")
+    scale, one, usual = height / file.height, file.postures[name], file.postures["stand"]
+    points = {}
+    for point in ("head", "hips", "left_foot", "right_foot"):
+        if at := getattr(one, point) or getattr(usual, point):
+            points[point] = frames.compose(standing.root, frames.pose(scale * np.array(at)))
+    nod = frames.pose(np.zeros(3), frames.exp(np.array([0.0, one.tilt, 0.0])))
+    points["head"] = frames.compose(points.get("head", standing.head), nod)
+    for side in ("left", "right"):
+        palm = getattr(one, side) or getattr(usual, side)
+        if palm:
+            turn = frames.from_x_axis(np.array(palm.along), np.array(palm.back))
+            points[side] = frames.compose(standing.root, frames.pose(scale * np.array(palm.at), turn))
+            points[f"{side}_fingers"] = palm.bent
+    return dataclasses.replace(standing, **points)

@@ -1,0 +1,100 @@
+"""Shapes as figure files describe them: paints, cones, cylinders, ellipsoids and boxes."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vinesim import frames
+from vinesim.scene.toml_loader import DataError
+from vinesim.scene.values import Shape
+
+SURFACES = ("paint", "plastic", "cloth", "skin", "rubber", "metal", "straw", "reflex", "glass", "lamp")
+"""What a shape can be made of, beside its colour."""
+Surface = Literal["paint", "plastic", "cloth", "skin", "rubber", "metal", "straw", "reflex", "glass", "lamp"]
+Point = tuple[float, float, float]
+_Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
+
+
+class AppearanceError(DataError):
+    """A figure that cannot be drawn; one line with file, place, finding and remedy."""
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
+class Paint(Table, frozen=True):
+    """Colour and surface of a shape."""
+
+    rgb: Point
+    """sRGB, 0 to 1."""
+    surface: Surface
+
+
+class ShapeSpec(Table, frozen=True, kw_only=True):
+    """One shape of a part [m, rad]; which fields count follows from ``kind``."""
+
+    kind: Literal["cone", "cylinder", "ellipsoid", "box", "loft"]
+    paint: str | tuple[str, ...]
+    """Name of a :class:`Paint`; of a loft, one for each strip between two rings."""
+    start: Point = (0.0, 0.0, 0.0)
+    """Of a cone or a cylinder."""
+    end: Point = (0.0, 0.0, 0.0)
+    radius: tuple[float, float] = (0.0, 0.0)
+    """At both ends; the first alone counts for a cylinder."""
+    at: Point = (0.0, 0.0, 0.0)
+    half: Point = (0.0, 0.0, 0.0)
+    """Half axes of an ellipsoid, half edges of a box."""
+    turn: Point = (0.0, 0.0, 0.0)
+    """Rotation vector of an ellipsoid or a box [rad]."""
+    twin: bool = False
+    """There is a second one, mirrored to the other side."""
+    along: Literal["x", "z"] = "z"
+    """Axis of a loft: z (front is x) or x (front is z); left is y."""
+    rings: tuple[tuple[float, ...], ...] = ()
+    """Of a loft: place on the axis, rear, front, half width, and how far it lies to the left (0 unless given)."""
+    arc: tuple[float, float] = (-180.0, 180.0)
+    """Which part of its rings a loft covers, counter-clockwise about its axis from the front [degrees]."""
+    arc_end: tuple[float, float] | None = None
+    """The same at its last ring, if it narrows or widens from the first to there."""
+    swell: float = 0.0
+    """By how much a loft's rings are wider than written: a patch on another loft."""
+    sides: int = 20
+    """Edges of a whole ring."""
+    square: float = 2.0
+    """Exponent of the rings: 2 an ellipse, more a rounded rectangle."""
+
+
+def check_spec(paints: dict[str, Paint], spec: ShapeSpec, place: str) -> None:
+    """:class:`AppearanceError` naming ``place`` if paints are unknown or the rings of a loft do not fit."""
+    names = (spec.paint,) if isinstance(spec.paint, str) else spec.paint
+    if missing := [name for name in names if name not in paints]:
+        raise AppearanceError(f"{place}.paint is {missing[0]!r}; give one of: {', '.join(paints)}")
+    if spec.kind != "loft":
+        return
+    if len(spec.rings) < 2 or any(len(ring) not in (4, 5) for ring in spec.rings):
+        raise AppearanceError(
+            f"{place}.rings: give two rings or more, each [place, rear, front, half width] or one more"
+        )
+    if not isinstance(spec.paint, str) and len(spec.paint) != len(spec.rings) - 1:
+        raise AppearanceError(f"{place}.paint names {len(spec.paint)} paints; give one, or {len(spec.rings) - 1}")
+
+
+def surface_fields(paint: Paint) -> tuple[tuple[float, float, float, float], str, str]:
+    """Colour, file and surface of a shape."""
+    return (*paint.rgb, 1.0), "", paint.surface
+
+
+def rod_shape(
+    start: ArrayLike, end: ArrayLike, radius: tuple[float, float], scale: float, paint: Paint, kind: str = "cone"
+) -> Shape:
+    """A round cone or a cylinder from one point [3] to another; all lengths [m] are multiplied by ``scale``."""
+    a, b = scale * np.asarray(start, float), scale * np.asarray(end, float)
+    half = 0.5 * float(np.linalg.norm(b - a))
+    turn = frames.multiply(frames.from_x_axis(b - a), _Z_TO_X)
+    ends = tuple(scale * r for r in radius) if kind == "cone" else (scale * radius[0],)
+    return Shape(kind, (*ends, half), frames.pose(0.5 * (a + b), turn), *surface_fields(paint))

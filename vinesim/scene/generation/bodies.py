@@ -1,0 +1,208 @@
+"""Bodies of all shoots in one table [shoot, slot]: poses as drawn, masses, inertias, springs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene import builder
+from vinesim.scene.generation.shoots import Shoots
+from vinesim.scene.generation.slots import (
+    AXIS_SEGMENTS,
+    CORE_SLOTS,
+    LATERAL_SEGMENTS,
+    LATERAL_SLOTS,
+    MAX_BUNCHES,
+    PEDUNCLE_SEGMENTS,
+    SLOT_COUNT,
+    cluster_slots,
+    peduncle_slots,
+)
+from vinesim.scene.ids import Organ
+from vinesim.scene.plant_parameters import VineParameters
+
+
+@dataclasses.dataclass
+class Bodies:
+    """[shoot, slot]: the table that becomes the model's bodies."""
+
+    present: np.ndarray
+    parent: np.ndarray
+    """Slot, -1 for the root."""
+    organ: np.ndarray
+    origin: np.ndarray
+    turn: np.ndarray
+    """World pose as drawn."""
+    length: np.ndarray
+    radius: np.ndarray
+    mass: np.ndarray
+    com: np.ndarray
+    inertia: np.ndarray
+    stiffness: np.ndarray
+    half: np.ndarray
+    """Spring of what of a piece of wood lies behind its middle."""
+    damping: np.ndarray
+    drag: np.ndarray
+    """Drag area Cd A [m^2]."""
+    head: dict[str, np.ndarray]
+    """[shoot, MAX_BUNCHES] mass, com, inertia of what of a bunch is no cluster."""
+
+
+def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
+    count = len(shoots.vine)
+    shape = (count, SLOT_COUNT)
+    bodies = Bodies(
+        present=np.ones(shape, bool), parent=np.zeros(shape, int), organ=np.full(shape, int(Organ.CANE)),
+        origin=np.zeros((*shape, 3)), turn=np.zeros((*shape, 4)), length=np.zeros(shape), radius=np.zeros((*shape, 2)),
+        mass=np.zeros(shape), com=np.zeros((*shape, 3)), inertia=np.zeros((*shape, 3)),
+        stiffness=np.zeros((*shape, 3)), half=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)),
+        drag=np.zeros(shape),
+        head={"mass": np.zeros((count, MAX_BUNCHES)), "com": np.zeros((count, MAX_BUNCHES, 3)),
+              "inertia": np.zeros((count, MAX_BUNCHES, 3))},
+    )  # fmt: skip
+    cane, peduncle = parameters.cane, parameters.peduncle
+
+    tip = 0.5 * cane.tip_diameter.value
+    share = np.linspace(0.0, 1.0, AXIS_SEGMENTS + 1)
+    radius = shoots.base[:, None] + (tip - shoots.base[:, None]) * share
+    green = np.clip((share[:-1] - cane.woody_share.value) / 0.2 + 0.5, 0.0, 1.0)
+    modulus = np.exp(np.log(cane.woody_modulus.value) * (1.0 - green) + np.log(cane.green_modulus.value) * green)
+    parent = np.broadcast_to(np.arange(-1, AXIS_SEGMENTS - 1), (count, AXIS_SEGMENTS))
+    _fill_rod(
+        bodies,
+        slice(0, AXIS_SEGMENTS),
+        shoots.points,
+        radius,
+        modulus,
+        cane.density.value,
+        cane.damping.value,
+        shoots.up,
+        parent,
+    )
+
+    thin = 0.5 * cane.lateral_diameter.value
+    radius = np.broadcast_to(np.linspace(thin, 0.6 * thin, LATERAL_SEGMENTS + 1), (count, LATERAL_SEGMENTS + 1))
+    parent = np.concatenate(
+        [
+            shoots.lateral_at[:, None],
+            np.broadcast_to(
+                np.arange(AXIS_SEGMENTS, AXIS_SEGMENTS + LATERAL_SEGMENTS - 1), (count, LATERAL_SEGMENTS - 1)
+            ),
+        ],
+        1,
+    )
+    modulus = np.full(LATERAL_SEGMENTS, cane.green_modulus.value)
+    _fill_rod(
+        bodies,
+        LATERAL_SLOTS,
+        shoots.lateral_points,
+        radius,
+        modulus,
+        cane.density.value,
+        cane.damping.value,
+        shoots.up,
+        parent,
+    )
+    bodies.present[:, LATERAL_SLOTS] = shoots.has_lateral[:, None]
+
+    for k in range(MAX_BUNCHES):
+        slots = peduncle_slots(k)
+        pieces = slice(slots.start, slots.stop - 1)
+        thick = shoots.fruit["thick"][:, k]
+        radius = np.broadcast_to(thick[:, None], (count, PEDUNCLE_SEGMENTS + 1))
+        chain = np.broadcast_to(np.arange(slots.start, slots.stop - 2), (count, PEDUNCLE_SEGMENTS - 1))
+        parent = np.concatenate([shoots.bunch_at[:, k, None], chain], 1)
+        modulus = np.full(PEDUNCLE_SEGMENTS, peduncle.modulus.value)
+        _fill_rod(
+            bodies,
+            pieces,
+            shoots.peduncle[:, k],
+            radius,
+            modulus,
+            peduncle.density.value,
+            peduncle.damping.value,
+            shoots.bunch_up[:, k],
+            parent,
+        )
+        bodies.organ[:, pieces] = int(Organ.PEDUNCLE)
+
+        _fill_bunch(parameters, shoots, bodies, k)
+        bodies.present[:, slots] = shoots.has_bunch[:, k, None]
+    across = bodies.radius.sum(-1) * bodies.length  # of wood seen from the side
+    bodies.drag[:, :CORE_SLOTS] += np.where(bodies.organ == int(Organ.BUNCH), 0.0, cane.drag.value * across)[
+        :, :CORE_SLOTS
+    ]
+    return bodies
+
+
+def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: int) -> None:
+    """Fill the slots of the bunch at the end of stalk ``k`` and of its clusters."""
+    bunch, clusters = peduncle_slots(k).stop - 1, cluster_slots(k)
+    bodies.present[:, clusters] = False
+    has = np.flatnonzero(shoots.has_bunch[:, k])
+    if len(has) == 0:
+        return
+    mass, long, wide, count, seed = (
+        shoots.fruit[name][has, k] for name in ("mass", "length", "radius", "count", "seed")
+    )
+    pieces = builder.segment_bunches(
+        mass, long, wide, count, seed, parameters.rachis, parameters.bunch.stem_share.value
+    )
+    bodies.mass[has, bunch], bodies.com[has, bunch], bodies.inertia[has, bunch] = pieces.compound()
+    for name, head in bodies.head.items():
+        head[has, k] = getattr(pieces, name)[:, 0]
+    bodies.organ[:, bunch] = bodies.organ[:, clusters] = int(Organ.BUNCH)
+    bodies.parent[:, bunch] = bunch - 1
+    bodies.origin[:, bunch] = shoots.peduncle[:, k, -1]
+    bodies.turn[:, bunch] = frames.from_x_axis(shoots.bunch_axis[:, k], shoots.bunch_up[:, k])
+    bodies.length[has, bunch], bodies.radius[has, bunch] = long, wide[:, None]
+    bodies.stiffness[:, bunch], bodies.damping[:, bunch] = bodies.stiffness[:, bunch - 1], bodies.damping[:, bunch - 1]
+    # the wind takes hold of the bunch as a whole
+    bodies.drag[has, bunch] = parameters.bunch.drag.value * 0.5 * np.pi * wide * long
+
+    most = pieces.mass.shape[1] - 1
+    number = np.arange(1, most + 1)
+    slots = np.arange(clusters.start, clusters.start + most)
+    at = np.ix_(has, slots)
+    bodies.present[at] = number < pieces.count[:, None]
+    bodies.parent[at] = np.where(number == 1, bunch, slots - 1)
+    bodies.turn[at] = bodies.turn[has, bunch, None]
+    along = frames.rotate(bodies.turn[has, bunch], np.array([1.0, 0.0, 0.0])) * pieces.length[:, None]
+    bodies.origin[at] = bodies.origin[has, bunch, None] + number[:, None] * along[:, None]
+    bodies.length[at] = pieces.length[:, None]
+    for name in ("radius", "mass", "com", "inertia", "stiffness"):
+        getattr(bodies, name)[at] = getattr(pieces, name)[:, 1:]
+    bodies.damping[at] = parameters.rachis.damping.value * pieces.stiffness[:, 1:]
+
+
+def _fill_rod(
+    bodies: Bodies, slots: slice, points: np.ndarray, radius: np.ndarray, modulus: np.ndarray, density: float,
+    damping: float, up: np.ndarray, parent: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill the slots of one axis: points [shoot, piece + 1, 3], radius [shoot, piece + 1], modulus [piece].
+
+    It is a root, or grows on its parent's tip.
+    """
+    along = np.diff(points, axis=1)
+    length = np.linalg.norm(along, axis=-1)
+    start, end = radius[:, :-1], radius[:, 1:]
+    mass, inertia, near, bodies.half[:, slots] = builder.segment_properties(length, start, end, modulus, density)
+    bodies.parent[:, slots] = parent
+    bodies.origin[:, slots] = points[:, :-1]
+    bodies.turn[:, slots] = turn = frames.from_x_axis(along, up[:, None])
+    compliance = 1.0 / near
+    compliance[:, 1:] += 1.0 / bodies.half[:, slots][:, :-1]
+    if (parent[:, 0] >= 0).all():
+        grown_on = np.arange(len(parent)), parent[:, 0]
+        axes = frames.to_matrix(frames.multiply(frames.conjugate(bodies.turn[grown_on]), turn[:, 0]))
+        compliance[:, 0] += np.einsum("si,sij->sj", 1.0 / bodies.half[grown_on], axes**2)
+    stiffness = 1.0 / compliance
+    bodies.length[:, slots] = length
+    bodies.radius[:, slots] = np.stack([start, end], -1)
+    bodies.mass[:, slots] = mass
+    bodies.com[:, slots, 0] = 0.5 * length
+    bodies.inertia[:, slots] = inertia
+    bodies.stiffness[:, slots] = stiffness
+    bodies.damping[:, slots] = damping * stiffness

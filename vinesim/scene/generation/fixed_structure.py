@@ -1,0 +1,117 @@
+"""What stands still: poles, wires, trunks and arms, as round cones; and the random stream of each vine."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.scene.generation.slots import ARM_SEGMENTS, TRUNK_SEGMENTS
+from vinesim.scene.ids import Organ
+from vinesim.scene.plant_parameters import VineParameters
+from vinesim.scene.spec import Scene
+
+
+@dataclasses.dataclass
+class FixedStructure:
+    """Vines with the numbers each has drawn, their arms, and everything that stands still."""
+
+    foot: np.ndarray
+    """[vine, 3] m"""
+    row: np.ndarray
+    """[vine]"""
+    rngs: list[np.random.Generator]
+    arms: np.ndarray
+    """[vine, arm, point, 3] m"""
+    trunk: np.ndarray
+    """[vine, point, 3] m"""
+    fixed: dict[str, np.ndarray]
+
+
+def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStructure:
+    layout, tendone = scene.layout, scene.training == "tendone"
+    row, place = (a.ravel() for a in np.mgrid[0 : layout.rows, 0 : layout.vines])
+    foot = np.stack([place * layout.vine_spacing, row * layout.row_spacing, 0.0 * row], -1)
+    rngs = [
+        np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(int(r), int(p))))
+        for r, p in zip(row, place, strict=True)
+    ]
+    arm_count = int((parameters.arm.tendone_arms if tendone else parameters.arm.vsp_arms).value)
+    wobble = np.stack([g.normal(size=(TRUNK_SEGMENTS + 1, 3)) for g in rngs])
+    bend = np.stack([g.normal(size=(arm_count, ARM_SEGMENTS + 1, 3)) for g in rngs])
+
+    head = layout.height - (0.06 if tendone else 0.03)
+    up = np.linspace(0.0, 1.0, TRUNK_SEGMENTS + 1)[:, None]
+    beside = parameters.trunk.beside_pole.value
+    side = np.array([0.0, beside, 0.0] if tendone else [beside, 0.0, 0.0])
+    trunk = foot[:, None] + up * [0.0, 0.0, head] + side * (1.0 - 0.45 * up)
+    trunk += np.cumsum(wobble, 1) * [0.015, 0.015, 0.0] * np.sin(np.pi * np.minimum(up, 0.5))
+
+    angle = 2.0 * np.pi * np.arange(arm_count) / arm_count
+    out = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
+    reach = parameters.arm.share.value * np.where(np.abs(out[:, 1]) > 0.5, layout.row_spacing, layout.vine_spacing)
+    along = np.linspace(0.0, 1.0, ARM_SEGMENTS + 1)[:, None]
+    arms = trunk[:, -1, None, None] + out[:, None] * reach[:, None, None] * along
+    sway = np.cumsum(bend, 2) * [0.016, 0.016, 0.008]
+    sway[:, :, 0] = 0.0
+    arms = arms + sway
+    arms[..., 2] = np.minimum(arms[..., 2] + 0.03 * along[:, 0], layout.height - 0.005)
+
+    thick = 0.5 * parameters.trunk.diameter.at(up[:, 0])
+    thin = 0.5 * parameters.arm.diameter.at(along[:, 0])
+    count = len(foot)
+    radius = 0.5 * parameters.trellis.pole_diameter.value
+    pieces = [
+        _cone_chains(trunk, thick, Organ.TRUNK, np.arange(count)),
+        _cone_chains(arms.reshape(-1, ARM_SEGMENTS + 1, 3), thin, Organ.ARM, np.arange(count * arm_count)),
+        _cone_chains(
+            foot[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
+            np.array([radius, radius]), Organ.POLE, np.arange(count),
+        ),
+        *_wires(scene, parameters),
+    ]  # fmt: skip
+    fixed = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    return FixedStructure(foot, row, rngs, arms, trunk, fixed)
+
+
+def _cone_chains(points: np.ndarray, radius: np.ndarray, organ: Organ, index: np.ndarray) -> dict[str, np.ndarray]:
+    """Round cones along polylines [chain, point, 3]."""
+    pieces = points.shape[1] - 1
+    pairs = np.broadcast_to(np.stack([radius[:-1], radius[1:]], -1), (len(points), pieces, 2))
+    return {
+        "fixed_start": points[:, :-1].reshape(-1, 3),
+        "fixed_end": points[:, 1:].reshape(-1, 3),
+        "fixed_radius": pairs.reshape(-1, 2),
+        "fixed_organ": np.full(len(points) * pieces, int(organ)),
+        "fixed_index": np.repeat(index, pieces),
+    }
+
+
+def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarray]]:
+    """A net at the roof (tendone), or a fruiting wire and pairs of catch wires in each row (vsp)."""
+    layout, trellis = scene.layout, parameters.trellis
+    wide, deep = (layout.vines - 1) * layout.vine_spacing, (layout.rows - 1) * layout.row_spacing
+    over_x, over_y = 0.5 * layout.vine_spacing, 0.5 * layout.row_spacing
+    # a wire runs from pole to pole: points half a field before the first and behind the last one
+    xs = np.unique([-over_x, *(np.arange(layout.vines) * layout.vine_spacing), wide + over_x])
+    ys = np.unique([-over_y, *(np.arange(layout.rows) * layout.row_spacing), deep + over_y])
+    radius = 0.5 * trellis.wire_diameter.value
+    if scene.training == "tendone":
+        step_y = layout.row_spacing / max(round(layout.row_spacing / trellis.tendone_wire_spacing.value), 1)
+        step_x = layout.vine_spacing / max(round(layout.vine_spacing / trellis.tendone_wire_spacing.value), 1)
+        at_y = np.arange(-over_y, deep + over_y + 1e-6, step_y)
+        at_x = np.arange(-over_x, wide + over_x + 1e-6, step_x)
+        along_x = np.stack(np.broadcast_arrays(xs[None], at_y[:, None], layout.height), -1)
+        along_y = np.stack(np.broadcast_arrays(at_x[:, None], ys[None], layout.height + 2.0 * radius), -1)
+        lines = [along_x, along_y]
+    else:
+        apart = radius + 0.5 * trellis.pole_diameter.value
+        heights = layout.height + trellis.vsp_wire_spacing.value * np.arange(1, int(trellis.vsp_wires.value) + 1)
+        across = [(0.0, layout.height), *((side * apart, z) for z in heights for side in (-1.0, 1.0))]
+        rows = np.arange(layout.rows) * layout.row_spacing
+        lines = [np.stack(np.broadcast_arrays(xs[None], (rows + y)[:, None], z), -1) for y, z in across]
+    first, pieces = 0, []
+    for line in lines:
+        pieces.append(_cone_chains(line, np.full(line.shape[1], radius), Organ.WIRE, first + np.arange(len(line))))
+        first += len(line)
+    return pieces

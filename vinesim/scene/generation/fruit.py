@@ -1,0 +1,127 @@
+"""Bunches: their mass, berries and peduncles, and which of them a vine keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene import berries
+from vinesim.scene.generation.fixed_structure import FixedStructure
+from vinesim.scene.generation.slots import AXIS_SEGMENTS, MAX_BUNCHES, PEDUNCLE_SEGMENTS
+from vinesim.scene.plant_parameters import Range, VineParameters
+from vinesim.scene.spec import Scene
+
+Sampler = Callable[..., np.ndarray]
+"""Random numbers [shoot, ...] of the shape asked for, each shoot's from the stream of its vine."""
+
+MIN_GAP = 0.02
+"""Least gap between a bunch and its neighbours, poles and trunks [m]."""
+MAX_BUCKLING_LOAD = 0.6
+"""Most m g a^2 / EI of bunches at height a above the base of their shoot; a uniform column buckles at 2.47."""
+
+
+def sample_fruit(
+    scene: Scene,
+    parameters: VineParameters,
+    points: np.ndarray,
+    nodes: np.ndarray,
+    row: np.ndarray,
+    uniform: Sampler,
+    normal: Sampler,
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Two bunches for every shoot, of which :func:`choose_bunches` keeps some: fruit, at, peduncle, axis, roll."""
+    fruit, peduncle = parameters.bunch, parameters.peduncle
+    sigma = np.sqrt(np.log(1.0 + fruit.mass_variation.value**2))
+    mass = fruit.mass.value * np.exp(sigma * normal(MAX_BUNCHES) - 0.5 * sigma**2)
+    mass = np.clip(mass, *fruit.mass_range.value)
+    names = [v.name for v in berries.VARIETIES]
+    in_turn = np.array([names.index(name) for name in scene.fruit.varieties])
+    variety = np.broadcast_to(in_turn[row % len(in_turn)][:, None], mass.shape)
+    juice = mass * (1.0 - fruit.stem_share.value)
+    berry_mass = np.array([v.mass for v in berries.VARIETIES])[variety]
+    count = np.clip(np.round(juice / berry_mass), berries.MIN_BERRIES, berries.MAX_BERRIES).astype(int)
+    seed = (uniform(MAX_BUNCHES) * 2.0**32).astype(np.uint32)
+    size = np.array([v.volume_radius for v in berries.VARIETIES])[variety] * np.cbrt(juice / (count * berry_mass))
+    hull = berries.hull_size(count, seed) * size[..., None]
+    drawn = {
+        "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,
+        "pull": peduncle.pull.at(uniform(MAX_BUNCHES)), "thick": 0.5 * peduncle.diameter.at(_fraction(mass, fruit.mass_range)),
+    }  # fmt: skip
+
+    # opposite the third to sixth leaf and one or two nodes further on, never both on one piece's tip
+    low, high = parameters.cane.first_bunch_node.value
+    node = low + (high - low) * uniform()
+    node = np.stack([node, node + 2.2], -1)
+    at = np.clip(np.round(node / nodes[:, None] * AXIS_SEGMENTS).astype(int) - 1, 1, AXIS_SEGMENTS - 2)
+    at[:, 1] = np.maximum(at[:, 1], at[:, 0] + 1)
+    rows = np.arange(len(points))[:, None]
+    top = points[rows, at + 1]
+    long = peduncle.length.at(uniform(MAX_BUNCHES)) / PEDUNCLE_SEGMENTS
+    angle = 2.0 * np.pi * uniform(MAX_BUNCHES)
+    level = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
+    tilt = np.clip(0.10 + 0.04 * normal(MAX_BUNCHES), 0.02, 0.18)[..., None]
+    if scene.training == "vsp":  # beside its upright shoot, out of the hedge
+        level = frames.normalize(level * [0.4, 1.0, 0.0])
+        tilt = tilt + 0.10
+    first = frames.normalize(level * tilt - [0.0, 0.0, 1.0])
+    second = frames.normalize(level * 0.3 * tilt - [0.0, 0.0, 1.0])
+    middle = top + first * long[..., None]
+    end = middle + second * long[..., None]
+    axis = frames.normalize(0.02 * normal(MAX_BUNCHES, 3) - [0.0, 0.0, 1.0])
+    return drawn, at, np.stack([top, middle, end], 2), axis, level
+
+
+def _fraction(value: np.ndarray, within: Range) -> np.ndarray:
+    """How far ``value`` lies between the ends of a range, 0..1."""
+    low, high = within.value
+    return (value - low) / (high - low)
+
+
+def choose_bunches(
+    scene: Scene,
+    structure: FixedStructure,
+    per_vine: int,
+    peduncle: np.ndarray,
+    burden: np.ndarray,
+    fruit: dict[str, np.ndarray],
+) -> np.ndarray:
+    """Thin each vine to its number of bunches.
+
+    None is kept that touches a pole, a trunk or a bunch already kept, or under which an upright shoot would buckle.
+    """
+    layout = scene.layout
+    low, high = scene.fruit.bunches
+    slots = per_vine * MAX_BUNCHES
+    top = peduncle[:, :, -1].reshape(-1, slots, 3)
+    length, radius = (fruit[k].reshape(-1, slots) for k in ("length", "radius"))
+    burden = burden.reshape(-1, slots)
+    level = top[..., :2] - structure.foot[:, None, :2]
+    inside = (
+        np.abs(level) + radius[..., None] + 0.5 * MIN_GAP < 0.5 * np.array([layout.vine_spacing, layout.row_spacing])
+    ).all(-1)
+    # the pole and the trunk, whose head lies 5-15 cm beside it
+    trunk = structure.trunk[:, :, None, :2] - top[:, None, :, :2]
+    beside = np.sqrt((trunk * trunk).sum(-1)).min(1)
+    clear = (np.linalg.norm(level, axis=-1) > radius + 0.05 + MIN_GAP) & (beside > radius + 0.06 + MIN_GAP)
+    kept = np.zeros((len(top), slots), bool)
+    for number, g in enumerate(structure.rngs):
+        wanted = int(g.integers(low, high + 1))
+        # the first bunch of a shoot is likelier kept than its second
+        order = np.argsort(g.random(slots) + 0.45 * (np.arange(slots) % MAX_BUNCHES), kind="stable")
+        order = order[(inside & clear)[number, order]]
+        t, r, h = top[number, order], radius[number, order], length[number, order]
+        apart = np.sqrt(((t[:, None, :2] - t[None, :, :2]) ** 2).sum(-1))
+        middle = t[:, 2] - 0.5 * h
+        rise = np.abs(middle[:, None] - middle[None])
+        touch = (apart < r[:, None] + r[None] + MIN_GAP) & (rise < 0.5 * (h[:, None] + h[None]) + 0.03)
+        load, free, shoot = burden[number, order], np.ones(len(order), bool), order // MAX_BUNCHES
+        load_kept = np.zeros(per_vine)
+        for i in range(len(order)):
+            if wanted and free[i] and load_kept[shoot[i]] + load[i] < MAX_BUCKLING_LOAD:
+                kept[number, order[i]] = True
+                free &= ~touch[i]
+                load_kept[shoot[i]] += load[i]
+                wanted -= 1
+    return kept.reshape(-1, MAX_BUNCHES)

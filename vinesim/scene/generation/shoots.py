@@ -1,0 +1,160 @@
+"""Shoots as random numbers shape them: main axis, lateral, nodes; their points in the world."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene import builder
+from vinesim.scene.generation.fixed_structure import FixedStructure
+from vinesim.scene.generation.fruit import choose_bunches, sample_fruit
+from vinesim.scene.generation.slots import (
+    ARM_SEGMENTS,
+    AXIS_SEGMENTS,
+    LATERAL_NODES,
+    LATERAL_SEGMENTS,
+    MAX_NODES,
+)
+from vinesim.scene.plant_parameters import VineParameters
+from vinesim.scene.spec import Scene
+
+
+@dataclasses.dataclass
+class Shoots:
+    """What is drawn of each shoot, first axis: shoot."""
+
+    vine: np.ndarray
+    up: np.ndarray
+    """[shoot, 3] direction that a body's z axis leans to."""
+    points: np.ndarray
+    """[shoot, AXIS_SEGMENTS + 1, 3] m, main axis."""
+    length: np.ndarray
+    base: np.ndarray
+    """[shoot] radius at the base [m]"""
+    has_lateral: np.ndarray
+    """[shoot] bool: has a side shoot"""
+    lateral_at: np.ndarray
+    """[shoot] piece of the main axis whose tip carries it"""
+    lateral_points: np.ndarray
+    """[shoot, LATERAL_SEGMENTS + 1, 3] m"""
+    has_bunch: np.ndarray
+    """[shoot, MAX_BUNCHES] bool"""
+    bunch_at: np.ndarray
+    """[shoot, MAX_BUNCHES] piece of the main axis whose tip carries the peduncle"""
+    peduncle: np.ndarray
+    """[shoot, MAX_BUNCHES, PEDUNCLE_SEGMENTS + 1, 3] m, the last point is the bunch's origin"""
+    bunch_axis: np.ndarray
+    """[shoot, MAX_BUNCHES, 3] direction of the bunch's axis"""
+    bunch_up: np.ndarray
+    """[shoot, MAX_BUNCHES, 3] direction that the bunch's z axis leans to"""
+    fruit: dict[str, np.ndarray]
+    """[shoot, MAX_BUNCHES] mass, count, length, radius, seed, variety, pull, thick"""
+    nodes: np.ndarray
+    """[shoot] nodes of the main axis"""
+    leaf_normal: np.ndarray
+    """[8, shoot, MAX_NODES + LATERAL_NODES] standard normal numbers"""
+    leaf_uniform: np.ndarray
+    """[4, shoot, MAX_NODES + LATERAL_NODES] uniform numbers"""
+
+
+def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStructure) -> Shoots:
+    tendone, cane = scene.training == "tendone", parameters.cane
+    each = int((parameters.arm.tendone_shoots if tendone else parameters.arm.vsp_shoots).value)
+    arm_count = structure.arms.shape[1]
+    per_vine, vines = each * arm_count, len(structure.foot)
+    count = per_vine * vines
+
+    def uniform(*shape: int) -> np.ndarray:
+        return np.stack([g.random((per_vine, *shape)) for g in structure.rngs]).reshape(count, *shape)
+
+    def normal(*shape: int) -> np.ndarray:
+        return np.stack([g.standard_normal((per_vine, *shape)) for g in structure.rngs]).reshape(count, *shape)
+
+    # where a shoot springs from its arm: evenly, a little shuffled, alternating sides
+    number = np.tile(np.arange(each), arm_count * vines)
+    share = 0.17 + 0.81 * (number + 0.2 + 0.6 * uniform()) / each
+    where = share * ARM_SEGMENTS
+    piece = np.minimum(where.astype(int), ARM_SEGMENTS - 1)
+    arm = structure.arms.reshape(vines * arm_count, ARM_SEGMENTS + 1, 3)[np.repeat(np.arange(vines * arm_count), each)]
+    rows = np.arange(count)
+    start = arm[rows, piece] + (arm[rows, piece + 1] - arm[rows, piece]) * (where - piece)[:, None]
+    along = frames.normalize((arm[:, -1] - arm[:, 0]) * [1.0, 1.0, 0.0])
+
+    length = cane.length.at(uniform())
+    base = 0.5 * cane.base_diameter.at(uniform())
+    side_sign = np.where(number % 2, 1.0, -1.0)
+    if tendone:
+        turn = np.arctan2(along[:, 1], along[:, 0]) + side_sign * (1.0 + 0.6 * uniform())
+        heading = np.stack([np.cos(turn), np.sin(turn), -0.38 + 0.15 * uniform()], -1)
+        up = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
+    else:
+        lean = normal(2) * [0.12, 0.05]
+        across = np.cross([0.0, 0.0, 1.0], along)
+        heading = along * lean[:, :1] + across * lean[:, 1:] + [0.0, 0.0, 1.0]
+        up = along
+    owner = np.repeat(np.arange(vines), per_vine)
+    points = _grow_main_axis(scene, start, heading, length, normal(AXIS_SEGMENTS, 3), structure.foot[owner])
+
+    has_lateral = uniform() < cane.lateral_share.value
+    lateral_at = 6 + (5 * uniform()).astype(int)
+    lateral_length, sign = cane.lateral_length.at(uniform()), np.where(uniform() < 0.5, 1, -1)
+    lateral_points = _grow_lateral(points, lateral_at, up, lateral_length, sign, normal(LATERAL_SEGMENTS, 3))
+
+    nodes = np.floor(cane.nodes.value[0] + (cane.nodes.value[1] - cane.nodes.value[0] + 1) * uniform()).astype(int)
+    nodes = np.minimum(nodes, MAX_NODES)
+    fruit, at, peduncle, bunch_axis, bunch_up = sample_fruit(
+        scene, parameters, points, nodes, structure.row[owner], uniform, normal
+    )
+    rise = np.maximum(peduncle[:, :, 0, 2] - points[:, :1, 2], 0.0)
+    stiffness = cane.woody_modulus.value * np.pi / 4.0 * base**4
+    burden = fruit["mass"] * -builder.GRAVITY[2] * rise**2 / stiffness[:, None]
+    chosen = choose_bunches(scene, structure, per_vine, peduncle, burden, fruit)
+    leaf_normal = np.moveaxis(normal(MAX_NODES + LATERAL_NODES, 8), -1, 0)
+    leaf_uniform = np.moveaxis(uniform(MAX_NODES + LATERAL_NODES, 4), -1, 0)
+    return Shoots(
+        vine=owner, up=up, points=points, length=length, base=base, has_lateral=has_lateral, lateral_at=lateral_at,
+        lateral_points=lateral_points, has_bunch=chosen, bunch_at=at, peduncle=peduncle, bunch_axis=bunch_axis, bunch_up=bunch_up, fruit=fruit,
+        nodes=nodes, leaf_normal=leaf_normal, leaf_uniform=leaf_uniform,
+    )  # fmt: skip
+
+
+def _grow_main_axis(
+    scene: Scene, start: np.ndarray, heading: np.ndarray, length: np.ndarray, noise: np.ndarray, foot: np.ndarray
+) -> np.ndarray:
+    """Points of the shoots: over the net they are held between its wires, in a hedge between the catch wires."""
+    layout, tendone = scene.layout, scene.training == "tendone"
+    points = np.empty((len(start), AXIS_SEGMENTS + 1, 3))
+    points[:, 0] = start
+    heading = frames.normalize(heading)
+    step = (length / AXIS_SEGMENTS)[:, None]
+    for i in range(AXIS_SEGMENTS):
+        at, share = points[:, i], i / AXIS_SEGMENTS
+        heading = heading + noise[:, i] * ([0.10, 0.10, 0.06] if tendone else [0.07, 0.05, 0.03])
+        if tendone:
+            # the bearing part droops below the net, the rest climbs over it
+            low = layout.height - 0.28 + 0.44 * min(2.0 * share, 1.0)
+            heading[:, 2] += np.clip(2.2 * (low - at[:, 2]), -0.2, 0.28) * (0.5 + share)
+            heading[:, 2] = np.clip(heading[:, 2], -0.42, 0.5)
+        else:
+            heading[:, 1] = 0.7 * heading[:, 1] + 0.9 * (foot[:, 1] - at[:, 1])
+            heading[:, 2] += 0.12
+        heading = frames.normalize(heading)
+        points[:, i + 1] = at + heading * step
+    return points
+
+
+def _grow_lateral(
+    points: np.ndarray, at: np.ndarray, up: np.ndarray, length: np.ndarray, sign: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """Points of the side shoots: 45 degrees off the main axis, then on with a little wander."""
+    rows = np.arange(len(points))
+    start, axis = points[rows, at + 1], frames.normalize(points[rows, at + 1] - points[rows, at])
+    heading = axis + sign[:, None] * frames.normalize(np.cross(up, axis)) + 0.25 * up
+    result = np.empty((len(points), LATERAL_SEGMENTS + 1, 3))
+    result[:, 0] = start
+    for i in range(LATERAL_SEGMENTS):
+        heading = frames.normalize(heading) + 0.12 * noise[:, i]
+        result[:, i + 1] = result[:, i] + frames.normalize(heading) * (length / LATERAL_SEGMENTS)[:, None]
+    return result

@@ -1,0 +1,39 @@
+"""Slots of the table of shoots: which column holds which segment, bunch or cluster.
+
+Every shoot has the same slots: main axis, lateral, and for each of two bunches its peduncle, the bunch and its clusters.
+"""
+
+from __future__ import annotations
+
+from vinesim.scene.builder import MAX_CLUSTERS
+
+AXIS_SEGMENTS = 14
+"""Bodies of a shoot's main axis."""
+LATERAL_SEGMENTS = 4
+"""Bodies of a lateral (side shoot)."""
+PEDUNCLE_SEGMENTS = 2
+"""Bodies of a peduncle."""
+MAX_BUNCHES = 2
+"""Most bunches on a shoot."""
+MAX_NODES = 25
+"""Most leaves on a shoot's main axis."""
+LATERAL_NODES = 6
+"""Leaves of a lateral."""
+ARM_SEGMENTS = 5
+TRUNK_SEGMENTS = 7
+
+LATERAL_SLOTS = slice(AXIS_SEGMENTS, AXIS_SEGMENTS + LATERAL_SEGMENTS)
+CORE_SLOTS = AXIS_SEGMENTS + LATERAL_SEGMENTS + MAX_BUNCHES * (PEDUNCLE_SEGMENTS + 1)
+SLOT_COUNT = CORE_SLOTS + MAX_BUNCHES * MAX_CLUSTERS
+
+
+def peduncle_slots(which: int) -> slice:
+    """Slots of one peduncle and, last, its bunch."""
+    first = AXIS_SEGMENTS + LATERAL_SEGMENTS + which * (PEDUNCLE_SEGMENTS + 1)
+    return slice(first, first + PEDUNCLE_SEGMENTS + 1)
+
+
+def cluster_slots(which: int) -> slice:
+    """Slots of one bunch's berry clusters."""
+    first = CORE_SLOTS + which * MAX_CLUSTERS
+    return slice(first, first + MAX_CLUSTERS)

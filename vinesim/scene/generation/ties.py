@@ -1,0 +1,64 @@
+"""Ties: where shoots are bound to wires or held between them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.scene.generation.bodies import Bodies
+from vinesim.scene.generation.shoots import Shoots
+from vinesim.scene.plant_parameters import VineParameters
+from vinesim.scene.spec import Scene
+
+TIED_SEGMENT = 10
+"""The piece of a shoot at whose beginning a string binds it to the net."""
+
+
+def find_ties(scene: Scene, parameters: VineParameters, shoots: Shoots, bodies: Bodies) -> dict[str, np.ndarray]:
+    """Where shoots pass wires closely: over the net they are tied to it or lie on it, in a hedge wires hold them.
+
+    A taut wire pushed aside half way between two posts gives way with 4 tension / span.
+    """
+    layout, trellis, tendone = scene.layout, parameters.trellis, scene.training == "tendone"
+    start, end = shoots.points[:, :-1], shoots.points[:, 1:]
+    spacing = np.array([layout.vine_spacing, layout.row_spacing])
+    low, high = -0.5 * spacing, (np.array([layout.vines, layout.rows]) - 0.5) * spacing
+    if tendone:
+        lines = [
+            (axis, low[axis], d / max(round(d / trellis.tendone_wire_spacing.value), 1))
+            for axis, d in enumerate(spacing)
+        ]
+    else:
+        lines = [(2, layout.height, trellis.vsp_wire_spacing.value)]
+    crossings = []
+    for axis, first, step in lines:
+        share, found = _crossing(start[..., axis], end[..., axis], first, step)
+        point = start + share[..., None] * (end - start)
+        found &= (point[..., :2] >= low).all(-1) & (point[..., :2] <= high).all(-1)
+        apart = point[..., 2] - layout.height
+        if not tendone:
+            wire = np.round(apart / step)
+            found &= (wire >= 1) & (wire <= trellis.vsp_wires.value)
+            apart = point[..., 1] - layout.row_spacing * np.round(point[..., 1] / layout.row_spacing)
+        crossings.append((share, np.where(found, np.abs(apart), np.inf)))
+    share, apart = (np.stack(values, -1) for values in zip(*crossings, strict=True))
+    tied = apart < trellis.tie_reach.value
+    if tendone:  # strings bind the end to the net: a long shoot that is free beyond its middle falls over
+        share[:, TIED_SEGMENT, 0] = 0.0
+        tied[:, TIED_SEGMENT, 0] = np.abs(start[:, TIED_SEGMENT, 2] - layout.height) < trellis.tie_string.value
+    shoot, slot, which = np.nonzero(tied)
+    along = share[shoot, slot, which] * bodies.length[shoot, slot]
+    stiffness = 4.0 * trellis.wire_tension.value / layout.vine_spacing
+    return {
+        "shoot": shoot, "slot": slot, "point": along[:, None] * [1.0, 0.0, 0.0],
+        "anchor": start[shoot, slot] + share[shoot, slot, which, None] * (end - start)[shoot, slot],
+        "stiffness": np.full(len(slot), stiffness),
+        "damping": np.full(len(slot), trellis.tie_damping.value * stiffness),
+    }  # fmt: skip
+
+
+def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where pieces from ``start`` to ``end`` [...] cross one of parallel lines: share of their length, and whether."""
+    low, high = (start - first) / step, (end - first) / step
+    line = np.maximum(np.floor(low), np.floor(high))
+    found = np.floor(low) != np.floor(high)
+    return np.where(found, (line - low) / np.where(found, high - low, 1.0), 0.0), found
