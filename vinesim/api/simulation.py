@@ -29,7 +29,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
-from vinesim.scene.values import Contact, Parting, Snapshot
+from vinesim.scene.values import Contact, Detachment, Snapshot
 
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
@@ -87,7 +87,7 @@ class Simulation:
             wind = self.scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=self.scene.seed)
         self._loads: dict[int, np.ndarray] = {}
-        self._detachments: list[Parting] = []
+        self._detachments: list[Detachment] = []
         self._primitives: Primitives | None = None
         self._wake_unbalanced()
 
@@ -144,7 +144,7 @@ class Simulation:
         return self.physics.contacts
 
     @property
-    def detachments(self) -> tuple[Parting, ...]:
+    def detachments(self) -> tuple[Detachment, ...]:
         """Bunches and canes that left their plant in the last call of :meth:`step`."""
         return tuple(self._detachments)
 

@@ -17,7 +17,7 @@ from vinesim.net.replication.streams import NO_ROOTS, Roots
 from vinesim.physics.rigid.support_tracking import GROUND
 from vinesim.physics.step import Physics
 from vinesim.scene.ids import Kind, is_tree, thing, thing_named, unthing
-from vinesim.scene.values import Parting, ThingUpdate, TreeUpdate
+from vinesim.scene.values import Detachment, ThingUpdate, TreeUpdate
 
 BLEND_PER_STEP = 0.2
 """Share of the way to where its owner says it is by which a copy moves in one tick."""
@@ -36,7 +36,7 @@ class ObjectSync:
         self._supported: dict[str, set[int]] = {}
         self._changed_trees: set[int] = set()
         self._cut_bodies: dict[int, list[int]] = {}
-        self._detachments: tuple[Parting, ...] = ()
+        self._detachments: tuple[Detachment, ...] = ()
 
     # ------------------------------------------------------------------ what others say
 

@@ -16,7 +16,7 @@ from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.human_body import FINGERS, THICK, HandBody, HumanBody
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.scene.values import Contact, Haptic, Parting
+from vinesim.scene.values import Contact, Detachment, Haptic
 
 GRASP = 0.03
 """[m] A hand takes what its palm or its fingers are so close to."""
@@ -84,7 +84,7 @@ class GraspManager:
         if self._grips:
             self.plants.wake(self.held_trees)
 
-    def end_step(self, partings: tuple[Parting, ...]) -> None:
+    def end_step(self, partings: tuple[Detachment, ...]) -> None:
         """After a tick: keep bunches that left their vines, put hands where what they hold is, tell what is felt."""
         gone = {parting.body: parting.bunch for parting in partings if parting.bunch >= 0}
         contacts, haptics = [], []
