@@ -1,8 +1,10 @@
 """One simulation in one object: plants, robots, contacts, energy.
 
-simulation = Simulation(CaneBuilder(tip_mass=0.1, damping_ratio=0.05))
-simulation.step(500)
-print(simulation.tip(), simulation.energy().total)
+    simulation = Simulation(CaneBuilder(tip_mass=0.1, damping_ratio=0.05))
+    simulation.step(500)
+    print(simulation.tip(), simulation.energy().total)
+
+Positions are in m, forces in N, in world axes (:mod:`vinesim.frames`).
 """
 
 from __future__ import annotations
@@ -59,14 +61,16 @@ class Simulation:
         device: str = "cpu",
         threads: int = 1,
     ) -> None:
-        """Args:
-        source: see :data:`Source`. A scene brings its physics parameters and its wind.
-        dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
-        parameters: all numbers of the physics, in place of those of the scene.
-        sleep: whether trees at rest fall asleep, in place of ``parameters.sleep``.
-        detach: whether bunches detach when they are pulled too hard.
-        device: ``"cpu"`` or ``"cuda"``: where plants are stepped.
-        threads: of the CPU that share the plants.
+        """Build the world; it does not move until :meth:`step`.
+
+        Args:
+            source: see :data:`Source`. A scene brings its physics parameters and its wind.
+            dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
+            parameters: all numbers of the physics, in place of those of the scene.
+            sleep: whether trees at rest fall asleep, in place of ``parameters.sleep``.
+            detach: whether bunches detach when they are pulled too hard.
+            device: ``"cpu"`` or ``"cuda"``: where plants are stepped.
+            threads: of the CPU that share the plants.
         """
         self.scene: Scene | None = None
         """The scene that was simulated; None for a model or canes."""

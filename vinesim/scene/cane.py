@@ -1,8 +1,10 @@
 """Single canes from a few numbers: length, radius, Young's modulus, tip mass, damping ratio, shape.
 
-builder = CaneBuilder(length=1.0, radius=(0.006, 0.003), tip_mass=0.2, damping_ratio=0.05)
-model = builder.build()                       # one cane
-model = assemble([builder, CaneBuilder()])    # several
+    builder = CaneBuilder(length=1.0, radius=(0.006, 0.003), tip_mass=0.2, damping_ratio=0.05)
+    model = builder.build()  # one cane
+    model = assemble([builder, CaneBuilder()])  # several
+
+Branches and bunches are added through :meth:`CaneBuilder.tree`.
 """
 
 from __future__ import annotations
