@@ -22,7 +22,7 @@ from vinesim.net.codec.human import (
     quantised,
 )  # fmt: skip
 from vinesim.net.codec.messages import MessageError
-from vinesim.physics.rigid.human_body import standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))

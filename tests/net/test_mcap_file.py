@@ -21,7 +21,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.human import Push, encode_human, encode_push
 from vinesim.net.recording import mcap_file
 from vinesim.net.recording.mcap_file import NotARecording, Recording, RecordingStopped, free_path, read
-from vinesim.physics.rigid.human_body import standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.ids import Kind, thing
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 

@@ -504,7 +504,7 @@ def bunch_in_hand(description: RobotDescription, effort: float) -> tuple[Yard, i
     )
     yard.rigid.add_bunch(0, ball, middle, np.zeros(6))
     yard.robot.command_gripper("gripper_left", 0.0, effort)
-    body = yard.rigid.mj_model.body("loose/0").id
+    body = yard.rigid.mj_model.body("free_bunch/0").id
     weight = yard.rigid.mj_data.xfrc_applied[body]
     weight[2] = 0.3 * 9.81  # somebody holds it until it is held
     yard.run(1.0)

@@ -179,7 +179,7 @@ def test_names_are_unique() -> None:
 
 def test_eyes_open_once_and_close_twice() -> None:
     eyes = SensorScheduler(sensor_scenes.empty(), []).start()
-    with pytest.raises(RuntimeError, match="open already"):
+    with pytest.raises(RuntimeError, match="runs already"):
         eyes.start()
     eyes.stop()
     eyes.stop()

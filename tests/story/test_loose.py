@@ -10,7 +10,7 @@ import pytest
 from tests.support.shared_vineyard import BOX, BUNCH, World, apart, heard, pose_of, sent, vineyard
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.physics.rigid.human_body import standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.ids import Kind, Organ, thing_named
 from vinesim.scene.values import HumanPose
 

@@ -32,6 +32,7 @@ def run(
     renderer: str = "warp",
 ) -> int:
     """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
+    from vinesim.scene.camera_geometry import depth_millimetres
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
     from vinesim.scene.spec import load_scene, with_seed
@@ -68,8 +69,8 @@ def run(
     frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
-        "depth": picture.depth_millimetres(frame.exact_depth),
-        "measured": picture.depth_millimetres(frame.depth),
+        "depth": depth_millimetres(frame.exact_depth),
+        "measured": depth_millimetres(frame.depth),
         "labels": formats.encode_labels(frame.labels),
         "overlay": formats.draw_overlay(frame.rgb, truths),
     }

@@ -21,16 +21,17 @@ from concurrent.futures import Executor
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.humans import LocalHuman, RemoteHuman
+from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.recording.trace import Trace
 from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
+from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.exchange import Exchange, Inbox
 from vinesim.net.transport.bus import Bus
 from vinesim.physics.plants.wind import Wind
-from vinesim.physics.rigid.human_body import standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
@@ -214,7 +215,7 @@ class Client:
             settled = exchange.send(
                 now, pose, touched=touched, moving=moving, read=things.read_state,
                 grabbed=things.with_trees(parted), parted=parted, cut=things.cut_roots, changed=things.is_changed,
-                lies=self.physics.support_tracker.pose_on_support, pushed=actor.pushed(self.remote_actors) if isinstance(actor, LocalHuman) else None,
+                lies=self.physics.support_tracker.pose_on_support, pushed=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip
             for update in settled:
                 # the last word is what all copies hold: hold it too

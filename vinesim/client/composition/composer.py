@@ -16,7 +16,7 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.rigid.human_body import standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description

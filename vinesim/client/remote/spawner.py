@@ -8,9 +8,10 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from vinesim.client.humans import RemoteHuman, spec_of
+from vinesim.client.remote.remote_human import RemoteHuman, human_spec
 from vinesim.net.codec.messages import Hello, valid_name
-from vinesim.physics.rigid.rigid_world import CompiledWorld, RigidWorld
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.physics.rigid.world_core import CompiledWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
@@ -84,7 +85,7 @@ class RemoteSpawner:
 
     def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
         if isinstance(update, HumanUpdate):
-            return None, self.rigid.compile_with(spec_of(hello, update), is_remote=True)
+            return None, self.rigid.compile_with(human_spec(hello, update), is_remote=True)
         description = resolve_description(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from vinesim.scene.berries import VARIETIES
+from vinesim.scene.camera_geometry import DISTORTION, DISTORTION_MODEL, intrinsic_matrix
 from vinesim.scene.ids import Kind, Organ, thing, thing_name
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
@@ -29,7 +30,7 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
     from pycocotools import mask as coco
 
     encoded = coco.encode(np.asfortranarray(mask, np.uint8))
-    return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}
+    return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}  # pyright: ignore[reportAttributeAccessIssue]  # bytes, not str
 
 
 def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
@@ -38,9 +39,9 @@ def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, A
         "model": model,
         "width": info.width,
         "height": info.height,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5,
-        "k": [info.fx, 0.0, info.cx, 0.0, info.fy, info.cy, 0.0, 0.0, 1.0],
+        "distortion_model": DISTORTION_MODEL,
+        "d": list(DISTORTION),
+        "k": intrinsic_matrix(info),
         "frame": "optical (REP-103): x right, y down, z forward",
         "position": pose[:3].tolist(),
         "quaternion_xyzw": pose[3:].tolist(),

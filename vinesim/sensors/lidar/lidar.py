@@ -196,7 +196,7 @@ class Lidar:
         turn = (np.arange(count - 1) + 0.5) * 2.0 * np.pi / max(count - 1, 1)
         sizes = zip(self.spec.aperture.value, self.spec.divergence.value, strict=True)
         wide, high = (0.5 * leaving / FOOTPRINT_RANGE + 0.5e-3 * growing for leaving, growing in sizes)
-        return tuple(np.append(0.0, ring * size * wave(turn)) for size, wave in ((wide, np.cos), (high, np.sin)))
+        return np.append(0.0, ring * wide * np.cos(turn)), np.append(0.0, ring * high * np.sin(turn))
 
     def _receiver_parameters(self) -> lidar_echoes.Receiver:
         spec, receiver = self.spec, lidar_echoes.Receiver()

@@ -62,7 +62,7 @@ class Primitives:
         trees = len(model.tree_first)
         batches = [cane_batch(model, bodies), *leaf_batches(model)]
         every = np.arange(len(model.bunch_body))
-        pieces = [bunch_bodies(model, bunch) for bunch in every]
+        pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
         batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
         around = [trellis_batch(model, bodies)]
         if grass > 0.0:
