@@ -1,7 +1,7 @@
-"""What rooms hand each other: small frozen values, so that siblings never import one another.
+"""Values that packages exchange: small frozen dataclasses, so that sibling packages never import each other.
 
 Times are simulation seconds. Arrays are numpy, poses and velocities as in :mod:`vinesim.frames`.
-A value that leaves the physics thread owns its arrays: nobody writes them afterwards.
+A value that leaves the physics thread owns its arrays: they are never written afterwards.
 """
 
 from __future__ import annotations
