@@ -13,6 +13,7 @@ All functions broadcast over leading axes and compute in the type they are given
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 """The unit quaternion, xyzw."""
@@ -131,11 +132,11 @@ def from_x_axis(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np
     return from_matrix(np.stack([ex, ey, np.cross(ex, ey)], -1))
 
 
-def pose(position: np.ndarray, quaternion: np.ndarray = IDENTITY) -> np.ndarray:
+def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.ndarray:
     """Seven numbers from position and quaternion."""
-    position, quaternion = np.asarray(position, float), np.asarray(quaternion, float)
-    lead = np.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1])
-    return np.concatenate([np.broadcast_to(position, (*lead, 3)), np.broadcast_to(quaternion, (*lead, 4))], -1)
+    x, q = np.asarray(position, float), np.asarray(quaternion, float)
+    lead = np.broadcast_shapes(x.shape[:-1], q.shape[:-1])
+    return np.concatenate([np.broadcast_to(x, (*lead, 3)), np.broadcast_to(q, (*lead, 4))], -1)
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:

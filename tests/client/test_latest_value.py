@@ -1,20 +1,20 @@
-"""The newest letter only, across a real process boundary."""
+"""The newest value only, across a real process boundary."""
 
 import multiprocessing
 
 import pytest
 
-from vinesim.client.sensing.latest_value import LatestValue, poller
+from vinesim.client.sensing.latest_value import LatestValue, make_poll
 
 
-def read_all(mailbox, pipe):
-    """The reader's process: says that it is there, then what it takes, until an empty letter."""
+def forward_values(latest, pipe):
+    """The reader's process: says that it is there, then what it takes, until an empty value."""
     pipe.send("ready")
     while True:
-        letter = mailbox.take(5.0)
-        if letter is not None:
-            pipe.send(letter)
-            if letter == b"end":
+        value = latest.take(5.0)
+        if value is not None:
+            pipe.send(value)
+            if value == b"end":
                 return
 
 
@@ -24,56 +24,56 @@ def context():
 
 
 def test_the_newest_letter_replaces_what_was_not_read(context):
-    mailbox = LatestValue(100, context)
+    latest = LatestValue(100, context)
     try:
-        assert mailbox.take(0.0) is None
+        assert latest.take(0.0) is None
         for i in range(5):
-            assert mailbox.put(b"letter %d" % i)
+            assert latest.put(b"value %d" % i)
         reader = LatestValue.__new__(LatestValue)
-        reader.__dict__.update(mailbox.__getstate__())
-        assert reader.take(0.0) == b"letter 4"
+        reader.__dict__.update(latest.__getstate__())
+        assert reader.take(0.0) == b"value 4"
         assert reader.take(0.0) is None
     finally:
-        mailbox.close()
+        latest.close()
 
 
 def test_a_letter_that_is_too_large_is_refused(context):
-    mailbox = LatestValue(10, context)
+    latest = LatestValue(10, context)
     try:
-        with pytest.raises(ValueError, match="11 bytes for a mailbox of 10"):
-            mailbox.put(bytes(11))
+        with pytest.raises(ValueError, match="11 bytes for a capacity of 10"):
+            latest.put(bytes(11))
     finally:
-        mailbox.close()
+        latest.close()
 
 
 def test_the_writer_never_waits_for_the_reader(context):
-    mailbox = LatestValue(10, context)
+    latest = LatestValue(10, context)
     try:
-        mailbox._lock.acquire()
-        assert mailbox.put(b"x") is False
-        assert mailbox.missed_writes == 1
-        mailbox._lock.release()
-        assert mailbox.put(b"y")
+        latest._lock.acquire()
+        assert latest.put(b"x") is False
+        assert latest.missed_writes == 1
+        latest._lock.release()
+        assert latest.put(b"y")
     finally:
-        mailbox.close()
+        latest.close()
 
 
-def test_letters_cross_to_another_process_in_order_and_the_last_arrives(context):
-    mailbox = LatestValue(100, context)
+def test_values_cross_to_another_process_in_order_and_the_last_arrives(context):
+    latest = LatestValue(100, context)
     ours, theirs = context.Pipe()
-    process = context.Process(target=read_all, args=(mailbox, theirs))
+    process = context.Process(target=forward_values, args=(latest, theirs))
     process.start()
     try:
         assert ours.poll(60)
         assert ours.recv() == "ready"
         for i in range(1000):
-            while not mailbox.put(b"%05d" % i):
+            while not latest.put(b"%05d" % i):
                 pass
-        while not mailbox.put(b"end"):
+        while not latest.put(b"end"):
             pass
         process.join(60)
         assert process.exitcode == 0
-        has_news, taken = poller(ours), []
+        has_news, taken = make_poll(ours), []
         while has_news():
             taken.append(ours.recv())
         assert taken[-1] == b"end"
@@ -81,4 +81,4 @@ def test_letters_cross_to_another_process_in_order_and_the_last_arrives(context)
     finally:
         process.kill()
         process.join()
-        mailbox.close()
+        latest.close()

@@ -7,7 +7,9 @@ import pytest
 
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
-from vinesim.client.tasks.tasks import LookAt, RosCommandHandler, UnknownTask, plan_task
+from vinesim.client.tasks.motions import LookAt
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
+from vinesim.client.tasks.tasks import UnknownTask, plan_task
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description as load_robot

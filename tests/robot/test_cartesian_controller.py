@@ -21,7 +21,7 @@ def led(
     """Lead a hand for a while; the places [tick, 3] m that its point went through."""
     robot, points = hand.robot, []
     for tick in range(round(seconds / 0.01)):
-        hand.move_towards(goal, ahead, up, speed=0.3, shoulder_height=float(goal[2]))
+        hand.move_towards(goal, ahead, up, speed=0.3, working_height=float(goal[2]))
         robot.control(0.01 * tick)
         robot.rigid.predict()
         robot.rigid.integrate()

@@ -200,8 +200,8 @@ def test_trajectories_that_make_no_sense_are_refused_and_change_nothing() -> Non
         ((), one, np.zeros((1, 0)), Outcome.INVALID_JOINTS, "no joints"),
         (TWO, one, np.zeros((2, 2)), Outcome.INVALID_GOAL, r"\(1, 2\) is needed"),
         (TWO, one, np.full((1, 2), np.nan), Outcome.INVALID_GOAL, "not finite"),
-        (TWO, np.array([1.0, 1.0]), np.zeros((2, 2)), Outcome.INVALID_GOAL, "rise from 0"),
-        (TWO, np.zeros(0), np.zeros((0, 2)), Outcome.INVALID_GOAL, "rise from 0"),
+        (TWO, np.array([1.0, 1.0]), np.zeros((2, 2)), Outcome.INVALID_GOAL, "increase from 0"),
+        (TWO, np.zeros(0), np.zeros((0, 2)), Outcome.INVALID_GOAL, "increase from 0"),
     ):
         with pytest.raises(TrajectoryError, match=text) as error:
             stage.controller.start(Trajectory(joints, times, positions), 0.0)

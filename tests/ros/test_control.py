@@ -22,8 +22,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.client import Client
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.client.tasks.tasks import RosCommandHandler
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.ros.node import Node

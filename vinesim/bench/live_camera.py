@@ -11,8 +11,8 @@ from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import Trace
 from vinesim.client.sensing.sensor_process import SensorProcess
+from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, start_pose
-from vinesim.client.tasks.tasks import LookAt
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch

@@ -40,7 +40,7 @@ from vinesim.scene.values import CameraFrame, LidarScan, RobotSample
 
 log = logging.getLogger(__name__)
 
-SensorPublisher = TypeVar("Sensor", CameraPublisher, LidarPublisher)
+SensorPublisher = TypeVar("SensorPublisher", CameraPublisher, LidarPublisher)
 
 SUBSCRIPTION_COUNT_PERIOD = 0.1
 """How often subscribers are counted [s of wall time]: so long may a new one wait for its first picture."""

@@ -1,8 +1,8 @@
-"""What a robot perceives and tells ROS, seen from the tick: a process of its own does the work.
+"""The client's side of a sensor process, which renders for one robot and runs its ROS node.
 
-Rendering and publishing hold Python's interpreter lock for milliseconds at a time. In threads beside the tick they cost
-it its beat (docs/decisions/senses-process.md has the figures), so they live in a process, to which the tick hands one
-letter a tick through shared memory and of which it never waits for an answer.
+Rendering and publishing hold Python's interpreter lock for milliseconds at a time. In threads beside the loop they make
+its steps late (docs/decisions/senses-process.md has the figures), so they run in a process of their own. The loop
+passes it one snapshot a step through shared memory and never waits for an answer.
 """
 
 from __future__ import annotations
@@ -18,36 +18,47 @@ from typing import Any, Self
 import numpy as np
 
 from vinesim.client.client import Client
-from vinesim.client.sensing.latest_value import LatestValue, poller
-from vinesim.client.sensing.sensor_worker import SensorConfig, StepSnapshot, run_sensor_worker
-from vinesim.client.tasks.tasks import RosCommandHandler
+from vinesim.client.sensing.latest_value import LatestValue, make_poll
+from vinesim.client.sensing.sensor_worker import (
+    GROUND_TRUTH_PERIOD,
+    MovedPlants,
+    SensorConfig,
+    StepSnapshot,
+    run_sensor_worker,
+)
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.robot import Robot
 from vinesim.ros import ros_setup
 from vinesim.ros.commands.types import Command
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
+from vinesim.scene.values import RigidVisual
 
 log = logging.getLogger(__name__)
 
 SNAPSHOT_PERIOD = 2
-"""Ticks between two views for the eyes: 50 Hz, faster than any camera here."""
+"""Ticks between two snapshots for the sensors: 50 Hz, faster than any camera here."""
 START_TIMEOUT = 300.0
 """How long the process may take to start; a first run compiles kernels [s]."""
-SAVE_TIMEOUT = 10.0
-"""How long the process may take to write its pictures [s]."""
+SAVE_TIMEOUT = 60.0
+"""How long the process may take to write its pictures [s]; on a busy machine it renders first."""
 EXIT_TIMEOUT = 1.2
 """How long it may take to end [s]."""
+VISUALS_CAPACITY = 4 << 20
+"""Size of a snapshot beside the poses of the plants [bytes]."""
+POSE_SIZE = 40
+"""Size of one plant body in a snapshot [bytes]."""
 
 
 class SensorProcessError(RuntimeError):
-    """The process of the senses failed; the text says how."""
+    """The sensor process failed; the text says how."""
 
     exit_code = 3
 
 
 class SensorProcess:
-    """Cameras, lidars and the ROS node of the client's robot. A context: the process ends with it."""
+    """Cameras, lidars and the ROS node of one robot of the client. A context: the process ends with it."""
 
     def __init__(
         self,
@@ -63,11 +74,11 @@ class SensorProcess:
         clock: bool | None = None,
         renderer: str = "warp",
     ) -> None:
-        """Starts the process; :meth:`attach` gives it something to perceive.
+        """Starts the process; :meth:`attach` connects it with a client.
 
-        ``keep_pictures`` renders the first camera even if no ROS peer listens, and keeps the picture of the greatest
-        displacement of the watched bunch for :meth:`save`. ``sensor_hz`` replaces the sensors' own rates. ``clock``:
-        publish /clock; unless given, whoever has no namespace does, since a ROS domain has one clock.
+        ``keep_pictures`` renders the first camera even without subscribers, and keeps the picture with the highest
+        ``Client.frame_score`` for :meth:`save_picture`. ``sensor_hz`` replaces the sensors' own rates. ``clock``:
+        publish /clock; unless given, a robot without a namespace does, since a ROS domain has one clock.
         """
         self.name = name
         self._attached = False
@@ -75,116 +86,124 @@ class SensorProcess:
             log.warning("running without ROS 2: %s", reason)
             ros = False
         self._ros = ros
-        self._sensors = {place.name: place.frame for place in (*description.cameras, *description.lidars)}
+        self._sensor_frames = {mount.name: mount.frame for mount in (*description.cameras, *description.lidars)}
         self._commands: list[Command] = []
-        self._figures: dict[str, Any] = {"sent": {}, "eyes": keep_pictures}
-        self._moved = np.zeros(len(model.tree_first), bool)
-        self._links: Any = None
-        self._acknowledged, self._letters = 0, 0
-        self._asked: list[tuple[int, np.ndarray]] = []
+        self._statistics: dict[str, Any] = {"sent": {}, "renders": keep_pictures}
+        self._moved_trees = np.zeros(len(model.tree_first), bool)
+        """[tree] whether it moved since the last snapshot that was acknowledged."""
+        self._visuals: tuple[RigidVisual, ...] | None = None
+        """The list of rigid bodies that the worker has."""
+        self._sent_snapshots = 0
+        self._unacknowledged: list[tuple[int, np.ndarray]] = []
+        """Number and trees of snapshots with plants that the worker has not read yet."""
         context = multiprocessing.get_context("spawn")
-        self._mailbox = LatestValue(40 * len(model.body_mass) + (4 << 20), context)
-        self._pipe, theirs = context.Pipe()
-        sun = scene.sun.direction
-        clock = not namespace if clock is None else clock
-        setup = SensorConfig(name, model, description, sun, namespace, ros, keep_pictures, sensor_hz, clock, renderer)
+        self._snapshots = LatestValue(POSE_SIZE * len(model.body_mass) + VISUALS_CAPACITY, context)
+        self._pipe, worker_end = context.Pipe()
+        config = SensorConfig(
+            name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz,
+            clock=not namespace if clock is None else clock, renderer=renderer,
+        )  # fmt: skip
         self._process = context.Process(
-            target=run_sensor_worker, args=(setup, self._mailbox, theirs), name=f"senses of {name}", daemon=True
+            target=run_sensor_worker, args=(config, self._snapshots, worker_end), name=f"sensors of {name}", daemon=True
         )
         self._process.start()
-        theirs.close()
-        self._has_news = poller(self._pipe)
+        worker_end.close()
+        self._has_message = make_poll(self._pipe)
 
     def attach(self, client: Client, robot: Robot | None = None) -> None:
-        """Perceive this client's world from now on, as its first robot unless told; waits for the process."""
+        """Pass the client's world to the process from now on, as seen by its first robot unless ``robot`` is given.
+
+        Waits until the process is ready; :class:`SensorProcessError` if it fails.
+        """
         self.client = client
         self.robot = robot or client.robot
         self._wait_for("ready", START_TIMEOUT)
         self._attached = True
-        client.post_step.append(self._every_tick)
+        client.post_step.append(self._after_step)
         if self._ros:
             client.pre_step.insert(0, RosCommandHandler(self.robot, self._take_commands))
 
-    # ------------------------------------------------------------------ the tick
+    # ------------------------------------------------------------------ in the loop
 
-    def _every_tick(self, client: Client) -> None:
-        self._listen()
+    def _after_step(self, client: Client) -> None:
+        """Receive what the worker sent, and put the next snapshot."""
+        self._receive()
         physics = client.physics
-        self._moved[physics.plants.awake] = self._moved[physics.remotely_posed] = True
-        looks = self._figures["eyes"] and physics.tick % SNAPSHOT_PERIOD == 0
-        truth = self._figures.get("truth", False) and physics.tick % 10 == 0
-        trees = bodies = body_q = link_q = poses = links = None
-        if looks or truth:
+        self._moved_trees[physics.plants.awake] = self._moved_trees[physics.remotely_posed] = True
+        renders = self._statistics["renders"] and physics.tick % SNAPSHOT_PERIOD == 0
+        truth = self._statistics.get("publishes_truth", False) and physics.tick % GROUND_TRUTH_PERIOD == 0
+        plants = visual_q = sensor_poses = visuals = None
+        if renders or truth:
             physics.update_kinematics()
-            trees = np.flatnonzero(self._moved)
+            trees = np.flatnonzero(self._moved_trees)
             bodies = physics.plants.bodies_of(trees)
-            body_q = physics.state.body_q[bodies]
-        if looks:
-            link_q = physics.visual_q()
-            poses = {name: self.robot.frame_pose(frame) for name, frame in self._sensors.items()}
-            if physics.visuals() is not self._links:
-                links = physics.visuals()
-        letter = StepSnapshot(
-            number=self._letters + 1, tick=physics.tick, time=physics.time,
+            plants = MovedPlants(trees, bodies, physics.state.body_q[bodies])
+        if renders:
+            visual_q = physics.visual_q()
+            sensor_poses = {name: self.robot.frame_pose(frame) for name, frame in self._sensor_frames.items()}
+            if physics.visuals() is not self._visuals:
+                visuals = physics.visuals()
+        snapshot = StepSnapshot(
+            number=self._sent_snapshots + 1, tick=physics.tick, time=physics.time,
             sample=self.robot.sample(physics.time, physics.contacts),
-            bodies=bodies, body_q=body_q, trees=trees, attached=np.packbits(physics.state.bunch_attached),
-            links=links, link_q=link_q, poses=poses, frame_score=client.frame_score(),
+            plants=plants, attached=np.packbits(physics.state.bunch_attached),
+            visuals=visuals, visual_q=visual_q, sensor_poses=sensor_poses, frame_score=client.frame_score(),
         )  # fmt: skip
-        if self._mailbox.put(pickle.dumps(letter, pickle.HIGHEST_PROTOCOL)):
-            self._letters += 1
-            if trees is not None:
-                self._asked.append((self._letters, trees))
+        if self._snapshots.put(pickle.dumps(snapshot, pickle.HIGHEST_PROTOCOL)):
+            self._sent_snapshots += 1
+            if plants is not None:
+                self._unacknowledged.append((self._sent_snapshots, plants.trees))
 
-    def _listen(self) -> None:
-        """Take what the process says: commands, figures, and which letters it has read."""
-        while self._has_news():
+    def _receive(self) -> None:
+        """Take the worker's messages: commands, statistics, acknowledgements; :class:`SensorProcessError` if it failed."""
+        while self._has_message():
             try:
                 kind, value = self._pipe.recv()
             except EOFError:
                 self._process.join(EXIT_TIMEOUT)
                 code = self._process.exitcode
-                raise SensorProcessError(f"the senses of {self.name} ended with exit code {code}") from None
+                raise SensorProcessError(f"the sensor process of {self.name} ended with exit code {code}") from None
             if kind == "commands":
                 self._commands += value
-            elif kind == "figures":
-                self._figures = value
+            elif kind == "statistics":
+                self._statistics = value
             elif kind == "read":
-                self._read(*value)
+                self._acknowledge(*value)
             elif kind == "failed":
-                raise SensorProcessError(f"the senses of {self.name} failed: {value}")
+                raise self._failure(value)
 
-    def _read(self, number: int, links_seen: bool) -> None:
-        """A letter with a view was read: what moved until then, and rests since, needs no telling again."""
-        if links_seen:
-            self._links = self.client.physics.visuals()
-        told = [trees for n, trees in self._asked if n == number]
-        self._asked = [(n, trees) for n, trees in self._asked if n > number]
-        if told:
-            later = [trees for _, trees in self._asked]
-            self._moved[told[0]] = False
-            for trees in later:
-                self._moved[trees] = True
-            self._moved[self.client.physics.plants.awake] = True
+    def _acknowledge(self, number: int, had_visuals: bool) -> None:
+        """The worker has read a snapshot: trees that have rested since then need not be sent again."""
+        if had_visuals:
+            self._visuals = self.client.physics.visuals()
+        read = [trees for n, trees in self._unacknowledged if n == number]
+        self._unacknowledged = [(n, trees) for n, trees in self._unacknowledged if n > number]
+        if read:
+            self._moved_trees[read[0]] = False
+            for _, trees in self._unacknowledged:
+                self._moved_trees[trees] = True
+            self._moved_trees[self.client.physics.plants.awake] = True
 
     def _take_commands(self) -> list[Command]:
         commands, self._commands = self._commands, []
         return commands
 
-    # ------------------------------------------------------------------ questions
+    # ------------------------------------------------------------------ outside the loop
 
     def sent_messages(self) -> dict[str, int]:
-        """Messages sent so far, by topic."""
-        return self._figures["sent"]
+        """ROS messages sent so far, by topic."""
+        return self._statistics["sent"]
 
-    def publish_diagnostics(self, figures: dict[str, Any]) -> None:
-        """Pass the client's figures on to /diagnostics."""
+    def publish_diagnostics(self, status: dict[str, Any]) -> None:
+        """Publish a client's status on /diagnostics."""
         keys = ("time", "tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "bytes_in", "bytes_out")
         with contextlib.suppress(OSError):
-            self._pipe.send(("diagnose", {key: figures[key] for key in keys}))
+            self._pipe.send(("diagnose", {key: status[key] for key in keys}))
 
     def report(self) -> dict[str, Any]:
-        """What was rendered, sent and dropped."""
-        return {key: self._figures[key] for key in ("frames", "frames_dropped", "ros_dropped") if key in self._figures}
+        """Frames rendered and dropped by sensor, messages dropped by topic."""
+        keys = ("frames", "frames_dropped", "ros_dropped")
+        return {key: self._statistics[key] for key in keys if key in self._statistics}
 
     def save_picture(self, folder: pathlib.Path) -> None:
         """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs."""
@@ -198,12 +217,15 @@ class SensorProcess:
             except EOFError:
                 break
             if kind == "failed":
-                raise SensorProcessError(f"the senses of {self.name} failed: {value}")
-            if kind == "figures":
-                self._figures = value
+                raise self._failure(value)
+            if kind == "statistics":
+                self._statistics = value
             if kind == answer:
                 return
-        raise SensorProcessError(f"the senses of {self.name} did not get {answer} within {timeout:.0f} s")
+        raise SensorProcessError(f"the sensor process of {self.name} was not {answer} within {timeout:.0f} s")
+
+    def _failure(self, reason: str) -> SensorProcessError:
+        return SensorProcessError(f"the sensor process of {self.name} failed: {reason}")
 
     def close(self) -> None:
         """End the process."""
@@ -213,11 +235,11 @@ class SensorProcess:
             self._process.join(EXIT_TIMEOUT)
         if self._process.is_alive():
             if self._attached:
-                log.warning("the senses of %s did not end by themselves", self.name)
+                log.warning("the sensor process of %s did not end by itself", self.name)
             self._process.kill()
             self._process.join()
         self._pipe.close()
-        self._mailbox.close()
+        self._snapshots.close()
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""The process of a robot's senses: renders what somebody wants, and is the robot's ROS node."""
+"""The sensor process of one robot: renders what is subscribed to, and runs the robot's ROS node."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import sys
 import zlib
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.sensing.latest_value import LatestValue, poller
+from vinesim.client.sensing.latest_value import LatestValue, make_poll
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.ids import Organ
@@ -27,54 +27,82 @@ from vinesim.scene.state import State
 from vinesim.scene.values import CameraFrame, LidarScan, RigidVisual, RobotSample, Snapshot
 from vinesim.sensors.camera.sunlight import SunPath
 
+if TYPE_CHECKING:
+    from vinesim.ros.node import Node
+    from vinesim.sensors.scheduler import SensorScheduler
+
 log = logging.getLogger(__name__)
 
 STATISTICS_PERIOD = 0.1
-"""Simulated time between two reports to the tick: what is wanted, what was sent [s]."""
+"""Simulated time between two reports to the client: subscriptions and message counts [s]."""
+GROUND_TRUTH_PERIOD = 10
+"""Ticks between two messages of true poses: 10 Hz."""
 SWITCH_INTERVAL = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
 PROCESS_NICE, RENDER_NICE = 10, 15
-"""Where cores are scarce, the tick goes first, then what ROS is told, then the pictures."""
+"""Niceness where cores are scarce: the client's loop comes first (0), then ROS messages, then pictures."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SensorConfig:
-    """All that the process must know beforehand."""
+    """What the process needs to start."""
 
     name: str
+    """The robot's."""
     model: Model
     description: RobotDescription
     sun: SunPath
     namespace: str
+    """Prefix of its topics."""
     ros: bool
+    """Whether it runs a ROS node."""
     keep_pictures: bool
+    """Whether the first camera renders even without subscribers, and the best picture is kept."""
     sensor_hz: float | None
+    """Rate of all sensors [Hz]; None: each sensor's own."""
     clock: bool
+    """Whether the node publishes /clock."""
     renderer: str = "warp"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class MovedPlants:
+    """Poses of the plants that moved since the last snapshot that was acknowledged."""
+
+    trees: np.ndarray
+    """[tree] indices."""
+    bodies: np.ndarray
+    """[body] indices of their bodies."""
+    body_q: np.ndarray
+    """[body, 7] m, 1."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class StepSnapshot:
-    """What the tick hands over. Poses are given only when the eyes want them, and of plants only those that moved."""
+    """What the client passes to the worker after a step; poses only when a sensor or subscriber needs them."""
 
     number: int
+    """Counts snapshots from 1."""
     tick: int
     time: float
+    """[s]"""
     sample: RobotSample
-    bodies: np.ndarray | None
-    body_q: np.ndarray | None
-    trees: np.ndarray | None
+    plants: MovedPlants | None
     attached: np.ndarray
-    links: tuple[RigidVisual, ...] | None
-    link_q: np.ndarray | None
-    poses: dict[str, np.ndarray] | None
+    """Bit field: whether each bunch hangs on its plant."""
+    visuals: tuple[RigidVisual, ...] | None
+    """All rigid bodies, if the list is not the one of the last acknowledged snapshot."""
+    visual_q: np.ndarray | None
+    """[visual, 7] their poses, if a sensor renders."""
+    sensor_poses: dict[str, np.ndarray] | None
+    """[7] world pose of each sensor by name, if one renders."""
     frame_score: float
-    """How much there is to see: see ``Client.worth``."""
+    """How much there is to see: see ``Client.frame_score``."""
 
 
-def run_sensor_worker(setup: SensorConfig, mailbox: LatestValue, pipe: Connection) -> None:
-    """Entry of the process: perceive until told to stop, or until whoever started it is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then says stop
+def run_sensor_worker(config: SensorConfig, snapshots: LatestValue, pipe: Connection) -> None:
+    """Entry of the process: render and publish until told to stop, or until the client's process has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.setswitchinterval(SWITCH_INTERVAL)
     if hasattr(os, "nice"):
@@ -82,162 +110,183 @@ def run_sensor_worker(setup: SensorConfig, mailbox: LatestValue, pipe: Connectio
     code = 0
     try:
         with contextlib.ExitStack() as stack:
-            stack.callback(mailbox.close)
-            SensorWorker(setup, pipe, stack).run(mailbox)
+            stack.callback(snapshots.close)
+            SensorWorker(config, pipe, stack).run(snapshots)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the client is gone
     except Exception as error:
-        log.exception("the senses fail")
+        log.exception("the sensor process failed")
         with contextlib.suppress(OSError):
             pipe.send(("failed", f"{type(error).__name__}: {error}"))
         code = 1
-    # All is closed. Taking the engines down in order would only keep the one who waits for us.
+    # All is closed. Taking the interpreter down in order would only delay the client, which waits.
     logging.shutdown()
     os._exit(code)
 
 
 class SensorWorker:
-    def __init__(self, setup: SensorConfig, pipe: Connection, stack: contextlib.ExitStack) -> None:
-        self.setup, self.pipe = setup, pipe
-        self._state = State.at_rest(setup.model)
-        self._links: tuple[RigidVisual, ...] = ()
-        self._kept: CameraFrame | None = None
-        self._greatest = -1.0
-        self._worth = 0.0
-        self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(len(setup.model.bunch_body)))
-        self._names: tuple[str, ...] = self._bunch_names
-        self._next_figures = 0.0
-        self.node = self._open_node(stack) if setup.ros else None
-        self.eyes = self._open_eyes(stack)
-        pipe.send(("figures", self._figures()))
+    """The robot's ROS node and its sensors, fed with snapshots."""
+
+    def __init__(self, config: SensorConfig, pipe: Connection, stack: contextlib.ExitStack) -> None:
+        """Starts the node and the sensors in ``stack``, then reports "ready"."""
+        self.config, self.pipe = config, pipe
+        self._state = State.at_rest(config.model)
+        self._visuals: tuple[RigidVisual, ...] = ()
+        self._best_frame: CameraFrame | None = None
+        self._best_score = -1.0
+        self._frame_score = 0.0
+        self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(len(config.model.bunch_body)))
+        self._attached_names: tuple[str, ...] = self._bunch_names
+        self._next_statistics = 0.0
+        self.node = self._open_node(stack) if config.ros else None
+        self.scheduler = self._open_sensors(stack)
+        pipe.send(("statistics", self._statistics()))
         pipe.send(("ready", None))
 
-    # ------------------------------------------------------------------ building
+    # ------------------------------------------------------------------ construction
 
-    def _open_node(self, stack: contextlib.ExitStack) -> Any:
+    def _open_node(self, stack: contextlib.ExitStack) -> Node:
         from vinesim.ros.node import Node
 
-        setup, description = self.setup, self.setup.description
+        config, description = self.config, self.config.description
         fixed = [(p, c, q) for (p, c), q in zip(description.fixed_frames, description.fixed_poses, strict=True)]
         node = stack.enter_context(
             Node(
-                ros_name(setup.name), description.urdf, namespace=setup.namespace,
+                ros_name(config.name), description.urdf, namespace=config.namespace,
                 static_transforms=fixed, cameras=[m.name for m in description.cameras],
                 lidars=[m.name for m in description.lidars], base=description.base,
-                clock=setup.clock,
+                clock=config.clock,
             )
         )  # fmt: skip
-        poles = np.flatnonzero(setup.model.fixed_organ == Organ.POLE)
-        at = frames.pose(setup.model.fixed_start[poles])
-        node.publish_environment_static(tuple(f"pole_{i:04d}" for i in range(len(poles))), at)
+        poles = np.flatnonzero(config.model.fixed_organ == Organ.POLE)
+        poses = frames.pose(config.model.fixed_start[poles])
+        node.publish_environment_static(tuple(f"pole_{i:04d}" for i in range(len(poles))), poses)
         return node
 
-    def _open_eyes(self, stack: contextlib.ExitStack) -> Any:
+    def _open_sensors(self, stack: contextlib.ExitStack) -> SensorScheduler:
         from vinesim.sensors.camera.camera import Camera, CameraSpec
         from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
         from vinesim.sensors.scene.primitives import Primitives
         from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
 
         load_kernels()
-        setup, mounts = self.setup, []
-        seed = zlib.crc32(setup.name.encode())  # no two robots have the same noise
-        for i, place in enumerate(setup.description.cameras):
-            spec = CameraSpec.load(place.type)
-            camera = Camera(spec, spec.info(place.frame), place.name, setup.sun, quality="fast", seed=seed)
-            wanted = self._wanted(place.name, always=setup.keep_pictures and i == 0)
-            depth = self._wanted(f"{place.name}/depth", always=setup.keep_pictures and i == 0)
-            mounts.append(ScheduledSensor(camera, self._deliver_camera, wanted, depth, setup.sensor_hz))
-        for place in setup.description.lidars:
-            lidar = Lidar(LidarSpec.load(place.type), place.name, place.frame, seed=seed)
-            mounts.append(ScheduledSensor(lidar, self._deliver_lidar, self._wanted(place.name), rate=setup.sensor_hz))
-        primitives = Primitives(setup.model, renderer=setup.renderer)
-        return stack.enter_context(SensorScheduler(setup.model, mounts, primitives=primitives, nice=RENDER_NICE))
+        config, sensors = self.config, []
+        seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
+        for i, mount in enumerate(config.description.cameras):
+            spec = CameraSpec.load(mount.type)
+            camera = Camera(spec, spec.info(mount.frame), mount.name, config.sun, quality="fast", seed=seed)
+            always = config.keep_pictures and i == 0
+            is_wanted = self._demand(mount.name, always)
+            is_depth_wanted = self._demand(f"{mount.name}/depth", always)
+            sensors.append(ScheduledSensor(camera, self._deliver_camera, is_wanted, is_depth_wanted, config.sensor_hz))
+        for mount in config.description.lidars:
+            lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed)
+            is_wanted = self._demand(mount.name)
+            sensors.append(ScheduledSensor(lidar, self._deliver_lidar, is_wanted, rate=config.sensor_hz))
+        primitives = Primitives(config.model, renderer=config.renderer)
+        return stack.enter_context(
+            SensorScheduler(config.model, sensors, primitives=primitives, nice=RENDER_NICE)
+        )  # fmt: skip
 
-    def _wanted(self, name: str, always: bool = False) -> Callable[[], bool]:
-        return lambda: always or (self.node is not None and self.node.has_subscribers(name))
+    def _demand(self, topics: str, always: bool = False) -> Callable[[], bool]:
+        """Whether a family of topics has subscribers now."""
+        return lambda: always or (self.node is not None and self.node.has_subscribers(topics))
 
-    # ------------------------------------------------------------------ running
+    # ------------------------------------------------------------------ loop
 
-    def run(self, mailbox: LatestValue) -> None:
-        """Until somebody says stop."""
-        has_news = poller(self.pipe)
+    def run(self, snapshots: LatestValue) -> None:
+        """Take snapshots and requests until a "stop"."""
+        has_request = make_poll(self.pipe)
         while True:
-            letter = mailbox.take(0.05)
-            if letter is not None:
-                self._read(pickle.loads(letter))
-            while has_news():
+            value = snapshots.take(0.05)
+            if value is not None:
+                self._take(pickle.loads(value))
+            while has_request():
                 kind, value = self.pipe.recv()
                 if kind == "stop":
                     return
                 if kind == "save":
-                    self._save(value)
+                    self._save_best_frame(value)
                 elif kind == "diagnose" and self.node is not None:
                     time = value.pop("time")
                     self.node.publish_diagnostics(time, value, healthy=value["real_time_factor"] > 0.99)
 
-    def _read(self, letter: StepSnapshot) -> None:
-        self._worth = letter.frame_score
-        if letter.bodies is not None:
-            self._state.body_q[letter.bodies] = letter.body_q
-        if letter.links is not None:
-            self._links = letter.links
-        if letter.link_q is not None and len(letter.link_q) == len(self._links):
-            self._state.bunch_attached[:] = np.unpackbits(letter.attached, count=len(self._bunch_names))
-            view = Snapshot(
-                letter.time, letter.tick, self._state.body_q.copy(), self._state.bunch_attached.copy(), self._links,
-                letter.link_q, letter.trees,
-            )  # fmt: skip
-            self.eyes.submit(view, letter.poses)
-        if letter.bodies is not None:
-            self.pipe.send(("read", (letter.number, letter.links is not None)))
+    def _take(self, snapshot: StepSnapshot) -> None:
+        """Bring the copy of the world up to date, pass it to the sensors, publish the robot's state."""
+        self._frame_score = snapshot.frame_score
+        plants = snapshot.plants
+        if plants is not None:
+            self._state.body_q[plants.bodies] = plants.body_q
+        if snapshot.visuals is not None:
+            self._visuals = snapshot.visuals
+        self._submit(snapshot)
+        if plants is not None:
+            self.pipe.send(("read", (snapshot.number, snapshot.visuals is not None)))
         if self.node is not None:
-            self.node.publish_robot_state(letter.time, letter.sample)
-            if letter.tick % 10 == 0 and letter.bodies is not None and self.node.has_subscribers("tf_environment"):
-                self._publish_truth(letter.time)
+            self.node.publish_robot_state(snapshot.time, snapshot.sample)
+            is_due = snapshot.tick % GROUND_TRUTH_PERIOD == 0 and plants is not None
+            if is_due and self.node.has_subscribers("tf_environment"):
+                self._publish_ground_truth(self.node, snapshot.time)
             if commands := self.node.commands():
                 self.pipe.send(("commands", commands))
-        if letter.time >= self._next_figures:
-            self._next_figures = letter.time + STATISTICS_PERIOD
-            self.pipe.send(("figures", self._figures()))
+        if snapshot.time >= self._next_statistics:
+            self._next_statistics = snapshot.time + STATISTICS_PERIOD
+            self.pipe.send(("statistics", self._statistics()))
 
-    def _publish_truth(self, time: float) -> None:
-        here = np.flatnonzero(self._state.bunch_attached)
-        if len(here) != len(self._names):
-            self._names = tuple(self._bunch_names[i] for i in here)
-        poses = self._state.body_q[self.setup.model.bunch_body[here]]
-        self.node.publish_environment(time, self._names, poses.astype(float))
+    def _submit(self, step: StepSnapshot) -> None:
+        """Pass the world to the sensors, if the step has the poses of all rigid bodies that are known here."""
+        if step.plants is None or step.visual_q is None or step.sensor_poses is None:
+            return
+        if len(step.visual_q) != len(self._visuals):
+            return
+        self._state.bunch_attached[:] = np.unpackbits(step.attached, count=len(self._bunch_names))
+        world = Snapshot(
+            step.time, step.tick, self._state.body_q.copy(), self._state.bunch_attached.copy(), self._visuals,
+            step.visual_q, step.plants.trees,
+        )  # fmt: skip
+        self.scheduler.submit(world, step.sensor_poses)
 
-    def _figures(self) -> dict[str, Any]:
-        figures = {
+    def _publish_ground_truth(self, node: Node, time: float) -> None:
+        """True poses of the bunches that hang on their plants."""
+        attached = np.flatnonzero(self._state.bunch_attached)
+        if len(attached) != len(self._attached_names):
+            self._attached_names = tuple(self._bunch_names[i] for i in attached)
+        poses = self._state.body_q[self.config.model.bunch_body[attached]]
+        node.publish_environment(time, self._attached_names, poses.astype(float))
+
+    def _statistics(self) -> dict[str, Any]:
+        """What is subscribed to, and what was rendered, sent and dropped."""
+        statistics = {
             "sent": {},
-            "eyes": any(sensor.is_wanted() for sensor in self.eyes.sensors),
-            "frames": dict(self.eyes.frames),
-            "frames_dropped": dict(self.eyes.dropped),
+            "renders": any(sensor.is_wanted() for sensor in self.scheduler.sensors),
+            "frames": dict(self.scheduler.frames),
+            "frames_dropped": dict(self.scheduler.dropped),
         }
         if self.node is not None:
-            figures |= {
+            statistics |= {
                 "sent": self.node.sent,
                 "ros_dropped": self.node.dropped,
-                "truth": self.node.has_subscribers("tf_environment"),
+                "publishes_truth": self.node.has_subscribers("tf_environment"),
             }
-        return figures
+        return statistics
 
     def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
         assert isinstance(frame, CameraFrame)
         if self.node is not None:
             self.node.publish_camera(frame)
-        if self.setup.keep_pictures and frame.name == self.eyes.mounts[0].name and self._worth >= self._greatest:
-            self._greatest, self._kept = self._worth, frame
+        is_kept = self.config.keep_pictures and frame.name == self.scheduler.sensors[0].name
+        if is_kept and self._frame_score >= self._best_score:
+            self._best_score, self._best_frame = self._frame_score, frame
 
     def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
         assert isinstance(scan, LidarScan)
         if self.node is not None:
             self.node.publish_lidar(scan)
 
-    def _save(self, folder: pathlib.Path) -> None:
-        if self._kept is not None:
+    def _save_best_frame(self, folder: pathlib.Path) -> None:
+        if self._best_frame is not None:
             from vinesim.sensors.export import images
 
-            images.save_frame(self._kept, folder, "")
-        self.pipe.send(("figures", self._figures()))
+            images.save_frame(self._best_frame, folder, "")
+        self.pipe.send(("statistics", self._statistics()))
         self.pipe.send(("saved", None))

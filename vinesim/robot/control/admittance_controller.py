@@ -1,10 +1,10 @@
-"""Give way: a hand that moves as the force at its wrist asks, the example of a controller that uses force feedback.
+"""Admittance control of a hand: it moves as the force at its wrist asks; an example of force feedback.
 
-    controller = Admittance(robot, "arm_left", "wrist_left_ft")
+    controller = AdmittanceController(robot, "arm_left", "wrist_left_ft")
     ...
-    controller(robot.sample(time, contacts))    # each tick, before robot.control(time)
+    controller(robot.sample(time, contacts))    # each step, before robot.control(time)
 
-It hears nothing but the robot's samples, so a ROS node can do the same from topics (D6.4 section 3.1).
+It uses only the robot's samples, so a ROS node can do the same from topics (CANOPIES D6.4, section 3.1; Hogan 1985).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from vinesim.robot.drives.robot import Robot
 from vinesim.scene.values import RobotSample
 
 JACOBIAN_DAMPING = 0.05
-"""Damping of the inverse Jacobian: stretched out, an arm moves slower than asked instead of fast."""
+"""[m/rad] Damping of the inverse Jacobian, which bounds joint rates of a stretched arm. GUESSED"""
 
 
 class AdmittanceController:
-    """The hand is a mass in honey: mass dv/dt + damping v = force; it keeps its attitude."""
+    """The hand moves as a damped mass: mass dv/dt + damping v = force. It keeps its orientation."""
 
     def __init__(
         self,
@@ -33,10 +33,11 @@ class AdmittanceController:
         damping: float = 60.0,
         force_deadband: float = 0.5,
     ) -> None:
-        """``mass`` [kg] and ``damping`` [N s/m] that a hand feels; forces below ``ignored`` [N] count as none.
+        """``mass`` [kg] and ``damping`` [N s/m] of the virtual mass; forces below ``force_deadband`` [N] count as 0.
 
-        The mass must be larger than that of what hangs on the sensor, which feels its own inertia. What it carries at
-        the first sample, or at :meth:`tare`, is taken for weight.
+        ``group``: joints of the arm; ``sensor``: name of the wrist sensor. The mass must exceed that of the links
+        beyond the sensor, which measures their inertia too. The force in the first sample, or in the first after
+        :meth:`tare`, is taken for their weight. Raises :class:`CommandError` for an unknown sensor.
         """
         known = [mount.name for mount in robot.description.wrenches]
         if sensor not in known:
@@ -46,16 +47,16 @@ class AdmittanceController:
         self.robot, self.sensor = robot, sensor
         self.mass, self.damping, self.force_deadband = mass, damping, force_deadband
         self.velocity = np.zeros(3)
-        """[3] m/s of the hand, world axes, as it is asked for"""
+        """[3] m/s, commanded velocity of the hand, world axes"""
         self._joints = robot.description.joint_indices(group)
         self._weight: np.ndarray | None = None
 
     def tare(self) -> None:
-        """Take what the next sample carries for weight."""
+        """Take the force in the next sample for the weight."""
         self._weight = None
 
     def __call__(self, sample: RobotSample) -> None:
-        """Move on by a tick."""
+        """Command the arm for one step, given the robot's last ``sample``."""
         wrench = next(wrench for wrench in sample.wrenches if wrench.name == self.sensor)
         pose = self.robot.frame_pose(wrench.frame)
         force = frames.rotate(pose[3:], wrench.force)

@@ -1,15 +1,15 @@
-"""A hand, led: a point of an arm's tool follows straight lines, and the tool turns to where it is to point.
+"""Cartesian control of one arm: the tip follows straight lines, the tool turns to an orientation.
 
-    hand = Hand(robot, "left")
-    hand.start()
-    while hand.distance(goal) > 0.003:
-        hand.lead(goal, ahead=[1, 0, 0], up=[0, 0, 1], speed=0.3)
+    arm = CartesianController(robot, "left")
+    arm.reset()
+    while arm.distance_to(goal) > 0.003:
+        arm.move_towards(goal, x_axis=[1, 0, 0], z_axis=[0, 0, 1], speed=0.3, working_height=1.4)
         robot.control(time)
         physics.step()
 
-The point is led by the damped pseudo-inverse of the Jacobian (Nakamura and Hanafusa 1986) of the state as it is, so
-that neither a moving base nor a thing in the way is a special case. What that leaves free, an arm of seven joints on a
-lift, first turns the tool (Siciliano and Slotine 1991) and then goes to a posture.
+Differential inverse kinematics: the damped pseudo-inverse of the Jacobian (Nakamura and Hanafusa 1986) at the measured
+state moves the tip, so moving bases and obstacles need no special case. The remaining degrees of freedom of an arm
+with seven joints on a lift first turn the tool, then approach a posture (Siciliano and Slotine 1991).
 """
 
 from __future__ import annotations
@@ -21,27 +21,29 @@ from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.robot import Robot
 
 POSITION_GAIN = 5.0
-"""Share of an error that is taken out per second [1/s]; well below the servos' bandwidth."""
+"""[1/s] Feedback gain of position and orientation; well below the servos' bandwidth. GUESSED"""
 POSTURE_GAIN = 1.0
-"""The same for the posture [1/s]."""
+"""[1/s] Gain towards the posture. GUESSED"""
 MAX_TOOL_RATE = 1.0
-"""Fastest turn of the tool [rad/s]."""
+"""[rad/s] Largest rate at which the tool turns. GUESSED"""
 SHOULDER_DROP = 0.10
-"""The posture has the shoulder this far below the hand's goal [m]."""
+"""[m] The lift brings the shoulder this far below the working height. GUESSED"""
 MIN_SINGULAR_VALUE = 0.06
-"""Singular values [m/rad] below this one are damped, so that joints keep their speed near singular postures."""
+"""[m/rad] Smaller singular values are damped, which bounds joint rates near singular postures. GUESSED"""
 RATE_RAMP_TIME = 0.15
-"""Least time in which a joint comes to its full speed [s]."""
+"""[s] Shortest time in which a joint reaches its largest velocity. GUESSED"""
 
 
 class CartesianController:
-    """One arm's tool: where it is, and how it is led."""
+    """Moves the tip of one arm's tool, and with it the lift that carries the arm."""
 
     def __init__(
         self, robot: Robot, side: str, *, tip_offset: float = 0.0, acceleration: float = 0.8, use_lift: bool = True
     ) -> None:
-        """``tip``: how far ahead of the tool's frame the led point lies [m]; ``acceleration`` of that point [m/s2];
-        ``lift`` False leaves the torso to somebody else, such as the other arm.
+        """Control the group ``arm_{side}`` of ``robot``, and its torso if ``use_lift``.
+
+        ``tip_offset`` [m]: distance of the tip ahead of the tool's frame, along its x axis. ``acceleration`` [m/s2] of
+        the tip. Raises :class:`CommandError` if the robot has no such arm with a tool.
         """
         description = robot.description
         arm = description.groups.get(f"arm_{side}")
@@ -57,7 +59,7 @@ class CartesianController:
         self._lifts = len(lifts)
         speed_of = robot.max_velocity[self._joints]
         self._joint_weights = speed_of / speed_of.max()
-        """How readily a joint is used: the slow lift less than the arm."""
+        """[joint] Weights in the inverse kinematics: the slow lift moves less than the arm."""
         self._home = description.home[self._joints]
         moving = description.moving_joints
         self._shoulder = moving.frames[moving.names.index(arm.joints[0])][1]
@@ -65,27 +67,27 @@ class CartesianController:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new way where the hand is now, at rest."""
+        """Restart the reference at the present tip position, at rest."""
         self._reference, self._reference_speed = self.tip_position, 0.0
 
     @property
     def reference(self) -> np.ndarray:
-        """Where the point should be by now [3] m; :attr:`point` follows it."""
+        """Reference position [3] m in the world, which :attr:`tip_position` follows."""
         return self._reference
 
     @property
     def tip_position(self) -> np.ndarray:
-        """The led point in the world [3] m."""
+        """Position of the tip [3] m in the world."""
         pose = self.robot.frame_pose(self.tool)
         return pose[:3] + self._tip_offset * axes_of_pose(pose)[0]
 
     @property
     def shoulder_position(self) -> np.ndarray:
-        """Where the arm begins, in the world [3] m."""
+        """Origin of the arm's first link [3] m in the world."""
         return self.robot.frame_pose(self._shoulder)[:3]
 
     def distance_to(self, goal: np.ndarray) -> float:
-        """From the led point to ``goal`` [3] in the world [m]."""
+        """Distance [m] of the tip from ``goal`` [3] m in the world."""
         return float(np.linalg.norm(goal - self.tip_position))
 
     def move_towards(
@@ -95,12 +97,13 @@ class CartesianController:
         z_axis: np.ndarray | None = None,
         *,
         speed: float,
-        shoulder_height: float,
+        working_height: float,
     ) -> None:
-        """Command the arm for one tick: the point towards ``goal`` [3] m at most at ``speed`` [m/s].
+        """Command the arm for one step: the tip moves towards ``goal`` [3] m at no more than ``speed`` [m/s].
 
-        The tool's x axis turns to ``ahead`` [3], and its z axis to ``up`` [3] if that is given; both in the world and
-        perpendicular. The lift brings the shoulder a little below ``height`` [m].
+        The tool's x axis turns to ``x_axis`` [3], and its z axis to ``z_axis`` [3] if given: unit vectors in the
+        world, perpendicular to each other. The lift brings the shoulder to :data:`SHOULDER_DROP` below
+        ``working_height`` [m].
         """
         robot, dt = self.robot, self.robot.rigid.dt
         pose = robot.frame_pose(self.tool)
@@ -119,7 +122,7 @@ class CartesianController:
 
         now, home = robot.setpoint[self._joints], self._home.copy()
         if self._lifts:
-            raised = shoulder_height - SHOULDER_DROP - self.shoulder_position[2]
+            raised = working_height - SHOULDER_DROP - self.shoulder_position[2]
             home[: self._lifts] = now[: self._lifts] + raised / self._lifts
         lower, upper, fastest = (
             robot.lower_limit[self._joints],
@@ -133,7 +136,7 @@ class CartesianController:
             (upper - now) / dt,
             self._joint_weights,
         )
-        # slowed down all together, the joints keep the hand on its line
+        # all joints are slowed down by the same factor: the tip stays on its line
         rates /= max(1.0, float(np.max(np.abs(rates) / fastest)))
         change = rates - self._rates
         rates = self._rates + change / max(1.0, float(np.max(np.abs(change) / (fastest * dt / RATE_RAMP_TIME))))
@@ -141,18 +144,18 @@ class CartesianController:
         robot.command_position(now + dt * rates, self._joints)
 
     def hold_position(self) -> None:
-        """Stay as the joints are, whatever the base does."""
+        """Command the joints to their present set-points, for one step in which the arm does not move."""
         self._rates[:] = 0.0
         self.robot.command_position(self.robot.setpoint[self._joints], self._joints)
 
     def _advance_reference(self, goal: np.ndarray, speed: float, dt: float) -> np.ndarray:
-        """Advance the place where the point should be; its velocity [3] m/s."""
+        """Advance the reference by a step of a trapezoidal velocity profile; its velocity [3] m/s."""
         way = goal - self._reference
         left = float(np.linalg.norm(way))
         if left < 1e-9:
             self._reference_speed = 0.0
             return np.zeros(3)
-        # the fastest pace from which the rest of the way suffices to stop
+        # the largest speed from which it can stop at the goal
         braking = np.sqrt(2.0 * self.acceleration * left)
         self._reference_speed = min(self._reference_speed + self.acceleration * dt, speed, braking)
         step = min(self._reference_speed * dt, left)
@@ -161,7 +164,7 @@ class CartesianController:
 
 
 def _pointing_error(axis: np.ndarray) -> np.ndarray:
-    """Turn [2] about a tool's y and z axes that brings its x axis to ``axis`` [3], given in the tool's own axes."""
+    """Rotation [2] rad about a tool's y and z axes that turns its x axis to ``axis`` [3], given in the tool's frame."""
     ahead, left, up = axis
     turn = np.array([-up, left])
     if ahead < 0.0:
@@ -170,12 +173,12 @@ def _pointing_error(axis: np.ndarray) -> np.ndarray:
 
 
 def _clip_norm(vector: np.ndarray, length: float) -> np.ndarray:
-    """The vector, shortened to ``length`` if it is longer."""
+    """The vector, scaled down to ``length`` if it is longer."""
     return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-12))
 
 
 def axes_of_pose(pose: np.ndarray) -> np.ndarray:
-    """The axes of a pose [7] as rows [3, 3], in its parent (frames.to_matrix in plain numbers: ten times as fast)."""
+    """The axes of a pose [7] as rows [3, 3], in its parent: frames.to_matrix in Python floats, ten times as fast."""
     x, y, z, w = pose[3:].tolist()
     return np.array(
         [
@@ -193,10 +196,11 @@ def solve_prioritized_ik(
     max_rates: np.ndarray,
     joint_weights: np.ndarray,
 ) -> np.ndarray:
-    """Joint speeds [joint] that do ``tasks`` (Jacobian [k, joint], wanted [k]) in order, then ``posture`` [joint].
+    """Joint rates [joint] that fulfil ``tasks`` (Jacobian [k, joint], velocity [k]) in order, then ``posture_rates``.
 
-    Later tasks use only what earlier ones leave free. ``share`` [joint] says how readily a joint is used. Joints that
-    would pass ``lowest`` or ``highest`` [joint] stay at that bound, and the others do their work.
+    Strict priority: a task uses only the null space of those before it (Siciliano and Slotine 1991). All rates are
+    [joint] rad/s or m/s. ``joint_weights`` [joint]: relative use of the joints. Joints that would exceed ``min_rates``
+    or ``max_rates`` are fixed at that bound, one at a time, and the others do the tasks.
     """
     held = np.zeros(len(posture_rates), bool)
     fixed = np.zeros(len(posture_rates))
@@ -213,7 +217,7 @@ def solve_prioritized_ik(
 def _solve_task_stack(
     tasks: list[tuple[np.ndarray, np.ndarray]], posture: np.ndarray, share: np.ndarray, fixed: np.ndarray
 ) -> np.ndarray:
-    """Speeds [joint] ``fixed`` + ``share`` y, where y does each task in what the ones before it leave free."""
+    """Rates [joint] ``fixed`` + ``share`` y, where y does each task in the null space of the ones before it."""
     y = np.zeros(len(posture))
     free = np.eye(len(posture))
     for jacobian, wanted in tasks:
@@ -227,7 +231,7 @@ def _solve_task_stack(
 
 
 def _damped_inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pseudo-inverse [joint, k] with small singular values damped, and the projector [joint, joint] on what it uses."""
+    """Pseudo-inverse [joint, k] with small singular values damped, and the projector [joint, joint] on its row space."""
     u, s, vt = np.linalg.svd(matrix, full_matrices=False)
     damping = np.where(
         s < MIN_SINGULAR_VALUE, (1.0 - (s / MIN_SINGULAR_VALUE) ** 2) * (0.5 * MIN_SINGULAR_VALUE) ** 2, 0.0

@@ -1,13 +1,13 @@
-"""Joint trajectories with tolerances, as ``joint_trajectory_controller`` of ros2_control follows them.
+"""Follows joint trajectories with tolerances, as ``joint_trajectory_controller`` of ros2_control does.
 
     controller = TrajectoryController(robot, robot.description.groups["arm_left"].joints)
-    run = controller.start(Trajectory(joints, times, positions), time)
+    goal = controller.start(Trajectory(joints, times, positions), time)
     ...
     controller(time)              # each tick, before robot.control(time)
-    if run.outcome is Outcome.PATH_TOLERANCE_VIOLATED: ...
+    if goal.outcome is Outcome.PATH_TOLERANCE_VIOLATED: ...
 
-Splines are cubic where way points have velocities, else straight lines. Where the drives cannot follow, the limits of
-the URDF win and the tolerances tell.
+Between waypoints the splines are cubic if velocities are given, else linear. Where the drives cannot follow, the limits
+of the URDF hold, and the tolerances detect the error.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vinesim.robot.drives.robot import Robot
 
 
 class Outcome(enum.IntEnum):
-    """How a run ended: error codes of control_msgs/action/FollowJointTrajectory, and two that ROS has states for."""
+    """How a goal ended: error codes of control_msgs/action/FollowJointTrajectory, and two for which ROS has goal states."""
 
     SUCCESSFUL = 0
     INVALID_GOAL = -1
@@ -45,7 +45,7 @@ class TrajectoryError(CommandError):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Tolerance:
-    """How far joints may be off, each [joint] in the trajectory's order; infinite where nobody looks."""
+    """Largest permitted errors, each [joint] in the trajectory's order; infinite where there is no limit."""
 
     position: np.ndarray
     """[joint] rad or m"""
@@ -58,34 +58,34 @@ class Tolerance:
         return cls(np.full(count, float(position)), np.full(count, float(velocity)))
 
     def violated(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """[k] indices of the joints whose errors are too large."""
+        """Indices [k] of the joints whose errors in ``position`` or ``velocity`` [joint] are too large."""
         return np.flatnonzero((np.abs(position) > self.position) | (np.abs(velocity) > self.velocity))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Way points of some joints (trajectory_msgs/JointTrajectory)."""
+    """Waypoints of some joints (trajectory_msgs/JointTrajectory), and tolerances of the goal."""
 
     joints: tuple[str, ...]
     times: np.ndarray
-    """[point] s after the start, rising; if the first is not at 0, the way begins where the joints are"""
+    """[point] s after the start, increasing; if the first is not 0, the spline begins at the present positions"""
     positions: np.ndarray
     """[point, joint] rad or m"""
     velocities: np.ndarray | None = None
-    """[point, joint] rad/s or m/s; without them the way is straight from point to point"""
+    """[point, joint] rad/s or m/s; None: linear interpolation"""
     start_time: float = 0.0
-    """When it starts [s]; 0 means as soon as it is taken."""
+    """Simulation time [s] at which it starts; 0: when it is accepted."""
     path_tolerance: Tolerance | None = None
-    """How far off the joints may be on the way; None: as the controller is set."""
+    """Permitted errors on the path; None: the controller's."""
     goal_tolerance: Tolerance | None = None
-    """How far off they may be at the end."""
+    """Permitted errors at the end; None: the controller's."""
     goal_time_tolerance: float | None = None
-    """How much later than planned they may arrive [s]; 0: for ever, as in ROS."""
+    """[s] Permitted delay of the arrival; 0: unlimited, as in ROS; None: the controller's."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ControllerState:
-    """Where the joints should be and are (control_msgs/JointTrajectoryControllerState), each [joint]."""
+    """Desired and actual joint states (control_msgs/JointTrajectoryControllerState), each [joint] rad or m, or per s."""
 
     time: float
     joints: tuple[str, ...]
@@ -96,30 +96,30 @@ class ControllerState:
 
     @property
     def error(self) -> np.ndarray:
-        """[joint] rad or m: wanted less actual."""
+        """[joint] rad or m: desired less actual position."""
         return self.desired - self.position
 
 
 @dataclasses.dataclass(slots=True, eq=False)
 class GoalHandle:
-    """One trajectory on its way, or what came of it."""
+    """One accepted trajectory and its result."""
 
     trajectory: Trajectory
     start_time: float
-    """[s] simulation time of its first moment"""
+    """Simulation time [s] of its start."""
     outcome: Outcome | None = None
-    """None as long as it runs."""
+    """None while it is executed."""
     text: str = ""
-    """What went wrong, in words."""
+    """Why it failed; empty if it did not."""
 
     @property
     def is_done(self) -> bool:
-        """Whether it has ended, well or not."""
+        """Whether it has ended, successfully or not."""
         return self.outcome is not None
 
 
 class TrajectoryController:
-    """Moves some joints of a robot along trajectories, one at a time; a newer one takes over where the old one is."""
+    """Moves some joints of a robot along trajectories, one at a time; a newer one preempts the one that is executed."""
 
     def __init__(
         self,
@@ -130,7 +130,7 @@ class TrajectoryController:
         goal_tolerance: Tolerance | None = None,
         goal_time_tolerance: float = 0.0,
     ) -> None:
-        """``path``, ``goal``, ``goal_time``: tolerances of trajectories that bring none; none means anything goes."""
+        """The tolerances are those of trajectories that have none of their own; None: no limit."""
         self.robot = robot
         self.joints = tuple(joints)
         self.indices = robot.joint_indices(self.joints)
@@ -138,7 +138,7 @@ class TrajectoryController:
         self.goal_tolerance = goal_tolerance or Tolerance.uniform(len(self.joints))
         self.goal_time_tolerance = goal_time_tolerance
         self.active_goal: GoalHandle | None = None
-        """What is being followed, None if nothing is."""
+        """The goal that is executed, None if there is none."""
         self._knot_times = np.zeros(0)
         self._knot_positions = np.zeros((0, 0))
         self._knot_velocities: np.ndarray | None = None
@@ -150,10 +150,10 @@ class TrajectoryController:
     # ------------------------------------------------------------------ commands
 
     def start(self, trajectory: Trajectory, time: float) -> GoalHandle:
-        """Follow a trajectory from now, or from its own start, on; what ran before is preempted.
+        """Follow a trajectory from ``time`` [s], or from its own start; the goal before it is preempted.
 
-        Joints that it does not name stay where they are. Raises :class:`TrajectoryError` and changes nothing if the
-        trajectory makes no sense.
+        Joints that it does not name keep their positions. Raises :class:`TrajectoryError` and changes nothing if the
+        trajectory is invalid.
         """
         order = self._validate(trajectory, time)
         began = max(trajectory.start_time, time) if trajectory.start_time > 0.0 else time
@@ -164,7 +164,7 @@ class TrajectoryController:
             trajectory.positions,
             trajectory.velocities,
         )
-        if trajectory.times[0] > 0.0:  # from where they are, or should be
+        if trajectory.times[0] > 0.0:  # from the present set-points, or positions
             by_servo = np.isin(self.robot.interface[active], (CommandInterface.POSITION, CommandInterface.VELOCITY))
             here = np.where(
                 by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active]
@@ -179,16 +179,16 @@ class TrajectoryController:
         return self.active_goal
 
     def cancel(self) -> None:
-        """Stop where the joints are."""
+        """Cancel the goal and hold the present positions."""
         if self.active_goal is not None:
             self._end(Outcome.CANCELED, "it was cancelled")
             self._hold()
 
     def _validate(self, trajectory: Trajectory, time: float) -> np.ndarray:
-        """Where the trajectory's joints stand among this controller's [joint]."""
+        """Indices [joint] of the trajectory's joints among the controller's; :class:`TrajectoryError` if invalid."""
         name, t = self.robot.name, trajectory
-        strangers = [joint for joint in t.joints if joint not in self.joints]
-        if strangers or len(set(t.joints)) < len(t.joints) or not t.joints:
+        unknown = [joint for joint in t.joints if joint not in self.joints]
+        if unknown or len(set(t.joints)) < len(t.joints) or not t.joints:
             raise TrajectoryError(
                 Outcome.INVALID_JOINTS,
                 f"{name}: trajectory for {', '.join(t.joints) or 'no joints'}; this controller moves each of "
@@ -210,7 +210,7 @@ class TrajectoryController:
                 )
         if len(t.times) == 0 or not np.isfinite(t.times).all() or t.times[0] < 0.0 or (np.diff(t.times) <= 0.0).any():
             raise TrajectoryError(
-                Outcome.INVALID_GOAL, f"{name}: way points at {list(t.times)} s; give times that rise from 0 on"
+                Outcome.INVALID_GOAL, f"{name}: waypoints at {list(t.times)} s; give times that increase from 0 on"
             )
         if t.start_time > 0.0 and t.start_time + t.times[-1] < time:
             raise TrajectoryError(
@@ -219,13 +219,14 @@ class TrajectoryController:
             )
         return np.array([self.joints.index(joint) for joint in t.joints])
 
-    # ------------------------------------------------------------------ each tick
+    # ------------------------------------------------------------------ each step
 
     def __call__(self, time: float) -> None:
-        """Command the set-points of the tick that starts at ``time`` [s], and judge how the last one went."""
-        if self.active_goal is None:
+        """Command the set-points of the step that starts at ``time`` [s], and check the errors after the last one."""
+        goal = self.active_goal
+        if goal is None:
             return
-        run, elapsed = self.active_goal, time - self.active_goal.start_time
+        elapsed = time - goal.start_time
         if elapsed < 0.0:
             return
         position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
@@ -233,28 +234,28 @@ class TrajectoryController:
         self._desired[self._order], self._desired_velocity[self._order] = wanted, rate
         error, slip = wanted - position[self._active], rate - velocity[self._active]
         if elapsed < self._knot_times[-1]:
-            tolerance = run.trajectory.path_tolerance or _reordered(self.path_tolerance, self._order)
+            tolerance = goal.trajectory.path_tolerance or _reordered(self.path_tolerance, self._order)
             if len(off := tolerance.violated(error, slip)):
-                self._fail(Outcome.PATH_TOLERANCE_VIOLATED, off[0], error, slip, f"{elapsed:.2f} s on the way")
+                self._fail(goal, Outcome.PATH_TOLERANCE_VIOLATED, off[0], error, slip, f"{elapsed:.2f} s on the way")
                 return
         else:
-            tolerance = run.trajectory.goal_tolerance or _reordered(self.goal_tolerance, self._order)
+            tolerance = goal.trajectory.goal_tolerance or _reordered(self.goal_tolerance, self._order)
             off = tolerance.violated(error, slip)
             late = (
                 self.goal_time_tolerance
-                if run.trajectory.goal_time_tolerance is None
-                else run.trajectory.goal_time_tolerance
+                if goal.trajectory.goal_time_tolerance is None
+                else goal.trajectory.goal_time_tolerance
             )
             if not len(off):
                 self._end(Outcome.SUCCESSFUL, "")
                 self.active_goal = None
             elif late > 0.0 and elapsed > self._knot_times[-1] + late:
-                self._fail(Outcome.GOAL_TOLERANCE_VIOLATED, off[0], error, slip, f"{late:.2f} s after the end")
+                self._fail(goal, Outcome.GOAL_TOLERANCE_VIOLATED, off[0], error, slip, f"{late:.2f} s after the end")
                 return
         self.robot.command_position(self._sample(elapsed + self.robot.rigid.dt)[0], self._active)
 
     def state(self, time: float) -> ControllerState:
-        """Where the joints should be and are."""
+        """Desired and actual joint states at ``time`` [s]."""
         position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         return ControllerState(
             time, self.joints, self._desired.copy(), self._desired_velocity.copy(), position[self.indices],
@@ -262,7 +263,7 @@ class TrajectoryController:
         )  # fmt: skip
 
     def _sample(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [joint] of the spline; beyond its end, standing there."""
+        """Positions and velocities [joint] of the spline at ``elapsed`` [s]; at rest beyond its end."""
         knots, points = self._knot_times, self._knot_positions
         if elapsed >= knots[-1]:
             return points[-1], np.zeros(points.shape[1])
@@ -276,8 +277,10 @@ class TrajectoryController:
         place = points[i] + s * (first + s * (square + s * cube))
         return place, (first + s * (2.0 * square + 3.0 * s * cube)) / span
 
-    def _fail(self, outcome: Outcome, joint: int, error: np.ndarray, slip: np.ndarray, when: str) -> None:
-        name = self.active_goal.trajectory.joints[joint]
+    def _fail(
+        self, goal: GoalHandle, outcome: Outcome, joint: int, error: np.ndarray, slip: np.ndarray, when: str
+    ) -> None:
+        name = goal.trajectory.joints[joint]
         self._end(outcome, f"{name} is off by {error[joint]:.4f} and {slip[joint]:.4f} a second, {when}")
         self._hold()
 

@@ -1,4 +1,4 @@
-"""A way on the ground: the base turns towards each point, drives there straight, and turns to the last heading."""
+"""Drives the base along waypoints: it turns towards each, drives there straight, and turns to the final heading."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ import numpy as np
 from vinesim.robot.drives.robot import Robot
 
 POSITION_TOLERANCE = 0.01
-"""This near is there [m]."""
+"""[m] A waypoint this near is reached. GUESSED"""
 HEADING_TOLERANCE = 0.01
-"""This exactly turned is turned [rad]."""
+"""[rad] A heading with a smaller error is reached. GUESSED"""
 DECELERATION = 0.5
-"""Of the base before a point [m/s2] and before a heading [rad/s2]; half of what vinebot's tracks can do."""
+"""Of the base before a waypoint [m/s2] and before a heading [rad/s2]; half of what vinebot's tracks can do."""
 LOOKAHEAD_DISTANCE = 0.4
-"""A base beside its line steers for the point so far ahead on it [m]."""
+"""[m] A base beside its line steers for the point this far ahead on the line. GUESSED"""
 STUCK_TIMEOUT = 4.0
-"""A base that has not moved for so long while it should is stuck [s]."""
+"""[s] A base that should move and has not moved for this time is stuck. GUESSED"""
 
 
 class WaypointFollower:
-    """Drive along points, one straight leg after the other, forwards unless told otherwise."""
+    """Drives a robot's base along points, one straight leg after the other, forwards or in reverse."""
 
     def __init__(
         self, robot: Robot, points: np.ndarray, heading: float | None = None, *, speed: float = 0.5, turn_rate: float = 0.4,
         reverse: bool = False,
     ) -> None:  # fmt: skip
-        """``points`` [n, 2] m in the world, ``heading`` [rad] at the end (as the last leg left it, unless given);
-        ``speed`` [m/s], ``turn`` [rad/s]; ``backwards``: the base looks back along every leg.
+        """``points`` [n, 2] m in the world, ``heading`` [rad] at the end (that of the last leg unless
+        given); ``speed`` [m/s] and ``turn_rate`` [rad/s]: the largest; ``reverse``: the base drives backwards.
         """
         self.robot = robot
         self.points = np.asarray(points, float).reshape(-1, 2)
         self.heading, self.speed, self.turn_rate = heading, speed, turn_rate
         self.is_done = False
         self.is_stuck = False
-        """Whether something keeps the base from going on."""
+        """Whether the base does not move although it should."""
         self._direction = -1.0 if reverse else 1.0
         self._leg = 0
         self._turning = True
@@ -43,7 +43,7 @@ class WaypointFollower:
         self._last_motion = (0.0, np.full(3, np.inf))
 
     def control(self, time: float) -> None:
-        """Command the base for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
+        """Command the base for the step that starts at ``time`` [s]; call it before ``robot.control``."""
         if self.is_done:
             return
         pose, _ = self.robot.rigid.base_state(self.robot.name)
@@ -61,7 +61,7 @@ class WaypointFollower:
         self.robot.command_base(linear, angular, time)
 
     def _follow_leg(self, here: np.ndarray, yaw: float) -> tuple[float, float]:
-        """Speeds ahead and to the left on the present leg."""
+        """Velocity [m/s] and yaw rate [rad/s] on the present leg; ``here`` [2] m and ``yaw`` [rad] of the base."""
         goal = self.points[self._leg]
         leg = goal - self._leg_start
         length = float(np.hypot(*leg))
@@ -82,7 +82,7 @@ class WaypointFollower:
         return 0.0, 0.0
 
     def _turn_towards(self, course: float, yaw: float) -> float:
-        """Rate of turn [rad/s] towards a heading; takes note when it is reached."""
+        """Yaw rate [rad/s] towards the heading ``course`` [rad]; ends the turn when it is reached."""
         error = _wrap_angle(course - yaw)
         rate = float(self.robot.rigid.base_state(self.robot.name)[1][5])
         if abs(error) < HEADING_TOLERANCE and abs(rate) < 0.02:
@@ -94,7 +94,7 @@ class WaypointFollower:
         return math.copysign(min(self.turn_rate, math.sqrt(2.0 * DECELERATION * abs(error)), 3.0 * abs(error)), error)
 
     def _detect_stall(self, time: float, here: np.ndarray, yaw: float) -> None:
-        """Notice when the base stands where it should move."""
+        """Set :attr:`is_stuck` if the base has not moved for :data:`STUCK_TIMEOUT`."""
         now = np.append(here, yaw)
         if np.abs(now - self._last_motion[1]).max() > 0.01:
             self._last_motion = (time, now)

@@ -1,12 +1,12 @@
-"""Reach for a bunch and push it: a scripted motion for demonstrations, benchmarks and tests.
+"""Push a bunch with the fingertips: a scripted motion for demonstrations, benchmarks and tests.
 
-    reach = PushBunch(robot, "left", lambda: bunch_position)
+    push = PushBunch(robot, "left", lambda: bunch_position)
     while running:
-        reach.control(time)
+        push.control(time)
         robot.control(time)
         physics.step()
 
-The fingertips are led along straight lines, see :mod:`vinesim.robot.control.cartesian_controller`.
+The fingertips follow straight lines, see :mod:`vinesim.robot.control.cartesian_controller`.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from vinesim.robot.drives.robot import Robot
 log = logging.getLogger(__name__)
 
 FINGER_LENGTH = 0.027
-"""How far vinebot's fingers reach beyond its grasping frame [m]."""
+"""[m] Distance of vinebot's fingertips from its grasping frame."""
 PUSH_ELEVATION = 0.35
-"""Fingers point up by this angle [rad]: forearm and wrist stay below the leaves."""
+"""[rad] Fingers point up by this angle, so that forearm and wrist stay below the leaves. GUESSED"""
 POSITION_TOLERANCE = 0.003
-"""Fingertips this close to the end of a phase [m] are there."""
+"""[m] Fingertips this near to the goal of a phase have reached it. GUESSED"""
 
 MISS_DISTANCE = 0.01
-"""Fingertips that end an approach farther off than this [m] have missed."""
+"""[m] Fingertips farther from the goal at the end of an approach have missed. GUESSED"""
 
 
 class Phase(enum.Enum):
@@ -46,10 +46,10 @@ class Phase(enum.Enum):
 
 
 class PushBunch:
-    """One arm touches a target, pushes it, lets go, and begins again.
+    """One arm touches a target, pushes it, retreats, and begins again.
 
-    ``target`` gives the bunch's centre in the world [3] m; it is asked once for every approach. The fingers come from
-    the robot's side and from below, where no wire and few leaves are.
+    ``target`` returns the centre of the bunch in the world [3] m; it is called once before every approach. The fingers
+    come from the robot's side and from below, where no wire and few leaves are.
     """
 
     def __init__(
@@ -68,9 +68,9 @@ class PushBunch:
         repeat: bool = True,
         use_lift: bool = True,
     ) -> None:
-        """``radius`` of the bunch, ``depth`` of the push and ``clearance`` before the touch [m], ``hold`` [s];
+        """``radius`` of the bunch, ``depth`` of the push and ``clearance`` before the touch [m], ``hold_time`` [s];
         ``speed`` through free space, ``touch_speed`` [m/s] and ``acceleration`` [m/s2] of the fingertips;
-        ``lift`` False leaves the torso to somebody else, such as the other arm.
+        ``use_lift`` False leaves the torso to another controller, such as that of the other arm.
         """
         self.robot = robot
         self.target = target
@@ -83,9 +83,9 @@ class PushBunch:
         self.repeat = repeat
         self.phase = Phase.APPROACH
         self.push_count = 0
-        """Pushes done so far."""
+        """Completed pushes."""
         self.missed_count = 0
-        """Approaches given up because the target is out of reach."""
+        """Approaches that did not reach the target."""
 
         self._waypoints: dict[Phase, np.ndarray] = {}
         self._started = -np.inf
@@ -97,7 +97,7 @@ class PushBunch:
 
     @property
     def goal(self) -> np.ndarray:
-        """Where the fingertips are to be at the end of the present phase [3] m; where they are, if there is none."""
+        """Goal of the fingertips in the present phase [3] m; their reference before the first."""
         return self._waypoints.get(self.phase, self.arm.reference)
 
     @property
@@ -106,7 +106,7 @@ class PushBunch:
         return float(np.linalg.norm(self.goal - self.tip))
 
     def control(self, time: float) -> None:
-        """Command the arm for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
+        """Command the arm for the step that starts at ``time`` [s]; call it before ``robot.control``."""
         if self.phase is Phase.DONE:
             return
         if not self._waypoints:
@@ -115,12 +115,12 @@ class PushBunch:
         if self._is_phase_over(time):
             self._advance(time)
         if self.phase is not Phase.DONE:
-            self.arm.move_towards(self.goal, self._push_axis, speed=self._phase_speed, shoulder_height=self._height)
+            self.arm.move_towards(self.goal, self._push_axis, speed=self._phase_speed, working_height=self._height)
 
     # ------------------------------------------------------------------ phases
 
     def _plan(self) -> None:
-        """Lay the way to where the target is now."""
+        """Compute the waypoints for the present position of the target."""
         center = np.asarray(self.target(), float)
         ahead = center - self.arm.shoulder_position
         ahead[2] = np.hypot(ahead[0], ahead[1]) * np.tan(PUSH_ELEVATION)
@@ -145,7 +145,7 @@ class PushBunch:
         fast = phase in (Phase.APPROACH, Phase.RETREAT)
         self._phase_speed = self.speed if fast else self.touch_speed
         way = np.linalg.norm(self.goal - self.arm.reference)
-        # a bunch that pushes back may keep the tip from arriving; then time ends the phase
+        # a bunch that resists may keep the tip from arriving; then the timeout ends the phase
         self._phase_timeout = 2.0 * way / self._phase_speed + 2.0 * self._phase_speed / self.arm.acceleration + 3.0
 
     def _is_phase_over(self, time: float) -> bool:

@@ -1,14 +1,14 @@
-"""The logistic job: a carrier with a clamp at either end takes a full box away and leaves an empty one in its place.
+"""The logistic task: a carrier with a clamp at either end replaces a full box by an empty one.
 
-    exchange = SwapBoxes(physics, robot, swap)
-    while not exchange.done:
+    exchange = SwapBoxes(physics, robot, plan)
+    while not exchange.is_done:
         exchange.control(time)
         robot.control(time)
         physics.step()
     assert exchange.succeeded, exchange.reason
 
 The rear clamp fetches the empty box, the front clamp takes the full one, the base turns round and the rear clamp puts
-the empty one down. Where base, clamps and boxes are is asked as it goes; boxes are held by friction alone.
+the empty one down. The poses of base, clamps and boxes are read from the physics; boxes are held by friction alone.
 """
 
 from __future__ import annotations
@@ -28,20 +28,26 @@ from vinesim.robot.drives.robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
 
 LIFT_HEIGHT = 0.15
-"""A box is carried so high above the ground [m]."""
+"""[m] Height above the ground at which boxes are carried. GUESSED"""
 RELEASE_HEIGHT = 0.004
-"""A box is let go so high above where it was taken [m]: on the ground, whatever the clamp has given way."""
+"""[m] Height above the ground at which a box is released: it stands on the ground, however the clamp sags."""
 MIN_CLAMP_FORCE = 100.0
-"""Paddles that feel as much hold something [N]."""
+"""[N] Contact force of each paddle from which on it has clamped something. GUESSED"""
+CLAMP_TIME = 1.5
+"""[s] In which the paddles close or open. GUESSED"""
+LIFT_TIMEOUT = 6.0
+"""[s] In which a lift must reach its height. GUESSED"""
+LIFT_TOLERANCE = 0.003
+"""[m] A lift this near to its height has reached it. GUESSED"""
 APPROACH_SPEED = 0.2
-"""Speed of the base beside a box [m/s]."""
+"""[m/s] Speed of the base close to a box. GUESSED"""
 PLACEMENT_TOLERANCE = 0.05
-"""The empty box stands where the full one stood if it is no farther off [m]."""
+"""[m] Largest distance between the empty box and where the full one stood. GUESSED"""
 
 
 @dataclasses.dataclass(frozen=True)
 class SwapPlan:
-    """Which boxes to exchange, and the ways between them."""
+    """Which boxes to exchange, and the paths between them."""
 
     start: np.ndarray
     """[7] pose of the base at the beginning."""
@@ -54,7 +60,7 @@ class SwapPlan:
 
 
 class SwapBoxes(Task):
-    """An empty box for a full one; ``done``, ``succeeded`` and ``reason`` say how it went."""
+    """Replaces a full box by an empty one; ``succeeded`` and ``reason`` give the result."""
 
     def __init__(self, physics: Physics, robot: Robot, plan: SwapPlan, *, timeout: float = 180.0) -> None:
         super().__init__(robot, timeout=timeout)
@@ -63,7 +69,7 @@ class SwapBoxes(Task):
             if group not in robot.description.groups:
                 raise CommandError(f"{robot.name} has no group {group!r}; give a robot with a clamp at either end")
         self._target_pose = self.box_pose(plan.full_box)
-        """Where the full box stood [7]."""
+        """Pose [7] at which the full box stood."""
         self._contents = self._bunches_in(plan.full_box)
 
     def report(self) -> dict[str, Any]:
@@ -76,11 +82,11 @@ class SwapBoxes(Task):
         return self.box_pose(self.plan.full_box)[:3]
 
     def box_pose(self, box: int) -> np.ndarray:
-        """Where a box is [7]: the middle of its underside."""
+        """Pose [7] of a box: the middle of its underside."""
         rigid = self.physics.rigid
         return rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{box}")]
 
-    # ------------------------------------------------------------------ the job
+    # ------------------------------------------------------------------ the task
 
     def run(self) -> Iterator[str]:
         """See :class:`Task`."""
@@ -100,7 +106,7 @@ class SwapBoxes(Task):
         self._check_result()
 
     def _take(self, end: str, box: int) -> Iterator[str]:
-        """Come to a box, hold it, lift it, and go back to where there is room."""
+        """Approach a box with the clamp at ``end``, clamp it, lift it, and return to where the base can turn."""
         phase, group = f"take the {'full' if box == self.plan.full_box else 'empty'} box", f"clamp_{end}"
         here = self._base_pose()[:2].copy()
         fingers = self.robot.description.joint_indices(group)
@@ -108,7 +114,7 @@ class SwapBoxes(Task):
         yield from self._move_lift(phase, end, 0.0)
         yield from self._align_clamp(phase, end, self.box_pose(box))
         self.robot.command_position(np.zeros(len(fingers)), fingers)
-        yield from self.wait(1.5, phase)
+        yield from self.wait(CLAMP_TIME, phase)
         felt = np.abs(self.robot.rigid.joint_measurements(self.robot.name)[3][fingers])
         if (felt < MIN_CLAMP_FORCE).any():
             raise TaskFailed(f"the {end} paddles feel {felt.min():.0f} N: nothing between them")
@@ -120,7 +126,7 @@ class SwapBoxes(Task):
         yield from self._drive_straight(phase, here, backwards=end == "front")
 
     def _put_down(self, end: str, box: int) -> Iterator[str]:
-        """Put the box of a clamp down where the other one stood, and go back to where there is room."""
+        """Put the box in the clamp at ``end`` down where the full box stood, and return to where the base can turn."""
         phase, here = "leave the empty box", self._base_pose()[:2].copy()
         yield from self._align_clamp(phase, end, self._target_pose)
         down = float(self.robot.rigid.joint_measurements(self.robot.name)[0][self._lift_index(end)])
@@ -129,11 +135,11 @@ class SwapBoxes(Task):
         )
         fingers = self.robot.description.joint_indices(f"clamp_{end}")
         self.robot.command_position(self.robot.upper_limit[fingers], fingers)
-        yield from self.wait(1.5, phase)
+        yield from self.wait(CLAMP_TIME, phase)
         yield from self._drive_straight(phase, here, backwards=end == "front")
 
     def _check_result(self) -> None:
-        """:class:`TaskFailed` if a box is not where it should be, or what lay in it is not in it."""
+        """:class:`TaskFailed` if a box is not where it should be, or a bunch has fallen out."""
         swap = self.plan
         off = float(np.linalg.norm(self.box_pose(swap.empty_box)[:2] - self._target_pose[:2]))
         if off > PLACEMENT_TOLERANCE:
@@ -143,7 +149,7 @@ class SwapBoxes(Task):
         if lost := sorted(set(self._contents) - set(self._bunches_in(swap.full_box))):
             raise TaskFailed(f"{len(lost)} of {len(self._contents)} bunches fell out of the full box: {lost}")
 
-    # ------------------------------------------------------------------ what the steps are made of
+    # ------------------------------------------------------------------ motions
 
     def _follow_path(self, phase: str, points: np.ndarray, heading: float) -> Iterator[str]:
         yield from self._follow(phase, WaypointFollower(self.robot, points, heading, speed=0.5, turn_rate=0.3))
@@ -154,28 +160,28 @@ class SwapBoxes(Task):
         )
 
     def _align_clamp(self, phase: str, end: str, box: np.ndarray) -> Iterator[str]:
-        """Bring the clamp at one ``end`` to a box at pose [7], straight."""
+        """Drive straight until the clamp at ``end`` is at a box of pose ``box`` [7]."""
         clamp = self.robot.frame_pose(f"clamp_{end}_link")[:2]
         base = self._base_pose()[:2]
         reach = float(np.linalg.norm(clamp - base))
         ahead = (clamp - base) / reach
-        # straight ahead: a sideways step is what the turn before was for
+        # along the base only: the heading was aligned before
         place = base + ahead * (float((box[:2] - base) @ ahead) - reach)
         yield from self._drive_straight(phase, place, backwards=end == "rear")
 
-    def _follow(self, phase: str, way: WaypointFollower) -> Iterator[str]:
-        while not way.is_done:
-            way.control(self.time)
-            if way.is_stuck:
+    def _follow(self, phase: str, follower: WaypointFollower) -> Iterator[str]:
+        while not follower.is_done:
+            follower.control(self.time)
+            if follower.is_stuck:
                 raise TaskFailed("something keeps the base from going on")
             yield phase
 
     def _move_lift(self, phase: str, end: str, height: float) -> Iterator[str]:
-        """Bring a lift to ``height`` [m]."""
+        """Move the lift at ``end`` to ``height`` [m]."""
         index = self.robot.description.joint_indices(f"lift_{end}")
         self.robot.command_position([height], index)
-        until = self.time + 6.0
-        while abs(self.robot.rigid.joint_measurements(self.robot.name)[0][index[0]] - height) > 0.003:
+        until = self.time + LIFT_TIMEOUT
+        while abs(self.robot.rigid.joint_measurements(self.robot.name)[0][index[0]] - height) > LIFT_TOLERANCE:
             if self.time > until:
                 raise TaskFailed(f"the {end} lift does not come to {height:.2f} m")
             yield phase
@@ -184,15 +190,16 @@ class SwapBoxes(Task):
         return int(self.robot.description.joint_indices(f"lift_{end}")[0])
 
     def _base_pose(self) -> np.ndarray:
+        """Pose [7] of the base in the world."""
         return self.robot.rigid.base_state(self.robot.name)[0]
 
     def _away_from(self, box: int, place: np.ndarray, pose: np.ndarray | None = None) -> float:
-        """Heading [rad] of a base at ``place`` [2] that looks straight away from a box."""
+        """Heading [rad] of a base at ``place`` [2] m with its back to a box, or to ``pose`` [7]."""
         pose = self.box_pose(box) if pose is None else pose
         return math.atan2(place[1] - pose[1], place[0] - pose[0])
 
     def _bunches_in(self, box: int) -> tuple[int, ...]:
-        """The loose bunches that lie in a box."""
+        """The free bunches in a box."""
         rigid, size = self.physics.rigid, self.physics.model.box_size[box].astype(float)
         back, found = frames.inverse(self.box_pose(box)), []
         for bunch in rigid.free_bunches:

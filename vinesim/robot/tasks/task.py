@@ -1,4 +1,4 @@
-"""A job told in the order in which it happens: a generator that commands, then yields once a tick.
+"""Tasks of a robot as generators: each commands the robot and yields the name of its phase, once a step.
 
     class Wave(Task):
         def run(self):
@@ -9,7 +9,7 @@
         def focus(self):
             return self.robot.frame_pose(self.robot.description.groups["arm_left"].tool)[:3]
 
-What goes wrong ends the job with a reason in words.
+A :class:`TaskFailed` that it raises ends the task; its text becomes the reason.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ log = logging.getLogger(__name__)
 
 
 class TaskFailed(Exception):
-    """The job cannot go on; the text says why."""
+    """The task cannot go on; the text says why."""
 
 
 class Task(abc.ABC):
-    """Runs :meth:`run` one tick at a time. ``reason`` is empty as long as all goes well."""
+    """Advances :meth:`run` by one step a time; ``reason`` is empty unless the task has failed."""
 
     key_phases: frozenset[str] = frozenset()
-    """Phases of which a picture tells most."""
+    """Phases that are worth a picture."""
 
     def __init__(self, robot: Robot, *, timeout: float) -> None:
-        """Given up after ``timeout`` [s]."""
+        """The task fails after ``timeout`` [s]."""
         self.robot, self.timeout = robot, timeout
         self.time = 0.0
-        """Of the present tick [s]."""
+        """Start of the present step [s]."""
         self.phase = ""
-        """What it is at."""
+        """Name of the present phase."""
         self.durations: dict[str, float] = {}
-        """How long each phase took, in their order [s]."""
+        """[s] Of each phase, in their order."""
         self.is_done = False
         self.reason = ""
         """Why it failed, if it did."""
@@ -53,28 +53,28 @@ class Task(abc.ABC):
 
     @property
     def succeeded(self) -> bool:
-        """Whether it came to its end."""
+        """Whether it ended without a failure."""
         return self.is_done and not self.reason
 
     def frame_score(self) -> float:
-        """How much there is to see now, from 0 to 1."""
+        """How much a picture would show now, 0 to 1: 1 in a key phase."""
         return float(self.phase in self.key_phases)
 
     def report(self) -> dict[str, Any]:
-        """How it went, as plain values for JSON."""
+        """The result as plain values for JSON."""
         phases = {phase: round(seconds, 2) for phase, seconds in self.durations.items()}
         return {"succeeded": self.succeeded, "reason": self.reason, "phase": self.phase, "phases_s": phases}
 
     @abc.abstractmethod
     def focus(self) -> np.ndarray:
-        """What to look at [3] m in the world."""
+        """Point [3] m in the world for the head camera to look at."""
 
     @abc.abstractmethod
     def run(self) -> Iterator[str]:
-        """The job: commands the robot and yields the name of the phase, once a tick; raises :class:`TaskFailed`."""
+        """The task: command the robot and yield the name of the phase, once a step; may raise :class:`TaskFailed`."""
 
     def control(self, time: float) -> None:
-        """Command the robot for the tick that starts at ``time`` [s]; ``robot.control`` comes after it."""
+        """Command the robot for the step that starts at ``time`` [s]; call it before ``robot.control``."""
         if self.is_done:
             return
         if self._started is None:
@@ -93,7 +93,7 @@ class Task(abc.ABC):
             log.warning("%s: %s", self.robot.name, self.reason)
 
     def wait(self, seconds: float, phase: str) -> Iterator[str]:
-        """Let ``seconds`` [s] pass."""
+        """Let ``seconds`` pass."""
         end = self.time + seconds
         while self.time < end:
             yield phase

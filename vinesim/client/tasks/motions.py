@@ -1,0 +1,71 @@
+"""Motions of a robot beside its task: drive to a place, keep the head camera on a point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.robot.drives.robot import Robot
+
+
+class DriveTo:
+    """Drives the base to a place roughly straight ahead, and stops there; call it once a step."""
+
+    POSITION_TOLERANCE = 0.05
+    """[m] A base this near to the place has reached it. GUESSED"""
+
+    def __init__(self, robot: Robot, place: np.ndarray, *, speed: float = 1.2) -> None:
+        """``place`` [7]: pose of the base in the world."""
+        self.robot, self.speed = robot, speed
+        self.is_done = False
+        self._place = np.asarray(place, float)[:2]
+
+    def __call__(self, time: float) -> None:
+        if self.is_done:
+            return
+        base, _ = self.robot.rigid.base_state(self.robot.name)
+        offset = frames.rotate(frames.conjugate(base[3:]), np.append(self._place - base[:2], 0.0))
+        distance = float(np.hypot(offset[0], offset[1]))
+        if distance < self.POSITION_TOLERANCE or offset[0] < 0.0:
+            self.is_done = True
+            self.robot.command_base(0.0, 0.0, time)
+            return
+        turn = float(np.arctan2(offset[1], offset[0]))
+        self.robot.command_base(min(self.speed, 0.8 * distance + 0.05), np.clip(2.0 * turn, -0.6, 0.6), time)
+
+
+class LookAt:
+    """Keeps the camera on the head pointed at a place, through the Jacobian of any head; call it once a step."""
+
+    GAIN = 3.0
+    """[1/s] Feedback gain of the pointing angle. GUESSED"""
+    PERIOD = 0.05
+    """[s] Between two corrections: a head needs no 100 Hz. GUESSED"""
+
+    def __init__(self, robot: Robot, point: Callable[[], np.ndarray]) -> None:
+        """``point`` returns the place to look at [3] m in the world. Without a head and a camera nothing is done."""
+        description = robot.description
+        self.robot, self.point = robot, point
+        self._joints = (
+            description.joint_indices("head") if "head" in description.groups and description.cameras else None
+        )
+        self._camera = description.cameras[0].frame if description.cameras else ""
+        self._steps_per_correction = round(self.PERIOD / robot.rigid.dt)
+        self._step = 0
+
+    def __call__(self, time: float) -> None:
+        self._step += 1
+        if self._joints is None or self._step % self._steps_per_correction:
+            return
+        robot = self.robot
+        pose = robot.frame_pose(self._camera)
+        axis = frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0]))
+        wanted = frames.normalize(self.point() - pose[:3])
+        turn = frames.cross(axis, wanted) * self.GAIN
+        J = robot.rigid.jacobian(robot.name, self._camera, pose[:3])[3:, self._joints]
+        rate = J.T @ np.linalg.solve(J @ J.T + 0.01 * np.eye(3), turn)
+        robot.command_position(
+            robot.setpoint[self._joints] + self._steps_per_correction * robot.rigid.dt * rate, self._joints
+        )
