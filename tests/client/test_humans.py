@@ -10,13 +10,15 @@ import pytest
 from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from vinesim import frames
-from vinesim.avatar.scripted_human import Legs, ScriptedHuman
+from vinesim.avatar.leg_estimator import LegEstimator
+from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, start_pose
 from vinesim.net.codec import human as poses
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.physics.rigid.human_body import BODY_PARTS, standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.physics.rigid.human_shapes import BODY_PARTS
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
@@ -101,7 +103,7 @@ def test_people_and_robots_meet_and_part(vinebot):
 def test_who_stands_still_is_the_same_everywhere_to_the_bit():
     """F89: what copies hold is what crossed the network, and nothing makes it up anew."""
     world = World()
-    pose = poses.quantised(standing_pose(SIDE, 1.8))
+    pose = poses.quantise_pose(standing_pose(SIDE, 1.8))
     world.join("eva", None, SIDE, lambda _: pose, height=1.8)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(4.0)
@@ -142,13 +144,13 @@ def test_legs_that_each_client_makes_up_differ():
     walker.do(walker.walk((2.0, 0.0)))
     world.run(0.4)
     seen = ida.physics.rigid.human("eva").part_poses
-    guess = Legs(standing_pose(frames.pose(np.array([seen[0, 0] - 0.09, seen[0, 1], 0.0]))))
+    guess = LegEstimator(standing_pose(frames.pose(np.array([seen[0, 0] - 0.09, seen[0, 1], 0.0]))))
     feet = [BODY_PARTS.index("left_foot"), BODY_PARTS.index("right_foot")]
     guessed = []
     for _ in range(250):
         world.run(DT)
         head = ida.physics.rigid.human("eva").part_poses[BODY_PARTS.index("head")]
-        guessed.append(guess.under(head)[1:, :3] - parts_of(eva, "eva")[feet, :3])
+        guessed.append(guess.update(head)[1:, :3] - parts_of(eva, "eva")[feet, :3])
     apart = np.linalg.norm(guessed, axis=-1)
     assert apart.max() > 0.2, "in mid-stride"
     assert apart[-1].max() > 0.05, "and they stop in other places"

@@ -27,29 +27,29 @@ def clock(monkeypatch):
     return fake
 
 
-def run(pace, clock, works):
+def run(loop, clock, works):
     starts = []
     for work in works:
-        pace.begin()
+        loop.begin()
         starts.append(clock.now)
         clock.now += work
-        pace.end()
+        loop.end()
     return np.array(starts) - starts[0]
 
 
 def test_a_late_tick_does_not_shift_the_beat(clock):
-    pace = RateLoop(0.01)
-    starts = run(pace, clock, [0.001, 0.025, 0.001, 0.001, 0.001, 0.001])
+    loop = RateLoop(0.01)
+    starts = run(loop, clock, [0.001, 0.025, 0.001, 0.001, 0.001, 0.001])
     assert starts == pytest.approx([0.0, 0.01, 0.035, 0.036, 0.04, 0.05])
-    assert pace.overruns == 1
-    assert pace.dropped == 0
-    assert pace.hz == pytest.approx(100.0)
+    assert loop.overruns == 1
+    assert loop.dropped == 0
+    assert loop.hz == pytest.approx(100.0)
 
 
 def test_real_time_factor_is_simulated_over_wall_time(clock):
-    pace = RateLoop(0.01)
-    run(pace, clock, [0.002] * 101)
-    assert pace.real_time_factor == pytest.approx(1.01 / 1.002)
+    loop = RateLoop(0.01)
+    run(loop, clock, [0.002] * 101)
+    assert loop.real_time_factor == pytest.approx(1.01 / 1.002)
     slow = RateLoop(0.01)
     run(slow, clock, [0.02] * 20)
     assert slow.real_time_factor == pytest.approx(0.5)
@@ -57,16 +57,16 @@ def test_real_time_factor_is_simulated_over_wall_time(clock):
 
 
 def test_a_long_stall_is_dropped_and_counted(clock):
-    pace = RateLoop(0.01)
-    starts = run(pace, clock, [0.001, 3.0] + [0.001] * 10)
-    assert pace.dropped in (298, 299)
+    loop = RateLoop(0.01)
+    starts = run(loop, clock, [0.001, 3.0] + [0.001] * 10)
+    assert loop.dropped in (298, 299)
     assert np.diff(starts)[-5:] == pytest.approx([0.01] * 5)
 
 
 def test_percentiles_are_of_the_work(clock):
-    pace = RateLoop(0.01)
-    run(pace, clock, [0.001] * 99 + [0.009])
-    median, worst = pace.work_ms(50, 100)
+    loop = RateLoop(0.01)
+    run(loop, clock, [0.001] * 99 + [0.009])
+    median, worst = loop.work_ms(50, 100)
     assert median == pytest.approx(1.0)
     assert worst == pytest.approx(9.0)
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from vinesim import frames
-from vinesim.physics.rigid.static_world import FRICTION
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import GRAVITY, assemble
 from vinesim.scene.values import Drive, RobotSpec
@@ -67,7 +67,7 @@ def test_what_starts_a_box_is_mu_times_what_rests_on_its_sole(which, share):
         physics.step()
     start = poses(physics)
     data, body = physics.rigid.mj_data, physics.rigid.mj_model.body(f"box/{which}").id
-    force = share * FRICTION * WEIGHT * sum(MASSES[which:2])
+    force = share * PhysicsParameters().friction * WEIGHT * sum(MASSES[which:2])
     data.xfrc_applied[body, 0] = force
     data.xfrc_applied[body, 4] = -force * (data.xipos[body, 2] - start[which, 2])  # acts at its sole: does not tip it
     for _ in range(60):
@@ -114,7 +114,7 @@ def test_a_box_of_bunches_is_lifted_driven_and_set_down_with_all_that_is_in_it()
         inside = frames.rotate(frames.conjugate(frames.from_wxyz(box[3:])), middle - box[:3])
         assert (np.abs(inside[:2]) < [0.3, 0.2]).all()
         assert 0.0 < inside[2] < 0.35
-        body = rigid.mj_model.body(f"loose/{rigid._bunch_slot[bunch]}").id
+        body = rigid.mj_model.body(f"free_bunch/{rigid._bunch_slot[bunch]}").id
         assert rigid.mj_model.body_mass[body] == pytest.approx(mass, rel=1e-6)
 
 
@@ -142,7 +142,7 @@ def momentum(physics: Physics) -> np.ndarray:
     rigid, model = physics.rigid, physics.model
     rigid.update_kinematics()
     total, J = np.zeros(3), np.zeros((3, rigid.mj_model.nv))
-    names = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._bunch_slot.values())]
+    names = ["box/0", "box/1", *(f"free_bunch/{slot}" for slot in rigid._bunch_slot.values())]
     for name in (*names, "ram0/tool", "ram1/tool"):
         body = rigid.mj_model.body(name).id
         mujoco.mj_jacBodyCom(rigid.mj_model, rigid.mj_data, J, None, body)
@@ -199,7 +199,7 @@ def test_what_one_loses_the_other_gains(one, other):
 def along(physics: Physics, kind: str, index: int, rates: np.ndarray) -> float:
     """Mass times the rate of a thing's centre of mass along x, at the poses that MuJoCo has now."""
     rigid = physics.rigid
-    name = {"box": f"box/{index}", "bunch": f"loose/{rigid._bunch_slot[index]}", "ram": f"ram{index}/tool"}[kind]
+    name = {"box": f"box/{index}", "bunch": f"free_bunch/{rigid._bunch_slot[index]}", "ram": f"ram{index}/tool"}[kind]
     body, J = rigid.mj_model.body(name).id, np.zeros((3, rigid.mj_model.nv))
     mujoco.mj_jacBodyCom(rigid.mj_model, rigid.mj_data, J, None, body)
     return float(rigid.mj_model.body_mass[body] * (J @ rates)[0])

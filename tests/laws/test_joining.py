@@ -65,8 +65,8 @@ def numbers(physics: Physics) -> dict[str, bytes]:
     n = int(warm_start.count[0])
     found["memory"] = warm_start.normal_impulse[:n].tobytes() + warm_start.anchor[:n].tobytes()
     found["contacts"] = b"".join(c.force.tobytes() for c in physics.contacts)
-    parked = {f"loose/{slot}" for slot in range(physics.rigid._pool_size)} - {
-        f"loose/{slot}" for slot in physics.rigid._bunch_slot.values()
+    parked = {f"free_bunch/{slot}" for slot in range(physics.rigid._pool_size)} - {
+        f"free_bunch/{slot}" for slot in physics.rigid._bunch_slot.values()
     }
     return {k: v for k, v in found.items() if k not in parked and not k.startswith("newcomer")}
 
@@ -127,7 +127,7 @@ def test_what_sleeps_goes_on_sleeping_and_wakes_with_what_it_leans_on():
     for _ in range(900):
         physics.step()
     rigid = physics.rigid
-    lie = ["box/0", "box/1", *(f"loose/{slot}" for slot in rigid._bunch_slot.values())]
+    lie = ["box/0", "box/1", *(f"free_bunch/{slot}" for slot in rigid._bunch_slot.values())]
 
     def sleeping() -> list[bool]:
         trees = [rigid.mj_model.body_treeid[rigid.mj_model.body(name).id] for name in lie]
@@ -143,7 +143,7 @@ def test_what_sleeps_goes_on_sleeping_and_wakes_with_what_it_leans_on():
     for name, pose in zip(lie, before, strict=True):
         np.testing.assert_array_equal(rigid.mj_data.joint(name).qpos, pose)
     deepest = min(rigid.free_bunches, key=lambda bunch: rigid.bunch_pose(bunch)[2])
-    gone = lie.index(f"loose/{rigid._bunch_slot[deepest]}")
+    gone = lie.index(f"free_bunch/{rigid._bunch_slot[deepest]}")
     physics.rigid.remove_bunch(deepest)
     del lie[gone]
     assert not any(sleeping()), "all leaned on each other"

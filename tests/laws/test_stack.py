@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from vinesim import frames
-from vinesim.physics.rigid.static_world import FRICTION
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import GRAVITY, assemble
 
@@ -104,7 +104,7 @@ def test_a_full_crate_is_pushed_by_mu_m_g(share, moves):
     settle(physics)
     box, data = physics.rigid.mj_model.body("box/0").id, physics.rigid.mj_data
     start = data.joint("box/0").qpos[:3].copy()
-    data.xfrc_applied[box, 0] = -share * FRICTION * GRAVITY[2] * (MASSES.sum() + CRATE)
+    data.xfrc_applied[box, 0] = -share * PhysicsParameters().friction * GRAVITY[2] * (MASSES.sum() + CRATE)
     # at the height of the ground, so that it does not tip the crate
     data.xfrc_applied[box, 4] = -data.xfrc_applied[box, 0] * (data.xipos[box, 2])
     for _ in range(100):
@@ -127,7 +127,9 @@ def test_nothing_leaves_faster_than_it_came(seed):
     fastest = 0.0
     for _ in range(250):
         physics.step()
-        speeds = [np.linalg.norm(rigid.mj_data.joint(f"loose/{slot}").qvel[:3]) for slot in rigid._bunch_slot.values()]
+        speeds = [
+            np.linalg.norm(rigid.mj_data.joint(f"free_bunch/{slot}").qvel[:3]) for slot in rigid._bunch_slot.values()
+        ]
         fastest = max(fastest, *speeds)
     fall = np.sqrt(2.0 * 9.81 * 1.85)
     assert 0.8 * fall < fastest < 1.25 * fall

@@ -38,7 +38,7 @@ def test_a_cut_bunch_keeps_its_momentum_and_falls():
     com = frames.rotate(pose[3:], model.body_com[body].astype(float))
     before = 0.5 * (velocity[:3] + np.cross(velocity[3:], com))
     physics.pick(0)
-    np.testing.assert_allclose(momentum(physics, "loose/0"), before, atol=1e-6)
+    np.testing.assert_allclose(momentum(physics, "free_bunch/0"), before, atol=1e-6)
     assert np.linalg.norm(before) > 0.01
     view = physics.snapshot()
     assert not view.bunch_attached[0]
@@ -300,8 +300,8 @@ def test_a_fine_bunch_is_picked_as_the_compound_that_it_is():
     before = mass @ (qd[:, :3] + np.cross(qd[:, 3:], com))
     physics.pick(0)
     world, data = physics.rigid.mj_model, physics.rigid.mj_data
-    after = momentum(physics, "loose/0")
-    body = world.body("loose/0").id
+    after = momentum(physics, "free_bunch/0")
+    body = world.body("free_bunch/0").id
     assert world.body_mass[body] == pytest.approx(0.5, rel=1e-6)
     np.testing.assert_allclose(data.xipos[body], middle, atol=1e-6)
     assert np.linalg.norm(before) > 0.02

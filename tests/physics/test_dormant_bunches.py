@@ -44,12 +44,12 @@ def test_who_is_near_gets_a_body_with_the_weight_it_had():
     assert len(physics.dormant_bunches) == 1
     fallen.pick(0)
     world, other = physics.rigid.mj_model, fallen.rigid.mj_model
-    assert world.body("loose/0").mass == pytest.approx(other.body("loose/0").mass)
-    np.testing.assert_allclose(world.body("loose/0").inertia, other.body("loose/0").inertia, rtol=1e-4)
+    assert world.body("free_bunch/0").mass == pytest.approx(other.body("free_bunch/0").mass)
+    np.testing.assert_allclose(world.body("free_bunch/0").inertia, other.body("free_bunch/0").inertia, rtol=1e-4)
     np.testing.assert_allclose(
         physics.support_tracker.object_state(BUNCH(1))[0], frames.pose([1.0, 0.0, 0.05]), atol=1e-9
     )
-    with pytest.raises(ValueError, match="bunch 1 is loose already"):
+    with pytest.raises(ValueError, match="bunch 1 is free already"):
         physics.dormant_bunches.rigid.add_bunch(
             1, physics.rigid._free_bunches[1], frames.pose([0.0, 0, 0]), np.zeros(6)
         )

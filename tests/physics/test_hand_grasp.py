@@ -10,9 +10,10 @@ import pytest
 from tests.physics.test_human_body import eva, put
 from tests.support.contact_scenes import bunch_scene, cane, gripper, probe
 from vinesim import frames
+from vinesim.avatar.haptics import HapticFeedback
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.human_body import THICK
+from vinesim.physics.rigid.human_shapes import HAND_HALF_THICKNESS
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.state import State
@@ -30,7 +31,7 @@ def before_a_bunch(mass: float = 0.5, pull: float = 1e3) -> tuple[Physics, Human
     model.bunch_pull[0], model.bunch_bend[0] = pull, 1e3
     physics = Physics(model)
     spec = eva(middle[0], middle[1] - 0.6, 0.5 * np.pi)
-    at = frames.pose(middle - np.array([0.0, 0.075 + THICK, 0.0]), FORWARD)
+    at = frames.pose(middle - np.array([0.0, 0.075 + HAND_HALF_THICKNESS, 0.0]), FORWARD)
     spec = dataclasses.replace(spec, pose=put(spec.pose, at))
     physics.add_human(spec)
     return physics, spec, body, middle
@@ -194,7 +195,7 @@ def test_what_lies_on_the_ground_is_picked_up():
     middle = lies[:3] + frames.rotate(lies[3:], np.array([0.085, 0.0, 0.0]))
     spec = eva(middle[0] - 0.5, middle[1])
     physics.add_human(spec)
-    above = middle + np.array([0.0, 0.0, 0.045 + 2.0 * THICK])
+    above = middle + np.array([0.0, 0.0, 0.045 + 2.0 * HAND_HALF_THICKNESS])
     for share in np.linspace(0.0, 1.0, 150):
         physics.move_human("eva", put(spec.pose, (1.0 - share) * spec.pose.right[:3] + share * above))
         physics.step()
@@ -326,12 +327,12 @@ def test_who_leaves_lets_go():
 def test_a_touch_is_felt_at_once_and_as_strong_as_it_is():
     """F33"""
     physics, spec, _, _ = before_a_bunch()
-    told = []
+    feedback, told = HapticFeedback(physics, "eva"), []
     for share in np.concatenate([np.linspace(0.0, 1.0, 100), np.ones(200)]):
         physics.move_human("eva", led(spec, 0.0, 0.15 * share, 0.0))
         physics.step()
         touching = physics.hand("eva", "right").touching
-        told += [(physics.tick, haptic, touching) for haptic in physics.haptics]
+        told += [(physics.tick, haptic, touching) for haptic in feedback.update()]
     ticks, haptics, touching = zip(*told, strict=True)
     assert all(touching)
     assert {(haptic.actor, haptic.hand) for haptic in haptics} == {("eva", "right")}
@@ -347,9 +348,10 @@ def test_a_touch_is_felt_at_once_and_as_strong_as_it_is():
 
 def test_a_free_hand_feels_nothing():
     physics, _, _, _ = before_a_bunch()
+    feedback = HapticFeedback(physics, "eva")
     for _ in range(50):
         physics.step()
-        assert physics.haptics == ()
+        assert feedback.update() == ()
 
 
 def test_twice_the_same_bits():

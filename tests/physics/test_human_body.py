@@ -11,9 +11,11 @@ import pytest
 from tests.physics.test_rigid_world import arm, step, yard
 from tests.support.contact_scenes import probe
 from vinesim import frames
-from vinesim.physics.rigid.human_body import BODY_PARTS, THICK, VISUAL_PARTS, HumanError, posture, standing_pose
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.rigid.human_body import HumanError
+from vinesim.physics.rigid.human_posture import VISUAL_PARTS, body_posture, standing_pose
+from vinesim.physics.rigid.human_shapes import BODY_PARTS, HAND_HALF_THICKNESS
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.rigid.static_world import FRICTION
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -44,7 +46,7 @@ def pressing(offset: float, **settings) -> tuple[RigidWorld, HumanSpec]:
     """The palm against the pole, the controller ``offset`` m behind its surface, until all is at rest."""
     rigid, spec = RigidWorld(yard()), eva(2.2, **settings)
     rigid.add_human(spec)
-    for x in np.linspace(POLE - THICK - 0.1, POLE - THICK + offset, 100):
+    for x in np.linspace(POLE - HAND_HALF_THICKNESS - 0.1, POLE - HAND_HALF_THICKNESS + offset, 100):
         rigid.move_human("eva", put(spec.pose, frames.pose(np.array([x, 0.0, 1.1]), PALM)))
         step(rigid)
     step(rigid, 200)
@@ -249,7 +251,7 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
     pose = standing_pose(frames.pose(np.zeros(3), frames.from_yaw(0.7)), 1.8)
     for drop in (0.0, 0.2, 0.5):
         crouched = dataclasses.replace(pose, hips=pose.hips - np.array([0, 0, drop, 0, 0, 0, 0]))
-        parts = dict(zip(BODY_PARTS, posture(1.8, crouched), strict=True))
+        parts = dict(zip(BODY_PARTS, body_posture(1.8, crouched), strict=True))
         for side in ("left", "right"):
             thigh, shank, foot = (parts[f"{side}_{name}"] for name in ("thigh", "shank", "foot"))
             assert np.linalg.norm(shank[:3] - thigh[:3]) == pytest.approx(0.245 * 1.8, rel=1e-6)
@@ -261,8 +263,8 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
             forward = frames.rotate(foot[3:], np.array([1.0, 0.0, 0.0]))
             assert forward @ (shank[:3] - 0.5 * (thigh[:3] + foot[:3])) >= -1e-6
     assert forward @ (shank[:3] - 0.5 * (thigh[:3] + foot[:3])) > 0.2
-    np.testing.assert_allclose(np.linalg.norm(posture(1.8, crouched)[:, 3:], axis=1), 1.0, atol=1e-12)
-    chest = posture(1.8, pose)[BODY_PARTS.index("chest")]
+    np.testing.assert_allclose(np.linalg.norm(body_posture(1.8, crouched)[:, 3:], axis=1), 1.0, atol=1e-12)
+    chest = body_posture(1.8, pose)[BODY_PARTS.index("chest")]
     np.testing.assert_allclose(frames.rotate(chest[3:], np.eye(3))[[0, 2]], [[*forward[:2], 0.0], [0, 0, 1]], atol=0.1)
 
 
@@ -280,7 +282,7 @@ def test_nothing_moves_head_trunk_or_legs():
         rigid.command("probe", np.array([target, 0.0]))
         step(rigid)
         poses = rigid.visual_q()
-        expected = posture(spec.height, pose)
+        expected = body_posture(spec.height, pose)
         for part, told in zip(BODY_PARTS, expected, strict=True):
             assert poses[links.index(f"eva/{part}")].tobytes() == told.tobytes()
         assert poses[links.index("eva/head")].tobytes() == head.tobytes()
@@ -455,7 +457,7 @@ def test_what_is_heavier_needs_a_larger_movement(mass):
 
 def test_a_box_slides_from_mu_m_g_on():
     """F34: 1.5 kg on the ground: 11.8 N."""
-    threshold = FRICTION * 1.5 * 9.81 / 100.0
+    threshold = PhysicsParameters().friction * 1.5 * 9.81 / 100.0
     for share, moves in ((0.9, False), (1.1, True)):
         rigid, spec = RigidWorld(crate_yard(1.5)), eva(-1.0, 5.0)
         rigid.add_human(spec)
@@ -509,12 +511,12 @@ def test_a_hand_holds_a_hand():
     rigid.add_human(one)
     rigid.add_human(other)
     rigid.move_human("eva", put(one.pose, (0.0, 0.0, 1.1)))
-    rigid.move_human("ida", put(other.pose, (0.0, 0.0, 1.1 + 3 * THICK)))
+    rigid.move_human("ida", put(other.pose, (0.0, 0.0, 1.1 + 3 * HAND_HALF_THICKNESS)))
     step(rigid, 200)
     rigid.grasp("eva", "right", *rigid.nearest_to_hand("eva", "right", 0.05)[1:])
     assert rigid.hand_sample("eva", "right").held == ("ida", "right_hand")
     for x in np.linspace(0.0, 0.4, 200):
-        rigid.move_human("ida", put(other.pose, (x, 0.0, 1.1 + 3 * THICK)))
+        rigid.move_human("ida", put(other.pose, (x, 0.0, 1.1 + 3 * HAND_HALF_THICKNESS)))
         step(rigid)
     step(rigid, 300)
     mine, yours = rigid.hand_sample("eva", "right"), rigid.hand_sample("ida", "right")

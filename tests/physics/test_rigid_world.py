@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.physics.rigid import free_bunch as loose_module
-from vinesim.physics.rigid import static_world as yard_module
+from vinesim.physics.rigid import free_bunch, static_world
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.scene.builder import assemble
@@ -462,31 +461,31 @@ def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
     assert rigid.mj_data.time == pytest.approx(alone.mj_data.time)
 
 
-def loose(shapes: int, mass: float = 0.6) -> loose_module.FreeBunch:
+def loose(shapes: int, mass: float = 0.6) -> free_bunch.FreeBunch:
     """A bunch of some spheres and, last, a capsule."""
     start = np.stack([0.02 * np.arange(shapes), 0.003 * np.arange(shapes), np.zeros(shapes)], 1)
     end = start.copy()
     end[-1, 0] += 0.03
     inertia = np.array([6e-4, 1.5e-3, 1.4e-3])
     radius, product = 0.04 - 0.001 * np.arange(shapes), np.array([1e-5, -3e-5, 4e-5])
-    return loose_module.FreeBunch(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
+    return free_bunch.FreeBunch(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
 
 
-@pytest.mark.parametrize("shapes", [1, 5, loose_module.MAX_GEOMS])
+@pytest.mark.parametrize("shapes", [1, 5, free_bunch.MAX_GEOMS])
 def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
     """All constants that MuJoCo derives from weight and shapes, against a world compiled with the bunch in it."""
     model = assemble([], box_pose=[[1.0, 0, 0, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.3]], box_mass=[[2.0]])
     rigid = RigidWorld(model)
     bunch = loose(shapes)
     rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
-    spec = yard_module.build_static_world(model, rigid.parameters)
-    loose_module.add_free_bunch(spec, bunch)
+    spec = static_world.build_static_world(model, rigid.parameters)
+    free_bunch.add_free_bunch(spec, bunch, rigid.parameters)
     ours, theirs = rigid.mj_model, spec.compile()
-    a, b = ours.body("loose/0").id, theirs.nbody - 1
-    for name in loose_module.OF_BODY:
+    a, b = ours.body("free_bunch/0").id, theirs.nbody - 1
+    for name in free_bunch.BODY_ARRAYS:
         np.testing.assert_allclose(getattr(ours, name)[a], getattr(theirs, name)[b], rtol=1e-12, err_msg=name)
     at, there = ours.body_geomadr[a], theirs.body_geomadr[b]
-    for name in loose_module.OF_GEOM:
+    for name in free_bunch.GEOM_ARRAYS:
         mine, other = getattr(ours, name)[at : at + shapes], getattr(theirs, name)[there : there + shapes]
         np.testing.assert_allclose(mine, other, rtol=1e-12, err_msg=name)
     mine, other = slice(ours.body_dofadr[a], ours.body_dofadr[a] + 6), slice(theirs.nv - 6, theirs.nv)
@@ -515,12 +514,12 @@ def test_more_bunches_than_bodies_wait_for_them():
     """The pool grows by a compilation when it is used up; those that fall go on falling."""
     rigid = RigidWorld(assemble([]))
     generations = []
-    for bunch in range(loose_module.POOL_SIZE + 2):
+    for bunch in range(rigid.parameters.bunch_pool_size + 2):
         rigid.add_bunch(bunch, loose(3), frames.pose(np.array([float(bunch), 0.0, 5.0])), np.zeros(6))
         generations.append(rigid.mj_model)
         rigid.predict()
         rigid.integrate()
-    assert all(world is generations[0] for world in generations[: loose_module.POOL_SIZE])
+    assert all(world is generations[0] for world in generations[: rigid.parameters.bunch_pool_size])
     assert generations[-1] is not generations[0]
     ticks = np.arange(len(generations), 0, -1)
     fallen = 5.0 - 9.81 * rigid.dt**2 * ticks * (ticks + 1) / 2.0
@@ -529,6 +528,6 @@ def test_more_bunches_than_bodies_wait_for_them():
     rigid.remove_bunch(4)
     assert 4 not in rigid.free_bunches
     assert [link.name for link in rigid.visuals()] == [f"bunch/{bunch}" for bunch in rigid.free_bunches]
-    with pytest.raises(ValueError, match="shapes; a loose one has"):
-        rigid.add_bunch(4, loose(loose_module.MAX_GEOMS + 1), frames.pose(np.zeros(3)), np.zeros(6))
+    with pytest.raises(ValueError, match="shapes; a free one has"):
+        rigid.add_bunch(4, loose(free_bunch.MAX_GEOMS + 1), frames.pose(np.zeros(3)), np.zeros(6))
     assert 4 not in rigid.free_bunches

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.shared_vineyard import BOX, BUNCH, cart, vineyard
 from vinesim import frames
-from vinesim.physics.rigid.support_tracking import PATIENCE, SupportTracker
+from vinesim.physics.rigid.support_tracking import SupportTracker
 from vinesim.physics.step import Physics
 from vinesim.robot.drives.robot import Robot
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -119,11 +119,12 @@ def test_who_touches_what_moves():
 def test_a_thing_is_at_rest_after_half_a_second_and_told_ones_at_once():
     physics = Physics(vineyard())
     riding: SupportTracker = physics.support_tracker
+    rest_steps = physics.parameters.steps(physics.parameters.support_rest_duration)
     riding.set_state(BOX(0), frames.pose([-2.0, 0.5, 0.001]), np.zeros(6))
     run(physics, 1)
     assert riding.moving == [BOX(0)]
-    ticks = next(i for i in range(2 * PATIENCE) if run(physics, 1) or not riding.moving)
-    assert PATIENCE - 5 <= ticks <= PATIENCE + 10
+    ticks = next(i for i in range(2 * rest_steps) if run(physics, 1) or not riding.moving)
+    assert rest_steps - 5 <= ticks <= rest_steps + 10
     riding.set_state(BOX(1), frames.pose([-2.0, 1.5, 0.0]), np.zeros(6))
     riding.set_at_rest(BOX(1), "", frames.pose([-2.0, 1.5, 0.0]))
     run(physics, 1)

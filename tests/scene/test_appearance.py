@@ -11,7 +11,8 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.kernels.shading import materials
-from vinesim.physics.rigid.human_body import BODY_PARTS, body_shapes, hand_shapes, standing_pose
+from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.physics.rigid.human_shapes import BODY_PARTS, body_shapes, hand_shapes
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import CRATE_WALL
 from vinesim.robot.description.loader import load_description

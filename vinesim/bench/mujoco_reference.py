@@ -14,7 +14,7 @@ from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, ROUGH, build_static_world
+from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, build_static_world, contact_friction
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -78,7 +78,7 @@ class MujocoScene:
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         for bit, robot in enumerate(robots, FIRST_ACTOR):
-            RobotBody(robot, bit).attach(spec)
+            RobotBody(robot, bit, mine.parameters).add_to(spec)
         made = _add_plants(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
         shapes = plant_capsules(model)
         for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
@@ -87,7 +87,7 @@ class MujocoScene:
                 kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
             made[body].add_geom(
                 type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
-                friction=ROUGH, solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
+                friction=contact_friction(mine.parameters.friction), solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
             )  # fmt: skip
         world = spec.compile()
         if contact_time_constant is not None:

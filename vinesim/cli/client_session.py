@@ -42,7 +42,7 @@ class ClientSession:
     def __init__(self, options: ClientOptions) -> None:
         """Check the options and generate the vineyard; errors of the scene and :class:`UsageError` come from here."""
         check_options(options)
-        # The loop gives the interpreter lock away at every kernel launch, and must get it back within a fraction of a step.
+        # The loop releases the interpreter lock at every kernel launch and needs it back within a fraction of a step.
         sys.setswitchinterval(SWITCH_INTERVAL)
         self.options = options
         self.name = options.name or f"{options.role}-{os.getpid()}"
@@ -126,7 +126,7 @@ def run_loop(
     stop: threading.Event, step: Callable[[], None], loop: RateLoop, seconds: float | None, dt: float,
     is_done: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
-    """Step in real time until ``stop`` (SIGINT and SIGTERM set it), for ``seconds`` of simulated time, or until done."""
+    """Step in real time until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until done."""
     gc.collect()
     gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
     # until here Ctrl-C simply interrupts; from now on it ends the run in order

@@ -17,7 +17,7 @@ REACH = 0.55
 
 
 def run(options: ClientOptions) -> int:
-    """Walk, reach for a bunch, hold it, pull at it, let go, until told to stop; then write report.json; the exit code."""
+    """Walk, reach for a bunch, hold it, pull at it, let go, until a signal; then write report.json; the exit code."""
     with ClientSession(options) as session:
         validate_bunch(session.model, options.reach)
         start = start_pose(session.scene, session.spawn)

@@ -1,8 +1,9 @@
-"""What a client reports of itself: once a second while it runs, and at its end."""
+"""Status of a client, for display once a second, and its report at the end of a run."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,34 +15,40 @@ from vinesim.robot.tasks.task import Task
 
 
 class Status:
-    """Figures of a running client. Reads what the tick leaves behind; may be asked from another thread."""
+    """Measurements of a running client; reads only, and may be used from another thread than the loop's."""
 
-    def __init__(self, client: Client, rate_loop: RateLoop, sent: Any = None, task: Task | None = None) -> None:
-        """``sent`` gives the number of messages sent so far by ROS topic, if there is a node; ``script``: the job."""
+    def __init__(
+        self,
+        client: Client,
+        rate_loop: RateLoop,
+        sent: Callable[[], dict[str, int]] | None = None,
+        task: Task | None = None,
+    ) -> None:
+        """``sent`` gives the number of ROS messages sent so far by topic; ``task`` is what the robot does, if anything."""
         self.client, self.rate_loop, self._task = client, rate_loop, task
-        self._sent = sent or (dict)
+        self._sent: Callable[[], dict[str, int]] = sent or dict
         self._before: dict[str, int] = {}
         self._before_time = 0.0
 
     def current(self) -> dict[str, Any]:
-        """The state of affairs; topic rates are since the last call."""
-        client, pace = self.client, self.rate_loop
-        sent, time = dict(self._sent()), pace.elapsed
+        """The present values, for JSON; rates of topics are since the last call."""
+        client, loop = self.client, self.rate_loop
+        sent, time = dict(self._sent()), loop.elapsed
         span = max(time - self._before_time, 1e-9)
         rates = {topic: (count - self._before.get(topic, 0)) / span for topic, count in sent.items() if count}
         self._before, self._before_time = sent, time
         traffic = self.client.replicator.counters
         families = (traffic.actor, traffic.environment, traffic.event)
-        p50, p99 = pace.work_ms(50, 99)
+        p50, p99 = loop.work_ms(50, 99)
         force = np.sum([np.linalg.norm(c.force) for c in client.physics.contacts if c.actor == client.name] or [0.0])
         return {
             "name": client.name,
             "time": client.physics.time,
-            "tick_hz": pace.hz,
+            "tick_hz": loop.hz,
             "tick_p50_ms": p50,
             "tick_p99_ms": p99,
-            "overruns": pace.overruns,
-            "real_time_factor": pace.real_time_factor,
+            "overruns": loop.overruns,
+            "real_time_factor": loop.real_time_factor,
             "awake": len(client.physics.plants.awake),
             "force": float(force),
             "displacement_mm": 1e3 * client.trace.displacement if client.trace is not None else 0.0,
@@ -55,11 +62,11 @@ class Status:
         }
 
     def report(self) -> dict[str, Any]:
-        """The same at the end of a run, with what the trace shows."""
+        """The values at the end of a run, with counts of messages and the evaluation of the trace."""
         client = self.client
-        figures = self.current()
-        figures["topics"] = dict(self._sent())
-        figures |= {
+        values = self.current()
+        values["topics"] = dict(self._sent())
+        values |= {
             "environment_bytes_when_far": client.interest_audit.bytes,
             "ticks_touching_when_far": client.interest_audit.ticks_touching,
             "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
@@ -69,7 +76,7 @@ class Status:
         }
         if client.trace is not None:
             rows = client.trace.rows()
-            figures["touch_to_motion_ticks"] = touch_to_motion(rows)
-            figures["force_peak_n"] = float(np.linalg.norm(rows.force, axis=1).max(initial=0.0))
-            figures["displacement_peak_mm"] = 1e3 * float(np.linalg.norm(rows.displacement, axis=1).max(initial=0.0))
-        return figures
+            values["touch_to_motion_ticks"] = touch_to_motion(rows)
+            values["force_peak_n"] = float(np.linalg.norm(rows.force, axis=1).max(initial=0.0))
+            values["displacement_peak_mm"] = 1e3 * float(np.linalg.norm(rows.displacement, axis=1).max(initial=0.0))
+        return values

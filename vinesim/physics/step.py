@@ -24,7 +24,6 @@ from vinesim.scene.state import State
 from vinesim.scene.values import (
     Contact,
     HandSample,
-    Haptic,
     HumanPose,
     HumanSpec,
     Parting,
@@ -53,23 +52,17 @@ class Physics:
         p = parameters
         self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
-        self.plants = ArticulationSolver(
-            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, fast_rate=p.fast_joint_rate,
-            max_rate=p.max_joint_rate, fault_rate=p.fault_joint_rate,
-        )  # fmt: skip
+        self.plants = ArticulationSolver(model, self.state, p, device=device, threads=threads)
         self.rigid = RigidWorld(model, parameters=p)
         self.contact_solver = ContactSolver(model, self.plants, self.rigid)
-        self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
+        self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
         self._visuals: tuple[tuple[RigidVisual, ...], tuple[RigidVisual, ...], tuple[RigidVisual, ...]] = ((), (), ())
         self._detachment = detachment
-        self.level_of_detail = LevelOfDetail(
-            self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
-            patience=p.steps(p.detail_rest_duration),
-        )  # fmt: skip
-        self.sleep_monitor = SleepMonitor(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
+        self.level_of_detail = LevelOfDetail(self.plants, p)
+        self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
@@ -121,11 +114,6 @@ class Physics:
             return self.contact_solver.touched_trees
         held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.grasp_manager.contacts)
         return tuple(sorted({*self.contact_solver.touched_trees, *held}))
-
-    @property
-    def haptics(self) -> tuple[Haptic, ...]:
-        """What the controllers of people are to vibrate with after the last tick."""
-        return self.grasp_manager.haptics
 
     def update_kinematics(self) -> None:
         """Bring ``state.body_q`` from the start of the last tick to its end."""
@@ -246,7 +234,10 @@ class Physics:
         if self.wind is not None:
             actors = [self.rigid.actor_position(name) for name in self.rigid.actors]
             self.wind.update(
-                self.plants, self.time, (np.array(actors), self.parameters.wind_radius) if actors else None
+                self.plants,
+                self.time,
+                (np.array(actors), self.parameters.wind_radius) if actors else None,
+                self.parameters,
             )
 
     def _refine(self) -> None:

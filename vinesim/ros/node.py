@@ -1,8 +1,8 @@
-"""A robot's ROS 2 node, beside the simulation and never in its way.
+"""A robot's ROS 2 node: publishes in threads of its own, so that the simulation never waits.
 
-The simulation hands over values and goes on; the node's own threads build and publish the messages. A value that is
-replaced by a newer one before its turn comes is dropped and counted: a slow network or subscriber costs messages, not
-ticks. Nothing is built for which nobody listens, and :meth:`Node.has_subscribers` lets sensors not even render it.
+The simulation passes values and goes on; the node's threads build and publish the messages. A value that is replaced
+by a newer one before its turn is dropped and counted: a slow network or subscriber costs messages, not steps. Messages
+without subscribers are not built, and :meth:`Node.has_subscribers` lets sensors skip their rendering as well.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ log = logging.getLogger(__name__)
 SensorPublisher = TypeVar("SensorPublisher", CameraPublisher, LidarPublisher)
 
 SUBSCRIPTION_COUNT_PERIOD = 0.1
-"""How often subscribers are counted [s of wall time]: so long may a new one wait for its first picture."""
+"""Wall time between two counts of subscribers [s]: a new one waits at most that long for its first picture."""
 
 TRAJECTORY_CONTROLLERS = ("arm_left_controller", "arm_right_controller", "torso_controller", "head_controller")
+"""Names of the controllers that take joint trajectories, as vinebot has them."""
 
 
 class Node:
@@ -54,8 +55,9 @@ class Node:
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``cameras`` and ``lidars`` the names under
     which they publish, ``controllers`` those that take trajectories. All topics but /clock stand under the namespace,
     tf too (as Nav2 does with several robots); a second node in the process should be made with ``clock=False``.
-    :class:`environment.RosUnavailableError`, :class:`interfaces.InterfacesError` or :class:`ValueError` (a name that
-    ROS does not allow) say in one line why a node cannot be made.
+
+    Raises :class:`ros_setup.RosUnavailableError`, :class:`interfaces.InterfacesError`, or :class:`ValueError` for a
+    name that ROS does not allow; each with one line of text.
     """
 
     def __init__(
@@ -84,14 +86,14 @@ class Node:
         from tf2_msgs.msg import TFMessage
 
         self._topics: dict[str, Topic] = {}
-        # What the tick brings has a thread of its own, so that no picture in the making holds up the clock.
+        # The messages of every step have a thread of their own, so that no picture delays the clock.
         self._high_priority: dict[Topic, Build] = {}
         self._low_priority: dict[Topic, Build] = {}
         self._changed = threading.Condition()
         self._closing = False
 
         self._context = Context()
-        # No signal handlers: SIGINT belongs to the client. No arguments: sys.argv is vinesim's own.
+        # No signal handlers: the client handles SIGINT. No arguments: sys.argv is vinesim's own.
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
             self._node = rclpy.create_node(name, context=self._context, namespace=namespace or None)
@@ -115,48 +117,48 @@ class Node:
         for thread in self._threads:
             thread.start()
 
-    # What the simulation calls: never blocks, never builds.
+    # The simulation calls these; none of them blocks or builds a message.
 
     def publish_robot_state(self, time: float, sample: RobotSample) -> None:
-        """State of the robot at ``time`` [s]; call it every tick."""
+        """Publish joint states, transforms, odometry, contacts and the clock at ``time`` [s]; for every step."""
         offers = list(self._robot.pending(sample))
         if self._clock is not None:
             offers[:0] = self._clock.pending(time)
         self._enqueue(offers)
 
     def publish_camera(self, frame: CameraFrame) -> None:
-        """One picture of one of ``cameras``."""
+        """Publish one picture of one of ``cameras``; :class:`ValueError` if there is no such camera."""
         self._enqueue(self._publisher(self._cameras, "camera", frame.name).pending(frame))
 
     def publish_lidar(self, scan: LidarScan) -> None:
-        """One revolution of one of ``lidars``."""
+        """Publish one revolution of one of ``lidars``; :class:`ValueError` if there is no such lidar."""
         self._enqueue(self._publisher(self._lidars, "lidar", scan.name).pending(scan))
 
     def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """True poses [name, 7] in the map of what moves: attached bunches, people. 10 to 30 Hz will do.
+        """Publish true poses [name, 7] m, 1 in the map of what moves; 10 to 30 Hz will do.
 
-        Pass the same tuple object as long as the names stay: the message is then patched, not built.
+        Pass the same tuple object as long as the names stay: the serialised message is then patched, not built.
         """
         self._enqueue(self._ground_truth.pending(time, names, poses))
 
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """True poses [name, 7] in the map of what stands: poles. Once; late joiners get it too."""
+        """Publish true poses [name, 7] m, 1 in the map of poles, once; late subscribers receive them, too."""
         self._enqueue(self._ground_truth.pending_static(names, poses), always=True)
 
     def publish_diagnostics(self, time: float, values: Mapping[str, object], *, healthy: bool = True) -> None:
-        """Figures of the client (real-time factor, sync lag); the node adds what it had to drop. 1 Hz will do."""
+        """Publish statistics of the client; the node adds the messages that it dropped. 1 Hz will do."""
         own = {"ros_dropped": sum(self.dropped.values()), "ros_refused_commands": self._commands.rejected}
         build = partial(convert.diagnostics, time, self._node.get_fully_qualified_name(), {**values, **own}, healthy)
         self._enqueue([(self._diagnostics, build)])
 
     def commands(self) -> list[Command]:
-        """What peers asked for since the last call."""
+        """Commands that arrived since the last call, in order."""
         return self._commands.drain()
 
     def has_subscribers(self, family: str) -> bool:
-        """Does anybody listen to a topic or to one below it? ``"head_front_camera/depth"``, ``"lidar"``, ``"tf"``.
+        """Whether a topic, or one below it, has subscribers: ``"head_front_camera/depth"``, ``"lidar"``, ``"tf"``.
 
-        As counted at most :data:`COUNT_PERIOD` ago; :class:`ValueError` if there is no such topic.
+        As counted at most :data:`SUBSCRIPTION_COUNT_PERIOD` ago; :class:`ValueError` if there is no such topic.
         """
         below = family.rstrip("/") + "/"
         topics = [topic for name, topic in self._topics.items() if (name + "/").startswith(below)]
@@ -171,16 +173,16 @@ class Node:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Messages that somebody wanted and that were replaced before their turn, by topic."""
+        """Messages with subscribers that were replaced before their turn, by topic."""
         return {name: topic.dropped for name, topic in self._topics.items()}
 
     @property
     def has_pending(self) -> bool:
-        """Does anything wait to be sent?"""
+        """Whether any message waits to be sent."""
         return bool(self._high_priority or self._low_priority)
 
     def close(self) -> None:
-        """Leave the ROS graph; returns when its threads have ended. A second call does nothing."""
+        """Leave the ROS graph; returns when the threads have ended. A second call does nothing."""
         with self._changed:
             if self._closing:
                 return
@@ -221,7 +223,7 @@ class Node:
             self._changed.notify_all()
 
     def _send(self, waiting: dict[Topic, Build]) -> None:
-        """A publishing thread: whatever waits, the oldest first."""
+        """A publishing thread: builds and sends pending messages, the oldest first."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: waiting or self._closing)
@@ -237,7 +239,7 @@ class Node:
                     log.exception("could not publish %s; further failures are only counted", topic.name)
 
     def _receive(self) -> None:
-        """The receiving thread: commands, the services that every node has, and who listens to what."""
+        """The receiving thread: commands, the services that every node has, and counts of subscribers."""
         next_count = 0.0
         while not self._closing and self._context.ok():
             try:

@@ -1,8 +1,8 @@
-"""Can ROS 2 be used in this process, and with which middleware settings?
+"""Whether ROS 2 can be used in this process, and the settings of its middleware.
 
 ROS 2 comes from wheels (``pip install 'vinesim[ros]'``) or from a sourced installation, never from both: the wheels
-start Python a second time to put their libraries on ``LD_LIBRARY_PATH``, in no particular order, so that beside a
-sourced /opt/ros it is chance which library is loaded.
+start Python a second time to put their libraries on ``LD_LIBRARY_PATH``, in no particular order; beside a sourced
+/opt/ros it would be undefined which library is loaded.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def unavailable_reason() -> str | None:
 
 
 def configure() -> None:
-    """Settings that must stand before the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
+    """Set the environment for the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
 
     A profile that the user has chosen stays.
     """
@@ -64,6 +64,6 @@ def configure() -> None:
 
 
 def clear_profile() -> None:
-    """Forget our own profile again, as a program that knows nothing of vinesim would be started."""
+    """Remove vinesim's own profile again, to run as a program that knows nothing of vinesim."""
     if os.environ.get(PROFILE_VARIABLE) == str(PROFILE_FILE):
         del os.environ[PROFILE_VARIABLE]

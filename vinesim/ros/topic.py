@@ -1,4 +1,4 @@
-"""One outgoing topic: who listens, what was sent, what came too late to be sent."""
+"""One published topic with its QoS and counts: subscriptions, messages sent, messages dropped."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""What tf2 listeners expect of /tf."""
+"""QoS that tf2 listeners expect of /tf."""
 TRANSIENT_LOCAL = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""The last message reaches late joiners too."""
+"""A late subscriber receives the last message, too."""
 SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 Build = Callable[[], Any]
-"""Makes a message, its serialised bytes, or a list of messages; called only when somebody listens."""
+"""Makes a message, its serialised bytes, or a list of messages; called only if the topic has subscribers."""
 
 
 class Topic:
-    """A publisher with its counts; only the ROS thread sends."""
+    """A publisher with its counts; only the node's sending threads call :meth:`send`."""
 
     def __init__(self, name: str, publisher: Publisher, high_priority: bool) -> None:
         self.name = name
-        """As asked for: relative to the node's namespace unless it begins with a slash."""
+        """Relative to the node's namespace unless it begins with a slash."""
         self.high_priority = high_priority
-        """Sent before anything that is not: what the tick brings, before pictures and clouds."""
+        """Small messages of every step, which have a thread of their own beside pictures and clouds."""
         self.subscription_count = 0
-        """Subscribers when last counted."""
+        """Number of subscribers when last counted."""
         self.sent = 0
         """Messages."""
         self.dropped = 0
-        """Messages replaced by newer ones before they could be sent, or that could not be built."""
+        """Messages that were replaced by newer ones before their turn, or that could not be built."""
         self._publisher = publisher
 
     def update_subscription_count(self) -> None:
-        """Ask the middleware how many subscribers there are."""
+        """Query the middleware for the number of subscribers."""
         self.subscription_count = self._publisher.get_subscription_count()
 
     def send(self, message: Any) -> None:
@@ -49,10 +49,10 @@ class Topic:
 
 
 class Advertise(Protocol):
-    """How a topic family gets its topics from the node."""
+    """How a publisher class creates its topics in the node."""
 
     def __call__(self, message: type, name: str, qos: QoSProfile = ..., *, high_priority: bool = ...) -> Topic: ...
 
 
 PendingMessage = tuple[Topic, Build]
-"""A message to be: the node builds and sends it on its own thread."""
+"""A topic and the function that builds its next message; a thread of the node calls it and sends the result."""

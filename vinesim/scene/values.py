@@ -161,10 +161,10 @@ class HumanSpec:
     """At the start."""
     height: float = 1.75
     """[m] It gives the limbs their lengths."""
-    stiffness: float = 100.0
-    """Force of a touching hand per offset from its controller [N/m] (CANOPIES D6.4, section 3.1.1)."""
-    force: float = 100.0
-    """The most that a hand can do [N]."""
+    stiffness: float | None = None
+    """Force of a hand in contact per offset from its controller [N/m]; None: ``PhysicsParameters.hand_stiffness``."""
+    force: float | None = None
+    """Largest force of a hand [N]; None: ``PhysicsParameters.hand_force``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -464,10 +464,10 @@ class TreeUpdate:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class ThingUpdate:
+class ObjectUpdate:
     """State of one box or loose bunch that moves, as it crosses the network."""
 
-    thing: int
+    object: int
     """:func:`vinesim.scene.ids.thing`"""
     owner: str
     ownership: int

@@ -8,9 +8,10 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from vinesim.client.humans import RemoteHuman, spec_of
-from vinesim.net.codec.messages import Hello, valid_name
-from vinesim.physics.rigid.rigid_world import CompiledWorld, RigidWorld
+from vinesim.client.remote.remote_human import RemoteHuman, human_spec
+from vinesim.net.codec.messages import Hello, is_valid_name
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.physics.rigid.world_core import CompiledWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
@@ -84,7 +85,7 @@ class RemoteSpawner:
 
     def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
         if isinstance(update, HumanUpdate):
-            return None, self.rigid.compile_with(spec_of(hello, update), is_remote=True)
+            return None, self.rigid.compile_with(human_spec(hello, update), is_remote=True)
         description = resolve_description(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
@@ -95,7 +96,7 @@ def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDesc
     """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
     if own is not None and hello.urdf == own.urdf:
         return own
-    name = hello.robot if valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
+    name = hello.robot if is_valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
     try:
         known = load_description(name)
         if known.urdf == hello.urdf:

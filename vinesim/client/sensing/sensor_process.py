@@ -155,7 +155,7 @@ class SensorProcess:
                 self._unacknowledged.append((self._sent_snapshots, plants.trees))
 
     def _receive(self) -> None:
-        """Take the worker's messages: commands, statistics, acknowledgements; :class:`SensorProcessError` if it failed."""
+        """Take the worker's messages; :class:`SensorProcessError` if it has failed."""
         while self._has_message():
             try:
                 kind, value = self._pipe.recv()

@@ -1,8 +1,8 @@
-"""Hands that close: they hold what they are at, wherever it grows, lies, stands or drives.
+"""Grasps of people's hands: what a hand holds, whether plant, box, bunch, robot or static geom.
 
-What is rigid is welded to the hand. A plant is held by a spring between the point that the hand holds and the
-controller: the spring of the hand itself, solved with the plant's own, and the hand rides on what it holds. When a
-bunch leaves its vine in the hand, the hand keeps it.
+A rigid body is welded to the hand. A plant is held by a spring between the grasped point and the controller: the spring of
+the hand itself, solved implicitly with the plant's own, and the hand is placed on the plant. When a bunch is detached from
+its vine in a hand, the hand goes on holding it as a rigid body.
 """
 
 from __future__ import annotations
@@ -14,171 +14,153 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.human_body import FINGERS, THICK, HandBody, HumanBody
+from vinesim.physics.rigid.hand_body import HandBody
+from vinesim.physics.rigid.human_body import HumanBody
+from vinesim.physics.rigid.human_shapes import GRASP_POINTS, HAND_HALF_THICKNESS
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.scene.values import Contact, Haptic, Parting
+from vinesim.scene.values import Contact, Parting
 
-GRASP = 0.03
-"""[m] A hand takes what its palm or its fingers are so close to."""
-PATIENCE = 20
-"""[tick] So long a hand that has closed on nothing still takes what comes into it; then it is a fist."""
-PULSE = 5
-"""[tick] A touch that goes on vibrates as often as this."""
-FELT = 0.2
-"""Amplitude that is surely felt: an onset has at least this."""
-FAINT = 0.01
-"""Amplitude not worth a message."""
-
-_NOBODY = np.zeros(0, int)
+_NO_TREES = np.zeros(0, int)
 
 
 @dataclasses.dataclass(slots=True)
-class _Grip:
-    """A plant in a hand."""
+class _PlantGrasp:
+    """A plant's body in a hand."""
 
     body: int
     tie: int
+    """Number of the spring, see :meth:`ArticulationSolver.add_tie`."""
     point: np.ndarray
-    """[3] in the body's frame."""
+    """[3] m, the grasped point in the body's frame."""
     bunch: int
     """Which bunch the body is, -1 if it is none."""
 
 
 class GraspManager:
-    """What the hands of all people hold, and what their controllers feel of it."""
+    """Closes and opens the hands of local people and connects plants to them."""
 
     def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver) -> None:
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
-        self.haptics: tuple[Haptic, ...] = ()
-        """Vibrations of the last tick, by person and hand."""
         self.contacts: tuple[Contact, ...] = ()
-        """Hands that held a plant in the last tick, as contacts; their ``distance`` is 0."""
-        self._grips: dict[tuple[str, str], _Grip] = {}
-        self._waiting: dict[tuple[str, str], int] = {}
-        self._known: dict[tuple[str, str], int] = {}
+        """Hands that held a plant in the last step, as contacts; their ``distance`` is 0."""
+        self._grasps: dict[tuple[str, str], _PlantGrasp] = {}
+        """Held plants, by person and side."""
+        self._steps_to_grasp: dict[tuple[str, str], int] = {}
+        """How many more steps a hand that closed on nothing still grasps, by person and side."""
+        self._grasp_steps = rigid.parameters.steps(rigid.parameters.grasp_duration)
 
     @property
     def held_trees(self) -> np.ndarray:
-        """Trees that somebody holds, sorted [k]."""
-        if not self._grips:
-            return _NOBODY
-        return np.unique([int(self.plants.model.body_tree[grip.body]) for grip in self._grips.values()])
+        """[k] Trees that are held, sorted."""
+        if not self._grasps:
+            return _NO_TREES
+        return np.unique([int(self.plants.model.body_tree[grasp.body]) for grasp in self._grasps.values()])
 
-    # ------------------------------------------------------------------ the tick
+    # ------------------------------------------------------------------ the step
 
     def begin_step(self) -> None:
-        """Before a tick: close and open hands, and pull at the plants that are held."""
-        for person, hand in self._hands():
-            key = person.spec.name, hand.side
-            if key in self._grips and not hand.on_plant:  # its person left and came back
-                self._drop(key)
+        """Before a step: close and open hands, and pull the plants that are held."""
+        for human, hand in self._local_hands():
+            key = human.spec.name, hand.side
+            if key in self._grasps and not hand.on_plant:  # the person left and joined again
+                self._remove_tie(key)
             if not hand.closed:
-                self._waiting[key] = PATIENCE
+                self._steps_to_grasp[key] = self._grasp_steps
                 if hand.held is not None:
                     self.release(*key)
-            elif hand.held is None and self._waiting.get(key, PATIENCE) > 0:
-                self._waiting[key] = self._waiting.get(key, PATIENCE) - 1
-                self._close(person, hand)
-            if key in self._grips:
-                self._pull(person, hand, self._grips[key])
-        if self._grips:
+            elif hand.held is None and self._steps_to_grasp.get(key, self._grasp_steps) > 0:
+                self._steps_to_grasp[key] = self._steps_to_grasp.get(key, self._grasp_steps) - 1
+                self._close(human, hand)
+            if key in self._grasps:
+                self._pull(human, hand, self._grasps[key])
+        if self._grasps:
             self.plants.wake(self.held_trees)
 
-    def end_step(self, partings: tuple[Parting, ...]) -> None:
-        """After a tick: keep bunches that left their vines, put hands where what they hold is, tell what is felt."""
-        gone = {parting.body: parting.bunch for parting in partings if parting.bunch >= 0}
-        contacts, haptics = [], []
-        if self._grips:
+    def end_step(self, detachments: tuple[Parting, ...]) -> None:
+        """After a step: place hands on the plants that they hold; go on holding bunches that were detached."""
+        detached = {detachment.body: detachment.bunch for detachment in detachments if detachment.bunch >= 0}
+        contacts = []
+        if self._grasps:
             self.plants.forward_kinematics(self.held_trees)
-        for person, hand in self._hands():
-            key = person.spec.name, hand.side
-            if (grip := self._grips.get(key)) is not None:
-                if grip.body in gone:
-                    self._drop(key)
-                    self.rigid.release(*key)
-                    self.rigid.grasp(*key, f"bunch/{gone[grip.body]}", "bunch")
-                elif not self._torn(grip):
-                    contacts.append(self._ride(person, hand, grip))
-                else:
-                    self.release(*key)
-            haptics += self._vibrate(person, hand)
-        self.contacts, self.haptics = tuple(contacts), tuple(haptics)
+        for human, hand in self._local_hands():
+            key = human.spec.name, hand.side
+            grasp = self._grasps.get(key)
+            if grasp is None:
+                continue
+            if grasp.body in detached:
+                self._remove_tie(key)
+                self.rigid.release(*key)
+                self.rigid.grasp(*key, f"bunch/{detached[grasp.body]}", "bunch")
+            elif self._is_bunch_gone(grasp):
+                self.release(*key)
+            else:
+                contacts.append(self._place_on_plant(human, hand, grasp))
+        self.contacts = tuple(contacts)
 
     def release(self, name: str, side: str) -> None:
         """Open a hand, whatever it holds."""
-        self._drop((name, side))
+        self._remove_tie((name, side))
         self.rigid.release(name, side)
 
     def remove_ties_of(self, name: str) -> None:
-        """Take all ties off that a person who leaves holds."""
-        for key in [key for key in self._grips if key[0] == name]:
-            self._drop(key)
+        """Release all plants that a person holds who is removed."""
+        for key in [key for key in self._grasps if key[0] == name]:
+            self._remove_tie(key)
 
-    # ------------------------------------------------------------------ inside
+    # ------------------------------------------------------------------ internal
 
-    def _hands(self) -> list[tuple[HumanBody, HandBody]]:
-        people = (self.rigid.human(name) for name in self.rigid.humans)
-        return [(person, hand) for person in people if not person.is_remote for hand in person.hands]
+    def _local_hands(self) -> list[tuple[HumanBody, HandBody]]:
+        humans = (self.rigid.human(name) for name in self.rigid.humans)
+        return [(human, hand) for human in humans if not human.is_remote for hand in human.hands]
 
-    def _close(self, person: HumanBody, hand: HandBody) -> None:
-        """Take what is nearest to the hand, if anything is near enough."""
-        key = person.spec.name, hand.side
+    def _close(self, human: HumanBody, hand: HandBody) -> None:
+        """Grasp what is nearest to the hand, if anything is near enough."""
+        key, distance = (human.spec.name, hand.side), self.rigid.parameters.grasp_distance
         palm = self.rigid.hand_sample(*key).pose
-        rigid = self.rigid.nearest_to_hand(*key, GRASP)
-        plant = self.contact_solver.nearest_body(palm[:3] + frames.rotate(palm[3:], FINGERS), GRASP + THICK)
-        if plant is not None and (rigid is None or plant[0] - THICK < rigid[0]):
+        rigid = self.rigid.nearest_to_hand(*key, distance)
+        points = palm[:3] + frames.rotate(palm[3:], GRASP_POINTS)
+        plant = self.contact_solver.nearest_body(points, distance + HAND_HALF_THICKNESS)
+        if plant is not None and (rigid is None or plant[0] - HAND_HALF_THICKNESS < rigid[0]):
             body = plant[1]
             self.plants.wake(self.plants.model.body_tree[body])
             pose = self.plants.state.body_q[body].astype(float)
             hand.grasp_pose = frames.compose(frames.inverse(pose), palm)
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
-            tie = self.plants.add_tie(body, hand.grasp_pose[:3], person.spec.stiffness, person.damping)
-            self._grips[key] = _Grip(body, tie, hand.grasp_pose[:3].copy(), next(iter(bunch.tolist()), -1))
+            tie = self.plants.add_tie(body, hand.grasp_pose[:3], hand.stiffness, hand.damping)
+            self._grasps[key] = _PlantGrasp(body, tie, hand.grasp_pose[:3].copy(), next(iter(bunch.tolist()), -1))
             self.rigid.grasp_plant(*key, body)
         elif rigid is not None:
             self.rigid.grasp(*key, *rigid[1:])
 
-    def _pull(self, person: HumanBody, hand: HandBody, grip: _Grip) -> None:
-        """Set the far end of the spring: no further from the plant than the hand is strong."""
-        spec, at = person.spec, self._point(grip)
-        pull = person.controller(hand)[:3] + person.damping / spec.stiffness * person.speed(hand, self.rigid.dt) - at
-        most = spec.force / spec.stiffness
-        self.plants.tie_anchor[grip.tie] = at + pull * min(1.0, most / max(float(np.linalg.norm(pull)), 1e-12))
+    def _pull(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> None:
+        """Set the anchor of the spring, no further from the plant than the hand's force allows."""
+        at = self._grasped_point(grasp)
+        velocity = human.controller_velocity(hand, self.rigid.dt)
+        pull = human.controller_pose(hand)[:3] + hand.damping / hand.stiffness * velocity - at
+        most = hand.max_force / hand.stiffness
+        self.plants.tie_anchor[grasp.tie] = at + pull * min(1.0, most / max(float(np.linalg.norm(pull)), 1e-12))
 
-    def _point(self, grip: _Grip) -> np.ndarray:
-        pose = self.plants.state.body_q[grip.body].astype(float)
-        return pose[:3] + frames.rotate(pose[3:], grip.point)
+    def _grasped_point(self, grasp: _PlantGrasp) -> np.ndarray:
+        """[3] m in the world."""
+        pose = self.plants.state.body_q[grasp.body].astype(float)
+        return pose[:3] + frames.rotate(pose[3:], grasp.point)
 
-    def _ride(self, person: HumanBody, hand: HandBody, grip: _Grip) -> Contact:
-        """Put a hand where the plant is that it holds, and say with what force it holds it."""
+    def _place_on_plant(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> Contact:
+        """Place a hand on the plant that it holds and set its force; the same as a contact."""
         plants = self.plants
-        pose, motion = plants.state.body_q[grip.body].astype(float), plants.state.body_qd[grip.body].astype(float)
-        self.rigid.place_hand(person.spec.name, hand.side, frames.compose(pose, hand.grasp_pose))
-        at = self._point(grip)
-        speed = motion[:3] + frames.cross(motion[3:], at - pose[:3])
-        hand.force = plants.tie_stiffness[grip.tie] * (plants.tie_anchor[grip.tie] - at) - person.damping * speed
+        pose, motion = plants.state.body_q[grasp.body].astype(float), plants.state.body_qd[grasp.body].astype(float)
+        self.rigid.place_hand(human.spec.name, hand.side, frames.compose(pose, hand.grasp_pose))
+        at = self._grasped_point(grasp)
+        velocity = motion[:3] + frames.cross(motion[3:], at - pose[:3])
+        hand.force = plants.tie_stiffness[grasp.tie] * (plants.tie_anchor[grasp.tie] - at) - hand.damping * velocity
         hand.steps_since_contact = 0
-        return Contact(person.spec.name, hand.link, grip.body, at, -hand.force, 0.0)
+        return Contact(human.spec.name, hand.link, grasp.body, at, -hand.force, 0.0)
 
-    def _torn(self, grip: _Grip) -> bool:
-        """Whether a held bunch is no longer there: picked by other means."""
-        return grip.bunch >= 0 and not self.plants.state.bunch_attached[grip.bunch]
+    def _is_bunch_gone(self, grasp: _PlantGrasp) -> bool:
+        """Whether a held bunch was detached otherwise, for example by another client."""
+        return grasp.bunch >= 0 and not self.plants.state.bunch_attached[grasp.bunch]
 
-    def _drop(self, key: tuple[str, str]) -> None:
-        grip = self._grips.pop(key, None)
-        if grip is not None:
-            self.plants.remove_tie(grip.body, grip.tie)
-
-    def _vibrate(self, person: HumanBody, hand: HandBody) -> list[Haptic]:
-        """A pulse when a touch begins, then as strong as the force."""
-        key = person.spec.name, hand.side
-        if hand.steps_since_contact > 0:
-            if hand.steps_since_contact >= PULSE:
-                self._known.pop(key, None)
-            return []
-        since = self._known[key] = self._known.get(key, -1) + 1
-        share = min(1.0, float(np.linalg.norm(hand.force)) / person.spec.force)
-        seconds = PULSE * self.rigid.dt
-        if since == 0:
-            return [Haptic(*key, True, max(FELT, share), seconds)]
-        return [Haptic(*key, False, share, seconds)] if since % PULSE == 0 and share > FAINT else []
+    def _remove_tie(self, key: tuple[str, str]) -> None:
+        grasp = self._grasps.pop(key, None)
+        if grasp is not None:
+            self.plants.remove_tie(grasp.body, grasp.tie)

@@ -1,7 +1,7 @@
-"""Robots in the rigid world: a base that tracks hold, joints that servos pull, links that may feel.
+"""One robot in MuJoCo's world: a planar base on servos, driven joints, sensors in links.
 
 MuJoCo's integrator damps a servo as if its D were larger by dt K, which keeps stiff servos and what they hold quiet. A
-compliant joint must swing as it was told to instead: for these :func:`split` takes the surplus back.
+compliant joint must swing with its own damping: for these :func:`split_damping` takes the surplus back.
 """
 
 from __future__ import annotations
@@ -13,99 +13,99 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import recompile
-from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROUGH
+from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction
 from vinesim.physics.rigid.urdf import RobotError, check, shapes_of, touchable
 from vinesim.scene.values import RobotSpec
-
-GIVE = 0.01
-"""The tracks hold the base like a spring that reaches its full effort at this offset [m or rad], then they slip."""
-FOLLOW_GIVE = 0.05
-"""The same for the copy of a remote robot: how far ahead of the copy the pull starts [m or rad]."""
-TRACK_TIME = 0.05
-"""Ratio of the base servo's damping to its stiffness [s]."""
 
 _PLANAR = ("x", "y", "yaw")
 
 
 @dataclasses.dataclass
 class LinkSensor:
-    """What a link felt in a tick, as MuJoCo tells it, with its places at the start of that tick."""
+    """Wrench and acceleration of a link in the last step, with the link's pose at the start of that step."""
 
-    inner: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
-    """Moment about the robot's centre of mass and force of the parent on the link, world axes."""
-    arm: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
-    """From the link's origin to that centre."""
-    turn: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+    parent_wrench: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
+    """[6] N m, N: moment about the robot's centre of mass and force of the parent on the link, world axes."""
+    com_offset: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    """[3] m from the link's origin to that centre, world axes."""
+    rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+    """[3, 3] of the link."""
     acceleration: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
+    """[6] rad/s^2, m/s^2: angular and proper linear acceleration of the link's origin, link axes."""
 
     @property
     def wrench(self) -> np.ndarray:
         """Force [N] and moment about the link's origin [N m] of the link on its parent [6], in the link's axes."""
-        (x, y, z), (u, v, w) = self.arm.tolist(), self.inner[3:].tolist()
-        moment = self.inner[:3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
-        return -np.concatenate([self.inner[3:] @ self.turn, moment @ self.turn])
+        (x, y, z), (u, v, w) = self.com_offset.tolist(), self.parent_wrench[3:].tolist()
+        moment = self.parent_wrench[:3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+        return -np.concatenate([self.parent_wrench[3:] @ self.rotation, moment @ self.rotation])
 
-    def feel(self, m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
-        """Keep what MuJoCo's ``body`` felt in the tick that ends, while its places are still those of its start."""
-        self.inner[:] = d.cfrc_int[body]
-        np.subtract(d.subtree_com[m.body_rootid[body]], d.xpos[body], out=self.arm)
-        self.turn[:] = d.xmat[body].reshape(3, 3)
+    def measure(self, m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
+        """Read the sensor at MuJoCo's ``body``, while MuJoCo's poses are still those of the step's start."""
+        self.parent_wrench[:] = d.cfrc_int[body]
+        np.subtract(d.subtree_com[m.body_rootid[body]], d.xpos[body], out=self.com_offset)
+        self.rotation[:] = d.xmat[body].reshape(3, 3)
         mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, self.acceleration, 1)
 
 
 class RobotBody:
-    """One robot: what it was asked for, and where its numbers lie in MuJoCo's arrays."""
+    """One robot: targets and gains of its drives, and its indices in MuJoCo's arrays."""
 
-    def __init__(self, spec: RobotSpec, bit: int) -> None:
+    def __init__(self, spec: RobotSpec, bit: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``bit``: collision bit. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
         check(spec)
         joints, pose = len(spec.drives), np.asarray(spec.pose, float)
-        self.spec, self.bit = spec, bit
+        self.spec, self.bit, self.parameters = spec, bit, parameters
         try:
-            self._parsed = _parsed(spec, 1 << bit)
+            self._parsed = _parse(spec, 1 << bit, parameters.friction)
         except ValueError as error:
             raise build_error(spec, error) from error
         self.shapes = shapes_of(spec.urdf)
         self.stiffness = np.array([d.stiffness for d in spec.drives], float)
         self.damping = np.array([d.damping for d in spec.drives], float)
-        self.effort = np.array([d.effort for d in spec.drives], float)
-        """[joint] limit of the servos, at most ``most``."""
-        self.most = self.effort.copy()
-        """[joint] limit of the drives: servo and weight together."""
+        self.servo_limit = np.array([d.effort for d in spec.drives], float)
+        """[joint] N m or N: limit of the servos, at most ``effort_limit``."""
+        self.effort_limit = self.servo_limit.copy()
+        """[joint] N m or N: limit of the drives, servo and gravity compensation together."""
         self.target = np.array(spec.home, float)
-        """[joint] position the drives pull to."""
+        """[joint] rad or m: position to which the servos pull."""
         self.target_velocity = np.zeros(joints)
-        self.forward = np.zeros(joints)
-        """[joint] effort beside that of the springs [N m or N]."""
+        self.feedforward = np.zeros(joints)
+        """[joint] N m or N: effort in addition to that of the servos."""
         self.control = np.zeros(joints)
-        """[joint] what MuJoCo was asked for in the last tick; less K q and D v it is what the servo gave."""
+        """[joint] N m or N: MuJoCo's control in the last step; less K q and D v it is the effort of the servo."""
         self.base_target = np.array([pose[0], pose[1], frames.to_yaw(pose[3:])])
-        """[3] x, y, yaw where the tracks hold; moves with ``base_velocity``."""
+        """[3] x, y, yaw (m, m, rad) to which the base's servos pull; moves with ``base_velocity``."""
         self.base_velocity = np.zeros(3)
-        """[3] vx, vy, wz in the base's own axes."""
-        self.tracks = _tracks(spec)
+        """[3] vx, vy, wz (m/s, m/s, rad/s) in the base's own axes."""
+        self.base_gains = _base_gains(spec, parameters)
         """Stiffness and damping [3] of the base's servos along x, y and about z."""
-        self.give = GIVE
-        self.exact = np.zeros(joints, bool)
-        """[joint] bool: the scheme must not add to its damping."""
-        self.late = np.zeros(0)
-        """[joint] the part of the damping that acts on the velocity at the start of the tick."""
-        self.soon = np.zeros(0)
-        """[joint] the part that MuJoCo applies to the velocity at its end, beside the spring at its end."""
+        self.base_slip = parameters.base_slip
+        """[m or rad] Offset at which the base's servos give their full effort."""
+        self.has_exact_damping = np.zeros(joints, bool)
+        """[joint] bool: the integrator must not add to its damping; see :func:`split_damping`."""
+        self.damping_at_start = np.zeros(0)
+        """[joint] N m s/rad: part of the damping that acts on the velocity at the start of the step."""
+        self.damping_at_end = np.zeros(0)
+        """[joint] N m s/rad: part that MuJoCo applies to the velocity at its end, like the spring."""
         self.q = self.v = self.actuator = np.zeros(0, int)
-        self.diagonal = np.zeros(0, int)
-        """Where the drives' own inertias lie in MuJoCo's sparse mass matrix."""
+        """[joint] Indices of the drives in MuJoCo's qpos, qvel and ctrl."""
+        self.inertia_index = np.zeros(0, int)
+        """[joint] Index of the drive's own inertia in MuJoCo's sparse mass matrix."""
         self.base_q = self.base_v = self.base_actuator = np.zeros(0, int)
+        """[3] The same of the base's x, y and yaw."""
         self.bodies: dict[str, int] = {}
         self.link_sensors: dict[str, LinkSensor] = {}
-        """What links with sensors felt in the last tick."""
+        """By link: the sensors of :meth:`RigidWorld.add_link_sensor`."""
         self.remote_wrenches: dict[str, np.ndarray] = {}
-        """Wrenches [6] on links by people whom other clients move: see :meth:`Rigid.bear`."""
+        """By link: wrenches [6] of remote people; see :meth:`RigidWorld.set_remote_wrenches`."""
 
     # ------------------------------------------------------------------ in MuJoCo
 
-    def attach(self, spec: mujoco.MjSpec) -> None:
-        """Set the robot on a planar base and give it its servos."""
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add the robot to a world, on a planar base and with its servos."""
         given, name = self.spec, self.spec.name
         base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, float(given.pose[2])])
         slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
@@ -116,18 +116,18 @@ class RobotBody:
         spec.attach(self._parsed, prefix=f"{name}/", frame=base.add_frame())
         for drive, stiffness, damping in zip(given.drives, self.stiffness, self.damping, strict=True):
             _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
-        stiffness, damping = self.tracks
+        stiffness, damping = self.base_gains
         for i, axis in enumerate(_PLANAR):
             _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 
-    def locate(self, m: mujoco.MjModel) -> None:
-        """Find the robot's numbers in a world that was compiled anew."""
+    def find_indices(self, m: mujoco.MjModel) -> None:
+        """Find the robot's bodies and joints in a world that was compiled anew."""
         name = self.spec.name
         joints = [m.joint(f"{name}/{drive.joint}") for drive in self.spec.drives]
         planar = [m.joint(f"{name}:{axis}") for axis in _PLANAR]
         self.q = np.array([j.qposadr[0] for j in joints], int)
         self.v = np.array([j.dofadr[0] for j in joints], int)
-        self.diagonal = (m.M_rowadr + m.M_rownnz - 1)[self.v]
+        self.inertia_index = (m.M_rowadr + m.M_rownnz - 1)[self.v]
         self.actuator = np.array([m.actuator(f"{name}/{drive.joint}").id for drive in self.spec.drives], int)
         self.base_q = np.array([j.qposadr[0] for j in planar], int)
         self.base_v = np.array([j.dofadr[0] for j in planar], int)
@@ -137,53 +137,53 @@ class RobotBody:
         self._set_gains(m)
 
     def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
-        """Be somewhere, at rest and asking for nothing else: base ``pose`` [7], ``position`` [joint]."""
+        """Put the robot at base ``pose`` [7] and ``position`` [joint], at rest, with its targets there."""
         self.target[:] = d.qpos[self.q] = position
         self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.to_yaw(pose[3:])
         d.qvel[self.v] = d.qvel[self.base_v] = 0.0
         self.target_velocity[:] = self.base_velocity[:] = 0.0
-        self.control[:] = self.stiffness * self.target + self.forward
+        self.control[:] = self.stiffness * self.target + self.feedforward
         for joint, (source, coefficients) in self._mimics(m).items():
             polynomial = np.polynomial.Polynomial(coefficients)
             d.joint(joint).qpos[0] = polynomial(d.joint(source).qpos[0])
 
-    def drive(self, d: mujoco.MjData, dt: float) -> None:
-        """Before a tick: turn the targets into MuJoCo's controls."""
-        pull = self.stiffness * self.target + (self.soon + self.late) * self.target_velocity
-        self.control[:] = pull - self.late * d.qvel[self.v] + self.forward
+    def apply_controls(self, d: mujoco.MjData, dt: float) -> None:
+        """Before a step: turn the targets into MuJoCo's controls."""
+        pull = self.stiffness * self.target + (self.damping_at_end + self.damping_at_start) * self.target_velocity
+        self.control[:] = pull - self.damping_at_start * d.qvel[self.v] + self.feedforward
         d.ctrl[self.actuator] = self.control
         q = d.qpos[self.base_q]
         c, s = math.cos(q[2]), math.sin(q[2])
         vx, vy, wz = self.base_velocity.tolist()
         velocity = np.array([c * vx - s * vy, s * vx + c * vy, wz])
-        # held back too far, the tracks slip: the place they hold comes along
-        held = np.minimum(self.base_target + dt * velocity, q + self.give)
-        np.maximum(held, q - self.give, out=self.base_target)
-        stiffness, damping = self.tracks
+        # held back too far, the base slips: its target comes along
+        held = np.minimum(self.base_target + dt * velocity, q + self.base_slip)
+        np.maximum(held, q - self.base_slip, out=self.base_target)
+        stiffness, damping = self.base_gains
         d.ctrl[self.base_actuator] = stiffness * self.base_target + damping * velocity
 
-    def effort_given(self, d: mujoco.MjData) -> np.ndarray:
-        """[joint] what the drives transmitted in the last tick: servo and their share of gravity compensation."""
-        # implicit servos: over the tick they gave the force of its end, not that of its start
-        servo = self.control - self.stiffness * d.qpos[self.q] - self.soon * d.qvel[self.v]
-        servo = np.clip(servo, -self.effort, self.effort)
-        return np.clip(servo + d.qfrc_gravcomp[self.v], -self.most, self.most)
+    def transmitted_effort(self, d: mujoco.MjData) -> np.ndarray:
+        """[joint] N m or N: effort of the drives in the last step, servo and gravity compensation."""
+        # implicit servos: over the step they give the force of its end, not that of its start
+        servo = self.control - self.stiffness * d.qpos[self.q] - self.damping_at_end * d.qvel[self.v]
+        servo = np.clip(servo, -self.servo_limit, self.servo_limit)
+        return np.clip(servo + d.qfrc_gravcomp[self.v], -self.effort_limit, self.effort_limit)
 
-    # ------------------------------------------------------------------ what it is asked to do
+    # ------------------------------------------------------------------ commands
 
     def command(self, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
-        """Pull the joints to ``position`` [joint] moving with ``velocity`` [joint] (standing, unless given)."""
+        """Set the targets of the servos: ``position`` [joint] and ``velocity`` [joint] (zero unless given)."""
         self.target[:] = position
         self.target_velocity[:] = 0.0 if velocity is None else velocity
 
-    def follow(self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray) -> None:
-        """Pull the base to where the original's is: ``base_q`` [7], ``base_qd`` [6] world axes."""
+    def follow_remote(self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray) -> None:
+        """Pull the base of a copy to the received state: ``base_q`` [7], ``base_qd`` [6] world axes."""
         yaw = frames.to_yaw(base_q[3:])
         turns = np.round((d.qpos[self.base_q[2]] - yaw) / (2.0 * np.pi))
         self.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
         c, s = np.cos(yaw), np.sin(yaw)
         self.base_velocity[:] = c * base_qd[0] + s * base_qd[1], c * base_qd[1] - s * base_qd[0], base_qd[5]
-        self.give = FOLLOW_GIVE
+        self.base_slip = self.parameters.remote_base_slip
 
     def set_gains(
         self,
@@ -193,20 +193,23 @@ class RobotBody:
         limit: np.ndarray | None,
         exact: np.ndarray | None,
     ) -> None:
-        """Take other ``gains``: stiffness, damping and an effort beside; what was given in the last tick stays so."""
+        """Take other ``gains``: stiffness, damping, feedforward; see :meth:`RigidWorld.set_gains`.
+
+        The effort of the last step is kept, so that measurements of it do not change.
+        """
         before = self.stiffness.copy()
-        self.stiffness[:], self.damping[:], self.forward[:] = gains
+        self.stiffness[:], self.damping[:], self.feedforward[:] = gains
         if limit is not None:
-            self.effort[:] = np.minimum(limit, self.most)
+            self.servo_limit[:] = np.minimum(limit, self.effort_limit)
         if exact is not None:
-            self.exact[:] = exact
+            self.has_exact_damping[:] = exact
         q, v = d.qpos[self.q], d.qvel[self.v]
-        given = self.control - before * q - self.soon * v
+        given = self.control - before * q - self.damping_at_end * v
         self._set_gains(m)
-        self.control[:] = given + self.stiffness * q + self.soon * v
+        self.control[:] = given + self.stiffness * q + self.damping_at_end * v
 
     def set_remote_wrenches(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
-        """Feel other ``wrenches`` from afar than before; :class:`RobotError` if there is no such link."""
+        """Set the wrenches [6] of remote people by link; :class:`RobotError` if there is no such link."""
         if unknown := sorted(wrenches.keys() - self.bodies.keys()):
             raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, a link that it has not")
         for link in self.remote_wrenches.keys() - wrenches.keys():
@@ -215,8 +218,8 @@ class RobotBody:
             d.xfrc_applied[self.bodies[link]] = wrench
         self.remote_wrenches = wrenches
 
-    def effort_from_afar(self, m: mujoco.MjModel, d: mujoco.MjData) -> np.ndarray:
-        """[dof] generalised force of the wrenches from afar."""
+    def remote_effort(self, m: mujoco.MjModel, d: mujoco.MjData) -> np.ndarray:
+        """[dof] generalised force of the wrenches of remote people."""
         total = np.zeros(m.nv)
         for link, wrench in self.remote_wrenches.items():
             body = self.bodies[link]
@@ -226,18 +229,20 @@ class RobotBody:
     # ------------------------------------------------------------------ inside
 
     def _set_gains(self, m: mujoco.MjModel) -> None:
-        """Turn gains and limits into MuJoCo's constants."""
+        """Write gains and limits into MuJoCo's model."""
         dt = m.opt.timestep
-        soon, late = split_damping(self.stiffness, self.damping, m.dof_damping[self.v], m.dof_armature[self.v], dt)
-        self.soon = np.where(self.exact, soon, self.damping)
-        self.late = np.where(self.exact, late, 0.0)
+        at_end, at_start = split_damping(
+            self.stiffness, self.damping, m.dof_damping[self.v], m.dof_armature[self.v], dt
+        )
+        self.damping_at_end = np.where(self.has_exact_damping, at_end, self.damping)
+        self.damping_at_start = np.where(self.has_exact_damping, at_start, 0.0)
         m.actuator_biasprm[self.actuator, 1] = -self.stiffness
-        m.actuator_biasprm[self.actuator, 2] = -self.soon
-        m.actuator_forcerange[self.actuator, 0] = -self.effort
-        m.actuator_forcerange[self.actuator, 1] = self.effort
+        m.actuator_biasprm[self.actuator, 2] = -self.damping_at_end
+        m.actuator_forcerange[self.actuator, 0] = -self.servo_limit
+        m.actuator_forcerange[self.actuator, 1] = self.servo_limit
 
     def _mimics(self, m: mujoco.MjModel) -> dict[str, tuple[str, np.ndarray]]:
-        """Joints that copy another joint: name -> (source, polynomial)."""
+        """Joints that mimic another joint: name -> (source, coefficients of the polynomial [5])."""
         joints = {}
         for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT):
             joint, source = m.joint(m.eq_obj1id[e]).name, m.joint(m.eq_obj2id[e]).name
@@ -246,12 +251,12 @@ class RobotBody:
         return joints
 
 
-def _parsed(given: RobotSpec, bit: int) -> mujoco.MjSpec:
-    """A robot without base and servos, as its URDF says; its shapes carry the collision ``bit``."""
+def _parse(given: RobotSpec, bit: int, friction: float) -> mujoco.MjSpec:
+    """A robot without base and servos from its URDF; its shapes carry the collision ``bit``."""
     child = mujoco.MjSpec.from_string(touchable(given.urdf, frozenset(drive.joint for drive in given.drives)))
     for geom in child.geoms:
         geom.contype, geom.conaffinity = bit, ALL_BITS & ~bit & ~GROUND & ~REMOTE_HAND
-        geom.friction = ROUGH
+        geom.friction = contact_friction(friction)
     for body in child.bodies[1:]:
         body.gravcomp = 1.0
     driven = {drive.joint: drive for drive in given.drives}
@@ -265,11 +270,11 @@ def _parsed(given: RobotSpec, bit: int) -> mujoco.MjSpec:
     return child
 
 
-def _tracks(spec: RobotSpec) -> tuple[np.ndarray, np.ndarray]:
+def _base_gains(spec: RobotSpec, parameters: PhysicsParameters) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and damping [3] of the base's servos along x, y and about z."""
     force, moment = spec.base_effort
-    stiffness = np.array([force, force, moment]) / GIVE
-    return stiffness, TRACK_TIME * stiffness
+    stiffness = np.array([force, force, moment]) / parameters.base_slip
+    return stiffness, parameters.base_damping_time * stiffness
 
 
 def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, effort: float) -> None:
@@ -286,20 +291,20 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
 
 
 def split_damping(
-    stiffness: np.ndarray, damping: np.ndarray, friction: np.ndarray, rotor: np.ndarray, dt: float
+    stiffness: np.ndarray, damping: np.ndarray, friction: np.ndarray, armature: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How a servo's damping is split so that the joint swings as asked: parts [joint] at the tick's end and start.
+    """Split a servo's damping so that the joint swings as asked: parts [joint] at the end and at the start of the step.
 
-    With the spring at the end of the tick, q + dt v, the scheme damps as if D were larger by dt K. So much is taken
+    With the spring at the end of the step, q + dt v, the scheme damps as if D were larger by dt K. So much is taken
     from the part at the end, which makes the spring's share explicit. Half of the damping (``friction`` of the joint
     included) acts on the velocity at the start: the trapezoidal rule, whose decay is right to third order in dt D / M.
     The price is that the scheme is not stable for every inertia M. A - B >= dt K / 2 - 2 M / dt is needed, A and B
-    being the parts at the end (without - dt K) and at the start; M is at least ``rotor``, so B is cut down, and if
-    that does not suffice A is raised: a joint that is too stiff for its tick is damped more than asked.
+    being the parts at the end (without - dt K) and at the start; M is at least ``armature``, so B is cut down, and if
+    that does not suffice A is raised: a joint that is too stiff for the step is damped more than asked.
     """
     asked = damping + friction
-    needed = np.maximum(0.0, 0.5 * dt * stiffness - 2.0 * rotor / dt)
-    late = np.clip(0.5 * (asked - needed), 0.0, 0.5 * rotor / dt)
+    needed = np.maximum(0.0, 0.5 * dt * stiffness - 2.0 * armature / dt)
+    late = np.clip(0.5 * (asked - needed), 0.0, 0.5 * armature / dt)
     return np.maximum(asked, needed) - late - friction - dt * stiffness, late
 
 

@@ -1,1 +1,1 @@
-"""Subscriptions: commands of ROS peers as plain values."""
+"""Subscribed topics: commands to the robot as plain values."""

@@ -1,4 +1,4 @@
-"""What peers ask of the robot: subscriptions whose messages wait as plain values until the client drains them."""
+"""Subscriptions to the robot's command topics; commands are queued as plain values until the client takes them."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from vinesim.ros.topic import RELIABLE
 log = logging.getLogger(__name__)
 
 MAX_QUEUED = 64
-"""Commands that wait at most; a client that drains once per tick never sees the oldest fall out."""
+"""Largest number of queued commands; a client that takes them after every step never loses the oldest."""
 
 
 class CommandSubscriptions:
-    """Set points replace each other (only the newest counts), trajectories queue up."""
+    """The queue of commands: a set-point replaces an older one of its kind, trajectories are all kept."""
 
     def __init__(self, node: rclpy.node.Node, trajectory_controllers: Sequence[str]) -> None:
         self._lock = threading.Lock()
         self._queue: deque[Command] = deque(maxlen=MAX_QUEUED)
         self.rejected = 0
-        """Commands that contradicted themselves."""
+        """Messages that contradicted themselves."""
         self._subscribe(node, TwistStamped, "mobile_base_controller/cmd_vel", convert.base_velocity)
         forward = "forward_position_controller"
         take = partial(convert.joint_positions, controller=forward)
@@ -41,7 +41,7 @@ class CommandSubscriptions:
             self._subscribe(node, JointTrajectoryMessage, f"{name}/joint_trajectory", take)
 
     def drain(self) -> list[Command]:
-        """All that came since the last call, in order of arrival."""
+        """Take all commands that arrived since the last call, in order of arrival."""
         with self._lock:
             commands = list(self._queue)
             self._queue.clear()

@@ -1,4 +1,4 @@
-"""What comes in from ROS, as plain values: no room above or beside needs to know a message type.
+"""Commands from ROS as plain values, so that other packages need no message types.
 
 Times are simulation seconds, arrays are numpy float64.
 """
@@ -12,10 +12,10 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class BaseVelocity:
-    """Wanted velocity of the base, in its own axes (geometry_msgs/TwistStamped on mobile_base_controller/cmd_vel)."""
+    """Commanded velocity of the base, in its own axes (TwistStamped on mobile_base_controller/cmd_vel)."""
 
     time: float
-    """Stamp of the sender; 0 if it gave none."""
+    """Stamp of the sender [s]; 0 if it gave none."""
     linear: np.ndarray
     """[3] m/s"""
     angular: np.ndarray
@@ -24,7 +24,7 @@ class BaseVelocity:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointPositions:
-    """Wanted positions of all joints of a forward controller (std_msgs/Float64MultiArray)."""
+    """Commanded positions of all joints of a forward controller (std_msgs/Float64MultiArray)."""
 
     controller: str
     positions: np.ndarray
@@ -33,11 +33,11 @@ class JointPositions:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointTrajectory:
-    """Way points of some joints (trajectory_msgs/JointTrajectory); no points means: stop where you are."""
+    """Way points of some joints (trajectory_msgs/JointTrajectory); no points: stop at the present positions."""
 
     controller: str
     time: float
-    """When it starts; 0 means now."""
+    """Time of its start [s]; 0: now."""
     joints: tuple[str, ...]
     times: np.ndarray
     """[point] s after the start, rising"""

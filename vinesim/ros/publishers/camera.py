@@ -26,7 +26,7 @@ class CameraPublisher:
         )
 
     def pending(self, frame: CameraFrame) -> Iterator[PendingMessage]:
-        """Everything that one picture tells, cheap things first."""
+        """All messages of one picture, the cheap ones first."""
         for topic in self._infos:
             yield topic, partial(convert.camera_info, frame.info, frame.time)
         for topic, build in self._built:

@@ -12,11 +12,11 @@ from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
 
 
 class ClockPublisher:
-    """There is one clock per ROS domain, so its name is absolute under every namespace."""
+    """/clock: one for each ROS domain, so its name is absolute under every namespace."""
 
     def __init__(self, advertise: Advertise) -> None:
         self._topic = advertise(ClockMessage, "/clock", RELIABLE, high_priority=True)
 
     def pending(self, time: float) -> Iterator[PendingMessage]:
-        """The time [s]."""
+        """The message of a simulation time [s]."""
         yield self._topic, partial(convert.clock, time)

@@ -1,4 +1,4 @@
-"""The truth about the vineyard, for those who want it: poses apart from the robot's own tf, and what labels mean."""
+"""Topics of ground truth: true poses apart from the robot's own tf, and the meaning of label images."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class GroundTruthPublisher:
         self._transforms = SerializedTransforms([])
 
     def pending(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
-        """What moves; what is no longer named is gone. Pass the same tuple as long as the names stay."""
+        """The message of true poses [name, 7] of what moves. Pass the same tuple object as long as the names stay."""
         yield self._moving, partial(self._message, time, names, poses)
 
     def pending_static(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
-        """What stands, once for all."""
+        """The message of true poses [name, 7] of what never moves."""
         transforms = SerializedTransforms([(MAP_FRAME, name) for name in names])
         yield self._static, partial(transforms.message, 0.0, poses)
 

@@ -19,5 +19,5 @@ class LidarPublisher:
         self._points = advertise(PointCloud2, f"{name}/points", SENSOR_DATA)
 
     def pending(self, scan: LidarScan) -> Iterator[PendingMessage]:
-        """One revolution."""
+        """The message of one revolution."""
         yield self._points, partial(convert.lidar_cloud, scan)

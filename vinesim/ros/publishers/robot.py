@@ -1,4 +1,4 @@
-"""What a robot says of itself: description, joints, frames, odometry, contacts."""
+"""Topics of a robot's state: description, joints, frames, odometry, contacts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FrameTree = dict[str, tuple[str, np.ndarray]]
 
 
 class RobotPublisher:
-    """robot_description and tf_static once; joint_states, tf, odometry and contacts every tick."""
+    """robot_description and tf_static once; joint_states, tf, odometry and contacts after every step."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class RobotPublisher:
         advertise(tf_message, "tf_static", TRANSIENT_LOCAL).send(static.message(0.0, poses))
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
-        """Everything that one tick tells."""
+        """All messages of one step."""
         yield self._joints, partial(convert.joint_state, sample.joints)
         yield self._tf, partial(self._frames, sample)
         yield self._odometry, partial(convert.odometry, sample, self._base)
@@ -74,7 +74,7 @@ class RobotPublisher:
         return [self._wrench(sample, contact, joints) for contact in sample.contacts]
 
     def _wrench(self, sample: RobotSample, contact: Contact, joints: FrameTree) -> WrenchStamped:
-        """In the frame of the touching link, or in the map if no frame bears the link's name."""
+        """One contact in the frame of the touching link, or in the map if no frame has the link's name."""
         link = contact.link.removeprefix(f"{sample.actor}/")
         in_base = pose_in_base(link, joints, self._base)
         if in_base is None:
@@ -85,7 +85,7 @@ class RobotPublisher:
 
 
 def pose_in_base(link: str, joints: FrameTree, base: str) -> np.ndarray | None:
-    """Pose [7] of a link in the base, up the tree of joints; None if they do not lead there."""
+    """Pose [7] m, 1 of a link in the base, by the chain of joints; None if the chain does not end at the base."""
     pose = frames.pose(np.zeros(3))
     for _ in range(len(joints) + 1):
         if link == base:

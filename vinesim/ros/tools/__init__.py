@@ -1,1 +1,1 @@
-"""Tools beside the node."""
+"""Tools to look at a running ROS graph."""

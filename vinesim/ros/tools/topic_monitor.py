@@ -1,12 +1,12 @@
-"""A stranger's ears: a process of its own that subscribes with stock rclpy and counts what arrives.
+"""A monitor of ROS topics: subscribes with stock rclpy and reports counts, rates, latencies and losses.
 
-``python -m vinesim.ros.tools.topic_monitor --seconds 10`` listens to every topic there is (``--topic`` names some) and prints one
-JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here (the age,
+``python -m vinesim.ros.tools.topic_monitor --seconds 10`` subscribes to every topic (``--topic`` names some) and
+prints one JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here (the age,
 for what was latched), the messages lost (gaps in the publisher's numbering) and whether the stamps ever went back.
-Without ``--seconds`` it listens until its standard input is closed.
+Without ``--seconds`` it runs until its standard input is closed.
 
 It takes messages in their serialised form, so that counting costs next to nothing; the first one of every topic is
-taken apart, to see that it is well-formed. It runs without vinesim's middleware profile, as a stranger would.
+deserialised, to check that it is well-formed. It runs without vinesim's middleware profile, as any other node.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from vinesim.ros import ros_setup
 from vinesim.ros.messages import interfaces
 
 DISCOVERY_PERIOD = 0.2
-"""How often the graph is searched for new topics [s]."""
+"""Time between two searches for new topics [s]."""
 EXCLUDED_TOPICS = ("/rosout", "/parameter_events")
-"""Topics of every node, not listened to unless named."""
+"""Topics of every node, not monitored unless named."""
 
 
 class TopicStats:
-    """What one topic brought."""
+    """Statistics of one topic."""
 
     def __init__(self, type_name: str, type_hash: str, message: type, publishers: int) -> None:
         self.type_name, self.type_hash = type_name, type_hash
@@ -51,7 +51,7 @@ class TopicStats:
         self._latencies: deque[int] = deque(maxlen=10_000)
 
     def add(self, message: bytes, info: dict[str, Any]) -> None:
-        """One serialised message, and what the middleware says of it."""
+        """Count one serialised message with its meta-data from the middleware."""
         now = time.time_ns()
         if not self.count:
             from rclpy.serialization import deserialize_message
@@ -74,7 +74,7 @@ class TopicStats:
             self._stamp = stamp
 
     def report(self) -> dict[str, Any]:
-        """As plain numbers; ``lost`` is None if several publishers number their messages apart."""
+        """The statistics as plain values; ``lost`` is None if several publishers number their messages apart."""
         span = self.last - self.first
         return {
             "type": self.type_name,
@@ -100,12 +100,12 @@ class TopicMonitor:
         self._topics = tuple(topics)
         self._context = Context()
         self._context.init([])
-        self._node = Node("witness", context=self._context, enable_rosout=False, start_parameter_services=False)
+        self._node = Node("topic_monitor", context=self._context, enable_rosout=False, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
 
     def run(self, until: threading.Event, seconds: float | None) -> None:
-        """Listen until the event, or for so many seconds from the first message on."""
+        """Count messages until the event, or for so many ``seconds`` [s] after the first message."""
         next_look = 0.0
         deadline = None
         while not until.is_set() and (deadline is None or time.monotonic() < deadline):
@@ -113,12 +113,12 @@ class TopicMonitor:
                 self._discover()
                 next_look = time.monotonic() + DISCOVERY_PERIOD
             self._executor.spin_once(timeout_sec=DISCOVERY_PERIOD)
-            if seconds is not None and deadline is None and any(ear.count for ear in self.stats.values()):
+            if seconds is not None and deadline is None and any(topic.count for topic in self.stats.values()):
                 deadline = time.monotonic() + seconds
 
     def report(self) -> dict[str, dict[str, Any]]:
-        """By topic."""
-        return {name: ear.report() for name, ear in sorted(self.stats.items())}
+        """The statistics of each topic."""
+        return {name: topic.report() for name, topic in sorted(self.stats.items())}
 
     def close(self) -> None:
         """Leave the graph."""
@@ -128,8 +128,8 @@ class TopicMonitor:
 
     def _discover(self) -> None:
         for name, types in self._node.get_topic_names_and_types():
-            heard = name in self._topics if self._topics else name not in EXCLUDED_TOPICS
-            if heard and name not in self.stats:
+            is_monitored = name in self._topics if self._topics else name not in EXCLUDED_TOPICS
+            if is_monitored and name not in self.stats:
                 self._subscribe(name, types[0])
 
     def _subscribe(self, name: str, type_name: str) -> None:
@@ -147,10 +147,10 @@ class TopicMonitor:
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        ear = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered))
-        self.stats[name] = ear
-        hear: Any = ear.add  # rclpy hands over what the signature has room for, its annotations know less
-        self._node.create_subscription(message, name, hear, qos, raw=True)
+        topic = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered))
+        self.stats[name] = topic
+        add: Any = topic.add  # rclpy hands over what the signature has room for, its annotations know less
+        self._node.create_subscription(message, name, add, qos, raw=True)
 
 
 def _message_class(type_name: str) -> type | None:
@@ -171,7 +171,7 @@ def _stamp_offset(message: Any) -> int | None:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """What the command line says."""
+    """Options of the command line."""
 
     topics: list[str]
     seconds: float | None
@@ -183,7 +183,7 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
     parser = argparse.ArgumentParser(
         prog="python -m vinesim.ros.tools.topic_monitor", description="Count what arrives on ROS topics."
     )
-    parser.add_argument("--topic", action="append", default=[], help="listen to this one only (may be repeated)")
+    parser.add_argument("--topic", action="append", default=[], help="monitor this one only (may be repeated)")
     parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
     given = parser.parse_args(arguments)
@@ -191,7 +191,7 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Listen and report; returns the exit status."""
+    """Monitor and report; the exit status."""
     given = parse(arguments)
     reason = ros_setup.unavailable_reason()
     if reason is not None:
@@ -202,11 +202,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stop = threading.Event()
     if given.seconds is None:
         threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
-    witness = TopicMonitor(given.topics)
+    monitor = TopicMonitor(given.topics)
     with contextlib.suppress(KeyboardInterrupt):
-        witness.run(stop, given.seconds)
-    text = json.dumps(witness.report(), indent=1)
-    witness.close()
+        monitor.run(stop, given.seconds)
+    text = json.dumps(monitor.report(), indent=1)
+    monitor.close()
     if given.out is None:
         sys.stdout.write(text + "\n")
     else:

@@ -1,0 +1,60 @@
+"""Estimates hips and feet of a person of whom only head and hands are tracked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.values import HumanPose
+
+STEP_LENGTH = 0.28
+"""[m] A foot that is further than this from its place under the hips makes a step. GUESSED."""
+SWING_TIME = 0.35
+"""[s] Duration of a step. GUESSED."""
+LIFT_HEIGHT = 0.08
+"""[m] How high a foot is lifted. GUESSED."""
+
+
+class LegEstimator:
+    """Hips below the head, and feet that make a step when they are left behind.
+
+    The feet depend on their past: two estimators of the same head do not give the same legs.
+    """
+
+    def __init__(self, pose: HumanPose, dt: float = 0.01) -> None:
+        """``pose``: at the start; ``dt`` [s] between calls of :meth:`update`."""
+        self.dt = dt
+        self._below_head = frames.compose(
+            frames.inverse(_upright(pose.head)), np.stack([pose.hips, pose.left_foot, pose.right_foot])
+        )
+        self._feet = np.stack([pose.left_foot, pose.right_foot]).astype(float)
+        self._start = self._feet.copy()
+        self._swing = [1.0, 1.0]
+        """[foot] Phase of its step, 0 to 1."""
+        self._head = np.asarray(pose.head[:3], float).copy()
+
+    def update(self, head: np.ndarray) -> np.ndarray:
+        """Hips and both feet [3, 7] a time ``dt`` later, with the head at ``head`` [7]."""
+        there = frames.compose(_upright(head), self._below_head)
+        ahead = (head[:3] - self._head) / self.dt * SWING_TIME
+        self._head = np.asarray(head[:3], float).copy()
+        ahead[2] = 0.0
+        ahead *= min(1.0, 1.5 * STEP_LENGTH / max(float(np.linalg.norm(ahead)), 1e-9))
+        far = [float(np.linalg.norm(self._feet[foot, :2] - there[1 + foot, :2])) for foot in (0, 1)]
+        foot = int(far[1] > far[0])
+        if min(self._swing) >= 1.0 and far[foot] > STEP_LENGTH:
+            self._start[foot], self._swing[foot] = self._feet[foot], 0.0
+        for foot in (0, 1):
+            if self._swing[foot] < 1.0:
+                share = self._swing[foot] = min(1.0, self._swing[foot] + self.dt / SWING_TIME)
+                goal = there[1 + foot, :3] + (1.5 - share) * ahead
+                gone = share * share * (3.0 - 2.0 * share)  # smoothstep: no jump of velocity at either end
+                self._feet[foot, :3] = self._start[foot, :3] + gone * (goal - self._start[foot, :3])
+                self._feet[foot, 2] = there[1 + foot, 2] + LIFT_HEIGHT * np.sin(np.pi * share)
+                self._feet[foot, 3:] = there[1 + foot, 3:]
+        return np.stack([there[0], *self._feet])
+
+
+def _upright(head: np.ndarray) -> np.ndarray:
+    """The pose [7] of a head, with its yaw alone."""
+    return frames.pose(head[:3], frames.from_yaw(frames.to_yaw(head[3:])))

@@ -1,0 +1,70 @@
+"""A person whom this client moves: pose from a source, update for other clients, haptic feedback."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Container
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.avatar.haptics import HapticFeedback
+from vinesim.physics.rigid.human_shapes import SIDES
+from vinesim.physics.step import Physics
+from vinesim.scene.values import POINT_NAMES, Haptic, HumanPose, HumanSpec, HumanUpdate
+
+_HEAD, _HANDS = POINT_NAMES.index("head"), [POINT_NAMES.index(side) for side in SIDES]
+
+
+class LocalHuman:
+    """A person in the physics whose tracked points a source gives in every step."""
+
+    def __init__(self, physics: Physics, spec: HumanSpec, source: Callable[[float], HumanPose]) -> None:
+        """``source(time)`` gives the pose at the end of the coming step, which begins at simulation ``time`` [s]."""
+        self.physics, self.name, self.source = physics, spec.name, source
+        physics.add_human(spec)
+        self.pose = spec.pose
+        self.haptics: tuple[Haptic, ...] = ()
+        """Vibrations of the person's controllers after the last step."""
+        self._feedback = HapticFeedback(physics, spec.name)
+        self._sent_points = spec.pose.points
+        self._busy_steps = physics.parameters.steps(physics.parameters.hand_contact_duration)
+        """For how many steps a hand counts as busy after it pushed a robot or held something."""
+        self._steps_since_busy = [self._busy_steps] * len(SIDES)
+        self._hand_wrenches: dict[str, dict[str, np.ndarray]] = {}
+
+    def control(self, time: float) -> None:
+        """Before a step: move to where the source says."""
+        self.pose = self.source(time)
+        self.physics.move_human(self.name, self.pose)
+
+    def update(self, now: float) -> HumanUpdate:
+        """After a step: pose and velocity for other clients; busy hands are where they are, not at their controllers."""
+        self.haptics = self._feedback.update()
+        self._hand_wrenches, pushing = self.physics.rigid.hand_wrenches(self.name)
+        points, before = self.pose.points, self._sent_points
+        for i, side in enumerate(SIDES):
+            hand = self.physics.hand(self.name, side)
+            was_busy = self._is_busy(i)
+            self._steps_since_busy[i] = 0 if pushing[i] or hand.held is not None else self._steps_since_busy[i] + 1
+            if self._is_busy(i):
+                points[_HANDS[i]] = hand.pose
+            if was_busy != self._is_busy(i):
+                before[_HANDS[i]] = points[_HANDS[i]]  # from the controller to the palm or back: no velocity
+        way = points[:, :3] - before[:, :3]
+        turn = frames.log(frames.multiply(points[:, 3:], frames.conjugate(before[:, 3:])))
+        velocity = np.concatenate([way, turn], 1) / self.physics.dt
+        if np.linalg.norm(way[_HEAD]) > self.physics.parameters.teleport_distance:
+            velocity[:] = 0.0
+        self._sent_points = points
+        pose = dataclasses.replace(
+            self.pose.with_points(points), left_busy=self._is_busy(0), right_busy=self._is_busy(1)
+        )
+        return HumanUpdate(self.name, now, pose, velocity)
+
+    def hand_wrenches_on(self, robots: Container[str]) -> dict[str, dict[str, np.ndarray]]:
+        """Wrenches [6] of the hands on some ``robots`` in the last step, by robot and link; after :meth:`update`."""
+        return {robot: links for robot, links in self._hand_wrenches.items() if robot in robots}
+
+    def _is_busy(self, hand: int) -> bool:
+        return self._steps_since_busy[hand] < self._busy_steps

@@ -1,0 +1,28 @@
+"""The copy of a person whom another client moves."""
+
+from __future__ import annotations
+
+from vinesim.net.codec.messages import Hello
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.scene.values import HumanSpec, HumanUpdate
+
+
+class RemoteHuman:
+    """A copy whose pose equals the received one to the bit; its hands push objects, but no robots."""
+
+    def __init__(self, rigid: RigidWorld, name: str) -> None:
+        """``name`` of a person who was added to ``rigid`` already; see :func:`human_spec`."""
+        self.rigid, self.name = rigid, name
+
+    def follow(self, update: HumanUpdate) -> None:
+        """Be where ``update`` says at the end of the coming step."""
+        self.rigid.move_human(self.name, update.pose)
+
+    def remove(self) -> None:
+        """Remove the copy."""
+        self.rigid.remove_human(self.name)
+
+
+def human_spec(hello: Hello, update: HumanUpdate) -> HumanSpec:
+    """A person as physics needs one, from what another client sent."""
+    return HumanSpec(hello.name, hello.index, update.pose, hello.height)

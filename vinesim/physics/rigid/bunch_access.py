@@ -1,0 +1,61 @@
+"""Free bunches of the rigid world, by number; part of :class:`vinesim.physics.rigid.rigid_world.RigidWorld`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.rigid import free_bunch
+from vinesim.physics.rigid.free_bunch import FreeBunch
+from vinesim.physics.rigid.mujoco_sleep import wake_body
+from vinesim.physics.rigid.world_core import WorldCore
+
+
+class BunchAccess(WorldCore):
+    """Picked bunches as free bodies."""
+
+    def add_bunch(self, bunch: int, body: FreeBunch, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Add a bunch at ``pose`` [7] with ``velocity`` [6] (of its origin, angular; world axes)."""
+        self.add_bunches({bunch: (body, pose, velocity)})
+
+    def add_bunches(self, bunches: dict[int, tuple[FreeBunch, np.ndarray, np.ndarray]]) -> None:
+        """Add several bunches, each with its pose [7] and velocity [6]; ``ValueError`` if one exists already."""
+        if known := sorted(bunches.keys() & self._free_bunches.keys()):
+            raise ValueError(f"bunch {known[0]} is free already")
+        compiled = {bunch: free_bunch.compile_alone(body, self.parameters) for bunch, (body, _, _) in bunches.items()}
+        unused = iter(sorted(set(range(self._pool_size + len(bunches))) - set(self._bunch_slot.values())))
+        for bunch, (body, _, _) in bunches.items():
+            self._free_bunches[bunch], self._bunch_slot[bunch] = body, next(unused)
+        if max(self._bunch_slot[bunch] for bunch in bunches) >= self._pool_size:
+            self._recompile()
+        else:
+            for bunch, (body, _, _) in bunches.items():
+                free_bunch.activate(self.mj_model, self._bunch_slot[bunch], body, compiled[bunch])
+            self._update_tables()
+        for bunch, (_, pose, velocity) in bunches.items():
+            self.place_bunch(bunch, pose, velocity)
+
+    def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Put a free bunch at ``pose`` [7] with ``velocity`` [6] in world axes, and wake it."""
+        joint, pose = self._bunch_joint(bunch), np.asarray(pose, float)
+        rotation = frames.normalize(pose[3:])
+        joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(rotation)])
+        joint.qvel[:3] = velocity[:3]
+        joint.qvel[3:] = frames.rotate(frames.conjugate(rotation), np.asarray(velocity[3:], float))
+        wake_body(self.mj_model, self.mj_data, self._body_of_object(f"bunch/{bunch}", "bunch"))
+        self._kinematics_current = False
+
+    def remove_bunch(self, bunch: int) -> None:
+        """Remove a free bunch; the world is compiled anew."""
+        del self._free_bunches[bunch], self._bunch_slot[bunch]
+        self._recompile()
+
+    def bunch_pose(self, bunch: int) -> np.ndarray:
+        """World pose [7] of a free bunch."""
+        qpos = self._bunch_joint(bunch).qpos
+        return np.concatenate([qpos[:3], frames.from_wxyz(qpos[3:])])
+
+    def _bunch_joint(self, bunch: int) -> Any:  # MuJoCo's view of a joint has no public type
+        return self.mj_data.joint(free_bunch.slot_name(self._bunch_slot[bunch]))

@@ -1,0 +1,150 @@
+"""Commands to robots and measurements of them, by name; part of :class:`vinesim.physics.rigid.rigid_world.RigidWorld`."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vinesim.physics.rigid.robot_body import LinkSensor
+from vinesim.physics.rigid.world_core import WorldCore
+
+
+class RobotAccess(WorldCore):
+    """Robots of a rigid world. Every method raises ``ValueError`` if no robot or link has the name given."""
+
+    def place_robot(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
+        """Put a robot at base ``pose`` [7] and joint ``position`` [joint], at rest, with its targets there."""
+        self.robot(name).place(self.mj_model, self.mj_data, np.asarray(pose, float), position)
+        self._kinematics_current = False
+
+    # ------------------------------------------------------------------ commands
+
+    def command(self, name: str, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Set the targets of the servos: ``position`` [joint] and ``velocity`` [joint] (zero unless given)."""
+        self.robot(name).command(position, velocity)
+
+    def set_gains(
+        self,
+        name: str,
+        stiffness: np.ndarray,
+        damping: np.ndarray,
+        effort: np.ndarray,
+        *,
+        limit: np.ndarray | None = None,
+        exact: np.ndarray | None = None,
+    ) -> None:
+        """Set the gains of the servos and a feedforward ``effort`` (all [joint]); they last until the next call.
+
+        Args:
+            name: of the robot.
+            stiffness: N m/rad or N/m; with zero gains a joint is driven by ``effort`` alone.
+            damping: N m s/rad or N s/m.
+            effort: N m or N, added within ``limit``.
+            limit: N m or N, of the servos; that of the drive unless a lower one is given.
+            exact: bool, joints that swing with just this damping; the others are damped as if it were larger by dt times
+                stiffness, as stiff servos should be.
+        """
+        self.robot(name).set_gains(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
+
+    def command_base(self, name: str, velocity: tuple[float, float, float]) -> None:
+        """Drive the base with (vx, vy, wz) [m/s, m/s, rad/s] in its own axes; zero holds it in place."""
+        robot = self.robot(name)
+        robot.base_velocity[:] = velocity
+        robot.base_slip = self.parameters.base_slip
+
+    def follow_remote(
+        self, name: str, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> None:
+        """Pull the copy of a remote robot to its received state; it stays dynamic, so that a vine still holds it back.
+
+        ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
+        """
+        self.command(name, position, velocity)
+        self.robot(name).follow_remote(self.mj_data, np.asarray(base_q, float), np.asarray(base_qd, float))
+
+    def apply_wrench(self, name: str, link: str, force: np.ndarray, moment: np.ndarray = np.zeros(3)) -> None:
+        """Apply a force [3] N and a moment [3] N m at a link's centre of mass, world axes, until the next call."""
+        wrench = self.mj_data.xfrc_applied[self._link_body(name, link)]
+        wrench[:3], wrench[3:] = force, moment
+
+    def set_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
+        """Apply the wrenches [6] by link with which remote people push a robot, until the next call.
+
+        Force [N] and moment about the link's centre of mass [N m], world axes. :meth:`joint_measurements` counts them as
+        contacts. Raises :class:`RobotError` if a link does not exist.
+        """
+        self.robot(name).set_remote_wrenches(self.mj_data, wrenches)
+
+    # ------------------------------------------------------------------ joints and base
+
+    def joint_measurements(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Position, velocity, effort and contact effort of the drives, each [joint] in the order of ``spec.drives``.
+
+        The effort is that of the drive in the last step: servo and its share of gravity compensation. The contact effort
+        is J^T f of the contacts with plants and with rigid bodies; at rest the two cancel.
+        """
+        robot, d = self.robot(name), self.mj_data
+        return d.qpos[robot.q], d.qvel[robot.v], robot.transmitted_effort(d), self.contact_force[robot.v]
+
+    def joint_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity [joint] of the drives alone, as in :meth:`joint_measurements`."""
+        robot = self.robot(name)
+        return self.mj_data.qpos[robot.q], self.mj_data.qvel[robot.v]
+
+    def gravity_effort(self, name: str) -> np.ndarray:
+        """[joint] N m or N: the part of the drives' effort that carries the robot's own weight."""
+        return self.mj_data.qfrc_gravcomp[self.robot(name).v]
+
+    def joint_inertia(self, name: str) -> np.ndarray:
+        """[joint] kg m^2 or kg: inertia that each drive sees while the others stand, armature included, in this pose."""
+        return self.mj_data.M[self.robot(name).inertia_index]
+
+    def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Pose [7] and velocity [6] (world axes) of the base link."""
+        robot, d = self.robot(name), self.mj_data
+        x, y, yaw = d.qpos[robot.base_q]
+        vx, vy, wz = d.qvel[robot.base_v]
+        half = 0.5 * yaw
+        pose = np.array([x, y, robot.spec.pose[2], 0.0, 0.0, np.sin(half), np.cos(half)])
+        return pose, np.array([vx, vy, 0.0, 0.0, 0.0, wz])
+
+    # ------------------------------------------------------------------ links
+
+    def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
+        """[6, joint]: velocity of the world ``point`` [3] of a link, then its angular velocity, per joint velocity."""
+        robot, body = self.robot(name), self._link_body(name, link)
+        self.update_kinematics()
+        jacobian = np.zeros((6, self.mj_model.nv))
+        mujoco.mj_jac(self.mj_model, self.mj_data, jacobian[:3], jacobian[3:], np.asarray(point, float), body)
+        return jacobian[:, robot.v]
+
+    def add_link_sensor(self, name: str, link: str) -> None:
+        """From the next step on, measure :meth:`link_wrench` and :meth:`link_acceleration` at a link."""
+        self._link_body(name, link)
+        self.robot(name).link_sensors[link] = LinkSensor()
+
+    def link_wrench(self, name: str, link: str) -> np.ndarray:
+        """[6] N, N m about the link's origin: wrench of the link, and all beyond it, on its parent.
+
+        In the link's axes, mean of the last step. Weight, inertia, pushes and contacts with rigid bodies are included;
+        contacts with plants are not: they are in ``Physics.contacts``.
+        """
+        return self._link_sensor(name, link).wrench
+
+    def link_acceleration(self, name: str, link: str) -> np.ndarray:
+        """[6] rad/s^2, m/s^2: angular and proper acceleration of a link's origin in its axes; at rest 9.81 upwards."""
+        return self._link_sensor(name, link).acceleration.copy()
+
+    def link_angular_velocity(self, name: str, link: str) -> np.ndarray:
+        """[3] rad/s of a link, in its axes."""
+        body = self._link_body(name, link)
+        self.update_kinematics()
+        jacobian = np.zeros((3, self.mj_model.nv))
+        mujoco.mj_jacBody(self.mj_model, self.mj_data, None, jacobian, body)
+        return jacobian @ self.mj_data.qvel @ self.mj_data.xmat[body].reshape(3, 3)
+
+    def _link_sensor(self, name: str, link: str) -> LinkSensor:
+        try:
+            return self.robot(name).link_sensors[link]
+        except KeyError:
+            raise ValueError(f"link {link!r} of robot {name!r} has no sensor; call add_link_sensor() first") from None

@@ -1,0 +1,227 @@
+"""The MuJoCo world that all rigid bodies share: its actors, its compilation and its kinematics.
+
+:class:`RigidWorld` adds the step; the classes between them add the access to robots, people and free bunches.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import mujoco
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.contact import collision_geoms
+from vinesim.physics.contact.effective_mass import EffectiveMass
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.rigid import free_bunch, recompile, static_world
+from vinesim.physics.rigid.free_bunch import FreeBunch
+from vinesim.physics.rigid.hand_body import HandBody
+from vinesim.physics.rigid.human_body import HumanBody, HumanError
+from vinesim.physics.rigid.human_posture import VISUAL_PARTS
+from vinesim.physics.rigid.robot_body import RobotBody
+from vinesim.physics.rigid.world_tables import list_owners, list_visuals
+from vinesim.scene.model import Model
+from vinesim.scene.values import RigidVisual
+
+
+@dataclasses.dataclass(frozen=True)
+class CompiledWorld:
+    """A compiled MuJoCo model that is not in use yet."""
+
+    robots: tuple[RobotBody, ...]
+    humans: tuple[HumanBody, ...]
+    bunch_slots: int
+    """Number of free bunches that it has bodies for."""
+    mj_model: mujoco.MjModel
+
+
+class WorldCore:
+    """MuJoCo's model and data, and what they contain; compiled anew when an actor joins or leaves."""
+
+    def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        self.model, self.parameters = model, parameters
+        self.dt = parameters.dt
+        self._robots: dict[str, RobotBody] = {}
+        self._humans: dict[str, HumanBody] = {}
+        self._free_bunches: dict[int, FreeBunch] = {}
+        self._bunch_slot: dict[int, int] = {}
+        """By free bunch: the number of its body in the pool."""
+        self._pool_size = 0
+        self._static_spec = static_world.build_static_world(model, parameters)
+        self._compile_lock = threading.Lock()
+        self.mj_model: mujoco.MjModel
+        self.mj_data: mujoco.MjData
+        self.contact_force: np.ndarray
+        """[dof] N or N m: generalised force of all contacts and of remote people in the last step."""
+        self.generation = 0
+        """Counts changes of MuJoCo's model: views of its arrays must be renewed when this changes."""
+        self.owners: dict[int, tuple[str, str]] = {}
+        """Actor and link of every MuJoCo body that can be added, removed or moved, as in :class:`RigidGeoms`."""
+        self._recompile()
+
+    # ------------------------------------------------------------------ actors
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names in the order in which they joined."""
+        return tuple(self._robots)
+
+    @property
+    def humans(self) -> tuple[str, ...]:
+        """Names in the order in which they joined."""
+        return tuple(self._humans)
+
+    @property
+    def free_bunches(self) -> tuple[int, ...]:
+        """Bunches that lie, fall or are held, in the order in which they left their vines."""
+        return tuple(self._free_bunches)
+
+    @property
+    def actors(self) -> tuple[str, ...]:
+        """Names of robots, then of people."""
+        return (*self._robots, *self._humans)
+
+    def robot(self, name: str) -> RobotBody:
+        """The body of a robot; ``ValueError`` if there is none of this name."""
+        try:
+            return self._robots[name]
+        except KeyError:
+            raise ValueError(f"no robot {name!r} here; there are: {', '.join(self._robots) or 'none'}") from None
+
+    def human(self, name: str) -> HumanBody:
+        """The body of a person; :class:`HumanError` if there is none of this name."""
+        try:
+            return self._humans[name]
+        except KeyError:
+            raise HumanError(f"no human {name!r} here; there are: {', '.join(self._humans) or 'none'}") from None
+
+    def _link_body(self, name: str, link: str) -> int:
+        """MuJoCo body of a robot's link; ``ValueError`` if there is none of this name."""
+        robot = self.robot(name)
+        try:
+            return robot.bodies[link]
+        except KeyError:
+            raise ValueError(f"robot {name!r} has no link {link!r}; it has: {', '.join(robot.bodies)}") from None
+
+    def _body_of_object(self, actor: str, link: str) -> int:
+        """MuJoCo body of a link of an actor, of a box (``box/3``), of a free bunch (``bunch/7``) or of the ``world``."""
+        if actor in self._humans:
+            return self._humans[actor].bodies[link]
+        if actor in self._robots:
+            return self._link_body(actor, link)
+        kind, _, number = actor.partition("/")
+        if actor == "world":
+            return 0
+        return self.mj_model.body(free_bunch.slot_name(self._bunch_slot[int(number)]) if kind == "bunch" else actor).id
+
+    # ------------------------------------------------------------------ kinematics
+
+    def update_kinematics(self) -> None:
+        """Compute MuJoCo's poses from the present state: after a step they are those of the step's start."""
+        if not self._kinematics_current:
+            mujoco.mj_kinematics(self.mj_model, self.mj_data)
+            mujoco.mj_comPos(self.mj_model, self.mj_data)
+            self._kinematics_current = True
+
+    def invalidate_kinematics(self) -> None:
+        """Note that MuJoCo's state was changed from outside: its poses must be computed anew."""
+        self._kinematics_current = False
+
+    def link_pose(self, name: str, link: str) -> np.ndarray:
+        """World pose [7] of a robot's link, also of one that is fixed to its parent."""
+        body = self._link_body(name, link)
+        self.update_kinematics()
+        return np.concatenate([self.mj_data.xpos[body], frames.from_wxyz(self.mj_data.xquat[body])])
+
+    def visuals(self) -> tuple[RigidVisual, ...]:
+        """All rigid bodies that have a shape; the same tuple until one is added or removed."""
+        return self._visuals
+
+    def visual_q(self) -> np.ndarray:
+        """World poses [visual, 7] of :meth:`visuals`."""
+        self.update_kinematics()
+        d, body = self.mj_data, self._visual_body
+        pose = np.empty((len(body), 7))
+        pose[:, :3] = d.xpos[body]
+        pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
+        for human in self._humans.values():  # exactly as prescribed: MuJoCo normalises quaternions
+            pose[self._visual_row[human.part_bodies]] = human.part_poses
+            hands = self._visual_row[[hand.body for hand in human.hands]]
+            first = hands[-1] + 1
+            pose[first : first + len(VISUAL_PARTS)] = human.visual_poses(pose[hands])
+        return pose
+
+    # ------------------------------------------------------------------ compilation
+
+    def _compile_world(self, robots: tuple[RobotBody, ...], humans: tuple[HumanBody, ...]) -> CompiledWorld:
+        """Compile a world with these actors and a pool of bodies for free bunches; the world in use is not changed."""
+        slots = max(self._bunch_slot.values(), default=-1) + 1 + self.parameters.bunch_pool_size
+        with self._compile_lock:
+            spec = self._static_spec.copy()
+            for robot in robots:
+                robot.add_to(spec)
+            for human in humans:
+                human.add_to(spec, sum(1 << robot.bit for robot in robots))
+            for slot in range(slots):
+                free_bunch.add_slot(spec, slot)
+            mj_model = recompile.compile_without_contacts(spec)
+        # MuJoCo's solver tolerance is relative to it: an actor that joins would change when the solver stops for all others
+        mj_model.stat.meaninertia = 1.0
+        for slot in range(slots):
+            free_bunch.disable_collision(mj_model, slot)
+        return CompiledWorld(robots, humans, slots, mj_model)
+
+    def _recompile(self) -> None:
+        """Compile the world anew with the present actors and use it."""
+        self._replace_world(self._compile_world(tuple(self._robots.values()), tuple(self._humans.values())))
+
+    def _replace_world(self, compiled: CompiledWorld) -> None:
+        """Use another compiled world; the state of every joint and body is transferred by its name."""
+        before = (self.mj_model, self.mj_data, self.contact_force) if self.generation else None
+        self.mj_model, self._pool_size = compiled.mj_model, compiled.bunch_slots
+        m = self.mj_model
+        for bunch, body in self._free_bunches.items():
+            free_bunch.activate(m, self._bunch_slot[bunch], body, free_bunch.compile_alone(body, self.parameters))
+        if before is None:
+            self.mj_data, self.contact_force = mujoco.MjData(m), np.zeros(m.nv)
+        else:
+            slots = set(range(self._pool_size)) - set(self._bunch_slot.values())
+            unused = {free_bunch.slot_name(slot) for slot in slots}
+            self.mj_data, self.contact_force = recompile.transfer_state(*before, m, unused)
+        self._effective_mass = EffectiveMass(m)
+        self._valid_qpos = self.mj_data.qpos.copy()
+        self._kinematics_current = False
+        for actor in (*self._robots.values(), *self._humans.values()):
+            actor.find_indices(m)
+        for human in self._humans.values():
+            for hand in human.hands:
+                self._restore_grasp(hand)
+        if before is None:
+            self.static_geoms = collision_geoms.static_geoms(m)
+        self._update_tables()
+
+    def _restore_grasp(self, hand: HandBody) -> None:
+        """Weld a hand in a world that was compiled anew to what it holds, if that still exists."""
+        if hand.held is None:
+            return
+        try:
+            body = None if hand.on_plant else self._body_of_object(*hand.held)
+        except (KeyError, ValueError):
+            hand.release(self.mj_model, self.mj_data)
+        else:
+            hand.weld_to(self.mj_model, self.mj_data, body)
+
+    def _update_tables(self) -> None:
+        """List all bodies and geoms anew after a change of MuJoCo's model, and count :attr:`generation`."""
+        self.generation += 1
+        m = self.mj_model
+        bunch_body = {i: m.body(free_bunch.slot_name(slot)).id for i, slot in self._bunch_slot.items()}
+        bunches = {i: (body, bunch_body[i]) for i, body in self._free_bunches.items()}
+        self._visuals, self._visual_body = list_visuals(self.model, m, self._robots, self._humans, bunches)
+        self._visual_row = np.zeros(m.nbody, int)
+        own = self._visual_body > 0
+        self._visual_row[self._visual_body[own]] = np.flatnonzero(own)
+        self.owners = list_owners(self.model, m, self._robots, self._humans, bunch_body)
+        self.geoms = collision_geoms.movable_geoms(m, self.owners)

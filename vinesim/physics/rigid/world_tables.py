@@ -1,0 +1,67 @@
+"""Tables of a compiled MuJoCo world: what sensors draw, and which actor owns which body."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from vinesim.physics.rigid.free_bunch import FreeBunch
+from vinesim.physics.rigid.human_body import HumanBody
+from vinesim.physics.rigid.human_posture import VISUAL_PARTS
+from vinesim.physics.rigid.human_shapes import BODY_PARTS
+from vinesim.physics.rigid.robot_body import RobotBody
+from vinesim.scene import appearance
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import RigidVisual
+
+
+def list_visuals(
+    model: Model,
+    m: mujoco.MjModel,
+    robots: Mapping[str, RobotBody],
+    humans: Mapping[str, HumanBody],
+    bunches: Mapping[int, tuple[FreeBunch, int]],
+) -> tuple[tuple[RigidVisual, ...], np.ndarray]:
+    """All rigid bodies that have a shape and their MuJoCo bodies [visual]; 0 for parts that are placed by posture.
+
+    ``bunches`` gives the shapes and the MuJoCo body of every free bunch.
+    """
+    visuals, bodies = [], []
+    for box, size in enumerate(model.box_size):
+        length, width, height = map(float, size)
+        visuals.append(RigidVisual(f"box/{box}", Organ.BOX, box, appearance.crate_shapes((length, width, height), box)))
+        bodies.append(m.body(f"box/{box}").id)
+    for name, robot in robots.items():
+        for link, shapes in robot.shapes.items():
+            if shapes:
+                visuals.append(RigidVisual(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
+                bodies.append(robot.bodies[link])
+    for name, human in humans.items():
+        shapes_of_part = appearance.load_human_model(human.spec.height).parts
+        simulated = [(part, human.bodies[part]) for part in (*BODY_PARTS, *(hand.link for hand in human.hands))]
+        for part, body in (*simulated, *((part, 0) for part in VISUAL_PARTS)):
+            visuals.append(RigidVisual(f"{name}/{part}", Organ.HUMAN, human.spec.index, shapes_of_part[part]))
+            bodies.append(body)
+    for bunch, (free_bunch, body) in bunches.items():
+        visuals.append(RigidVisual(f"bunch/{bunch}", Organ.BUNCH, bunch, free_bunch.shapes))
+        bodies.append(body)
+    return tuple(visuals), np.array(bodies, int)
+
+
+def list_owners(
+    model: Model,
+    m: mujoco.MjModel,
+    robots: Mapping[str, RobotBody],
+    humans: Mapping[str, HumanBody],
+    bunch_body: Mapping[int, int],
+) -> dict[int, tuple[str, str]]:
+    """By MuJoCo body: actor and link of everything that can be added, removed or moved."""
+    owners = {m.body(f"box/{i}").id: (f"box/{i}", "box") for i in range(len(model.box_size))}
+    actors: dict[str, RobotBody | HumanBody] = {**robots, **humans}
+    for name, actor in actors.items():
+        owners.update({body: (name, link) for link, body in actor.bodies.items()})
+    owners.update({body: (f"bunch/{i}", "bunch") for i, body in bunch_body.items()})
+    return owners
