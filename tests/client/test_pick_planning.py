@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.client.tasks import pick_planning, start_poses
+from vinesim.client.tasks import path_planning, pick_planning, start_poses
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import Box, Scene, load_scene, with_seed
 
@@ -36,7 +36,7 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
         for a, b in itertools.pairwise(points[:-1]):
             line = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
             assert (
-                start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - pick_planning.GRID_SIZE
+                start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - path_planning.GRID_SIZE
             )
         end = frames.pose(np.append(points[-1], 0.0), frames.from_yaw(task.final_heading))
         box = frames.compose(frames.inverse(end), model.box_pose[task.box].astype(float))[:3]
@@ -48,17 +48,19 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
 def test_a_way_goes_round_what_stands_and_is_short():
     model = generate(harvest(7, boxes=()))
     start, goal = np.array([5.0, 1.4]), np.array([5.0, -1.4])  # a vine stands between
-    points = pick_planning.find_path(model, start, goal)
+    points = path_planning.find_path(model, start, goal, pick_planning.BASE_CLEARANCE)
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     assert 2.8 < length < 5.0
     for a, b in itertools.pairwise(points):
         line = a + np.linspace(0.0, 1.0, 100)[:, None] * (b - a)
-        assert start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - pick_planning.GRID_SIZE
+        assert start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - path_planning.GRID_SIZE
 
 
 def test_no_way_through_a_vine():
     model = generate(harvest(7))
-    assert pick_planning.find_path(model, np.array([5.0, 1.4]), np.array([5.0, 0.1])) is None
+    assert (
+        path_planning.find_path(model, np.array([5.0, 1.4]), np.array([5.0, 0.1]), pick_planning.BASE_CLEARANCE) is None
+    )
 
 
 def test_boxes_without_room_are_told():

@@ -1,10 +1,11 @@
-"""Jobs in a client: planned from the scene, begun with its robot, done tick by tick; nobody on the network needed."""
+"""Tasks in a client: planned from the scene, begun with its robot, done step by step, without a peer on the network."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.motions import LookAt
@@ -32,30 +33,51 @@ def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Task]:
         scene, model, load_robot(robot), MemoryHub().bus("worker"), name="worker", pose=start,
         clock=lambda: 0.01 * next(now),
     )  # fmt: skip
-    script = begin(client.physics, client.robot)
-    client.pre_step += [script.control, LookAt(client.robot, script.focus)]
-    return client, script
+    task = begin(client.physics, client.robot)
+    client.pre_step += [task.control, LookAt(client.robot, task.focus)]
+    return client, task
+
+
+def run_to_the_end(client: Client, task: Task) -> Task:
+    """Step the client until its task is done; more steps than its timeout has fail."""
+    for _ in range(round(task.timeout / client.physics.dt) + 1):
+        if task.is_done:
+            break
+        client.tick()
+    assert task.is_done
+    assert task.succeeded, task.reason
+    return task
 
 
 def test_a_client_picks():
-    client, script = client_with("pick", "vinebot", 0)
-    assert isinstance(script, PickBunch)
-    while not script.is_done and script.phase != "tuck":
+    """F51, farming: the client's own bunch leaves its vine, is carried to a box and rests in it."""
+    client, task = client_with("pick", "vinebot", 0)
+    assert isinstance(task, PickBunch)
+    while not task.is_done and task.phase != "tuck":
         client.tick()
-    assert not script.reason
-    assert client.physics.rigid.free_bunches == (script.plan.bunch,)
-    # the bunch is in its hand, and its trouble is its own: the client goes on
-    assert script.report()["phases_s"]["cut"] < 0.1
+    assert not task.reason
+    assert client.physics.rigid.free_bunches == (task.plan.bunch,)
+    assert task.report()["phases_s"]["cut"] < 0.1
+    run_to_the_end(client, task)
+    assert task.report()["picked"]
+    assert not client.physics.state.bunch_attached[task.plan.bunch]
+    local = frames.compose(frames.inverse(task.box_pose), task.bunch_pose)[:3]
+    assert (np.abs(local[:2]) < 0.5 * client.physics.model.box_size[task.plan.box, :2]).all()
 
 
 def test_a_client_exchanges():
-    client, script = client_with("exchange", "logistic", 1)
-    assert isinstance(script, SwapBoxes)
+    """F51, logistics: the full box leaves on the carrier with its bunches, the empty one stands where it stood."""
+    client, task = client_with("exchange", "logistic", 1)
+    assert isinstance(task, SwapBoxes)
+    place = task.box_pose(task.plan.full_box)[:2].copy()
     for _ in range(200):
         client.tick()
-    assert not script.reason
-    assert script.phase == "to the empty box"
-    assert len(client.physics.rigid.free_bunches) == script.report()["bunches"] == 6
+    assert not task.reason
+    assert task.phase == "to the empty box"
+    assert len(client.physics.rigid.free_bunches) == task.report()["bunches"] == 6
+    run_to_the_end(client, task)
+    assert np.linalg.norm(task.box_pose(task.plan.empty_box)[:2] - place) < 0.05
+    assert task.box_pose(task.plan.full_box)[2] > 0.1
 
 
 def test_an_unknown_job_is_told():

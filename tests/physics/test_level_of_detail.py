@@ -7,12 +7,14 @@ import pytest
 
 from tests.support.contact_scenes import DOWN, bar
 from vinesim import frames
-from vinesim.physics.plants.level_of_detail import LINGER
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.sensors.scene.primitives import Primitives
+
+LINGER = PhysicsParameters().steps(PhysicsParameters().detail_duration)
 
 
 def laden(rows: int = 1) -> Model:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -51,7 +52,7 @@ def test_a_kicked_tree_swings_then_sleeps_and_the_others_never_woke() -> None:
 
 def test_a_tree_drawn_at_rest_sleeps_after_patience() -> None:
     plants = row(2)
-    sleep = SleepMonitor(plants, patience=7)
+    sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.07))
     sleep.wake(np.array([0, 1]))
     drawn = plants.state.body_q.copy()
     rested = [tick(plants, sleep).tolist() for _ in range(7)]
@@ -61,7 +62,7 @@ def test_a_tree_drawn_at_rest_sleeps_after_patience() -> None:
 
 def test_busy_trees_stay_awake() -> None:
     plants = row(3)
-    sleep = SleepMonitor(plants, patience=5)
+    sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.05))
     sleep.wake(np.array([0, 2]))
     for _ in range(20):
         tick(plants, sleep, busy=np.array([2]))

@@ -6,12 +6,15 @@ import pytest
 from tests.support.contact_scenes import bar
 from vinesim import frames
 from vinesim.kernels.articulation.forces import AIR_DENSITY
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.wind import ROUND, Wind
+from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+
+ROUND = PhysicsParameters().steps(PhysicsParameters().wind_check_period)
 
 
 def leafy(count: int, area: float = 0.004, **wood: float) -> Model:

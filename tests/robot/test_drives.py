@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from xml.etree import ElementTree
 
-import msgspec
 import numpy as np
 import pytest
 
 from tests.support.contact_scenes import bunch_scene
+from tests.support.robot_yard import Yard
 from vinesim import frames
-from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
@@ -26,27 +24,6 @@ from vinesim.scene.values import Contact, RobotUpdate
 @pytest.fixture(scope="module")
 def vinebot() -> RobotDescription:
     return load_description("vinebot")
-
-
-class Yard:
-    """One robot on bare ground, and a clock."""
-
-    def __init__(self, description: RobotDescription, pose: np.ndarray | None = None) -> None:
-        self.rigid = RigidWorld(assemble([]))
-        self.robot = Robot(self.rigid, description, "anna", pose=pose)
-        self.time = 0.0
-
-    def run(self, seconds: float) -> np.ndarray:
-        """Positions, velocities, efforts and set-points of every tick [tick, 4, joint]."""
-        rows = []
-        for _ in range(round(seconds / self.rigid.dt)):
-            self.robot.control(self.time)
-            self.rigid.predict()
-            self.rigid.integrate()
-            self.time += self.rigid.dt
-            position, velocity, effort, _ = self.rigid.joint_measurements("anna")
-            rows.append((position, velocity, effort, self.robot.setpoint.copy()))
-        return np.array(rows)
 
 
 @pytest.fixture
@@ -381,230 +358,6 @@ def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
     assert rows[moving, 1].max() == pytest.approx(yard.robot.max_velocity[joint], rel=0.02)
     assert rows[0, 2] == pytest.approx(yard.robot.max_effort[joint], rel=1e-6)
     assert np.abs(rows[10:40, 2] - yard.rigid.gravity_effort("anna")[joint]).max() < 0.2 * yard.robot.max_effort[joint]
-
-
-# ---------------------------------------------------------------------- what sensors on it feel
-
-
-def hand_of(description: RobotDescription, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
-    """Mass [kg] of what hangs on the left wrist sensor, and its centre [3] in the base, from the URDF; at home."""
-    poses, mass, moment = description.link_poses(description.home if position is None else position), 0.0, np.zeros(3)
-    for link in ElementTree.fromstring(description.urdf).iterfind("link"):
-        name = link.get("name")
-        if (name.startswith("gripper_left") or name == "wrist_left_ft_link") and link.find("inertial") is not None:
-            own = float(link.find("inertial/mass").get("value"))
-            at = np.array(link.find("inertial/origin").get("xyz").split(), float)
-            mass, moment = mass + own, moment + own * (poses[name][:3] + frames.rotate(poses[name][3:], at))
-    return mass, moment / mass
-
-
-def centre_of_hand(yard: Yard) -> np.ndarray:
-    """[3] in the base."""
-    return hand_of(yard.robot.description, yard.rigid.joint_measurements("anna")[0])[1]
-
-
-def wrench_of(yard: Yard) -> tuple[np.ndarray, np.ndarray]:
-    """Force and torque [3] of the left wrist, world axes."""
-    wrench = next(w for w in yard.robot.sample(yard.time).wrenches if w.name == "wrist_left_ft")
-    turn = yard.robot.frame_pose(wrench.frame)[3:]
-    return frames.rotate(turn, wrench.force), frames.rotate(turn, wrench.torque)
-
-
-def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: RobotDescription) -> None:
-    yard.run(0.5)
-    force, torque = wrench_of(yard)
-    mass, centre = hand_of(vinebot)
-    down = np.array([0.0, 0.0, -9.81 * mass])
-    place = yard.robot.frame_pose("wrist_left_ft_link")[:3]
-    np.testing.assert_allclose(force, down, atol=0.01)
-    np.testing.assert_allclose(torque, np.cross(centre - place, down), atol=0.01)
-    push = np.array([6.0, -8.0, 3.0])
-    yard.rigid.apply_wrench("anna", "gripper_left_base_link", push)
-    yard.run(3.0)
-    pushed, twisted = wrench_of(yard)
-    np.testing.assert_allclose(pushed - force, push, atol=0.03)
-    body = yard.rigid.mj_model.body("anna/gripper_left_base_link").id
-    lever = yard.rigid.mj_data.xipos[body] - yard.robot.frame_pose("wrist_left_ft_link")[:3]
-    np.testing.assert_allclose(twisted - torque, np.cross(lever, push), atol=0.03)
-    other = next(w for w in yard.robot.sample(yard.time).wrenches if w.name == "wrist_right_ft")
-    assert np.linalg.norm(other.force) == pytest.approx(9.81 * mass, rel=0.01)
-
-
-def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: RobotDescription) -> None:
-    """Inertia counts: as the lift drops and the hand with it, the wrist carries m (g + a)."""
-    hand, _ = hand_of(vinebot)
-    yard.run(0.2)
-    yard.robot.command_effort([-400.0], ["torso_lift_joint"])
-    heights, forces = [], []
-    for _ in range(8):
-        yard.run(yard.rigid.dt)
-        heights.append(centre_of_hand(yard)[2])
-        forces.append(wrench_of(yard)[0][2])
-    acceleration = np.diff(heights, 2) / yard.rigid.dt**2
-    assert acceleration.min() < -0.5
-    np.testing.assert_allclose(forces[2:], -hand * (9.81 + acceleration), atol=0.1)
-
-
-def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
-    yard.run(0.3)
-    imu = yard.robot.sample(yard.time).imus[0]
-    assert (imu.name, imu.frame) == ("base_imu", "base_imu_link")
-    np.testing.assert_allclose(imu.linear_acceleration, [0.0, 0.0, 9.81], atol=1e-3)
-    np.testing.assert_allclose(imu.angular_velocity, 0.0, atol=1e-6)
-    yard.robot.command_base(0.8, 0.0, yard.time)
-    yard.run(0.4)
-    imu = yard.robot.sample(yard.time).imus[0]
-    assert imu.linear_acceleration[0] == pytest.approx(yard.robot.description.base_limits.linear_acceleration, rel=0.05)
-    for _ in range(200):
-        yard.robot.command_base(0.5, 0.6, yard.time)
-        yard.run(yard.rigid.dt)
-    imu = yard.robot.sample(yard.time).imus[0]
-    x, y = yard.robot.description.link_poses(yard.robot.description.home)["base_imu_link"][:2]
-    np.testing.assert_allclose(imu.angular_velocity, [0.0, 0.0, 0.6], atol=0.005)
-    expected = [-(0.6**2) * x, 0.5 * 0.6 - 0.6**2 * y, 9.81]
-    np.testing.assert_allclose(imu.linear_acceleration, expected, atol=0.02)
-
-
-# ---------------------------------------------------------------------- odometry
-
-
-@pytest.mark.parametrize(("ahead", "turning"), [(0.0, 0.0), (0.08, 0.0), (0.05, 0.2)])
-def test_odometry_believes_in_what_the_tracks_travelled(
-    vinebot: RobotDescription, ahead: float, turning: float
-) -> None:
-    """Straight on, then a turn on the spot: travel = way / (1 - slip)."""
-    limits = msgspec.structs.replace(vinebot.base_limits, slip=(ahead, turning))
-    start = frames.pose([3.0, -2.0, 0.0], frames.from_yaw(2.0))
-    yard = Yard(dataclasses.replace(vinebot, base_limits=limits), start)
-    for drive in ((0.5, 0.0), (0.0, 0.8)):
-        for _ in range(250):
-            yard.robot.command_base(*drive, yard.time)
-            yard.run(yard.rigid.dt)
-        yard.run(1.5)
-        sample = yard.robot.sample(yard.time)
-        way = frames.compose(frames.inverse(start), sample.base_q)
-        assert sample.odom_q[0] == pytest.approx(way[0] / (1.0 - ahead), abs=2e-3)
-        assert sample.odom_q[1] == pytest.approx(way[1], abs=2e-3)
-        turned, believed = (2.0 * np.arctan2(q[5], q[6]) for q in (way, sample.odom_q))
-        assert believed == pytest.approx(turned / (1.0 - turning), abs=2e-3)
-    assert turned > 1.5
-
-
-# ---------------------------------------------------------------------- grippers and cutters
-
-
-def bunch_in_hand(description: RobotDescription, effort: float) -> tuple[Yard, int]:
-    """A loose round bunch of 0.3 kg between the fingers of the left hand, held with ``effort`` [N] each."""
-    yard = Yard(description)
-    yard.robot.command_gripper("gripper_left", 0.08)
-    yard.run(0.5)
-    middle = yard.robot.frame_pose("gripper_left_grasping_link")
-    ball = FreeBunch(
-        0.3, np.zeros(3), np.full(3, 1e-4), np.zeros(3), np.zeros((1, 3)), np.zeros((1, 3)), np.array([0.03])
-    )
-    yard.rigid.add_bunch(0, ball, middle, np.zeros(6))
-    yard.robot.command_gripper("gripper_left", 0.0, effort)
-    body = yard.rigid.mj_model.body("free_bunch/0").id
-    weight = yard.rigid.mj_data.xfrc_applied[body]
-    weight[2] = 0.3 * 9.81  # somebody holds it until it is held
-    yard.run(1.0)
-    weight[:] = 0.0
-    yard.run(1.0)
-    return yard, body
-
-
-def slid(yard: Yard, body: int, force: np.ndarray) -> float:
-    """How far a bunch moves in the hand [m] within a second of a pull."""
-
-    def place() -> np.ndarray:
-        hand = yard.robot.frame_pose("gripper_left_grasping_link")
-        return frames.compose(frames.inverse(hand), yard.rigid.bunch_pose(0))[:3]
-
-    before = place()
-    yard.rigid.mj_data.xfrc_applied[body, :3] = force
-    yard.run(1.0)
-    return float(np.linalg.norm(place() - before))
-
-
-def test_a_bunch_is_held_by_friction_and_no_more(vinebot: RobotDescription) -> None:
-    """Two pads of 15 N and mu 0.8 hold 24 N: with the weight of 2.9 N, 16 N more hold and 25 N more do not."""
-    yard, body = bunch_in_hand(vinebot, 15.0)
-    fingers = vinebot.joint_indices("gripper_left")
-    squeeze = yard.rigid.joint_measurements("anna")[3][fingers]
-    np.testing.assert_allclose(squeeze, 15.0, atol=0.3 * 9.81 * 0.2)  # the hand is tilted: a bit of the bunch's weight
-    along = frames.rotate(yard.robot.frame_pose("gripper_left_grasping_link")[3:], np.array([0.0, 0.0, -1.0]))
-    assert slid(yard, body, 16.0 * along) < 1e-3
-    assert slid(yard, body, 25.0 * along) > 0.02
-
-
-def test_a_held_bunch_weighs_on_the_wrist_what_it_weighs(vinebot: RobotDescription) -> None:
-    yard, _ = bunch_in_hand(vinebot, 30.0)
-    mass, _ = hand_of(vinebot)
-    np.testing.assert_allclose(wrench_of(yard)[0], [0.0, 0.0, -9.81 * (mass + 0.3)], atol=0.05)
-
-
-def test_gripper_commands_that_make_no_sense_are_named(yard: Yard) -> None:
-    with pytest.raises(CommandError, match=r"no gripper 'claw'.*gripper_left"):
-        yard.robot.command_gripper("claw", 0.1)
-    with pytest.raises(CommandError, match="gripper effort -1"):
-        yard.robot.command_gripper("gripper_left", 0.1, -1.0)
-    with pytest.raises(CommandError, match="no cutter at 'gripper_left'; cutters fitted: none"):
-        yard.robot.command_cutter("gripper_left")
-
-
-def test_the_cutter_of_the_hand_takes_what_is_in_its_mouth(vinebot: RobotDescription) -> None:
-    """Beside the peduncle it cuts nothing, over it the bunch; and the wrist feels the vine that touches the hand."""
-    model, body, _ = bunch_scene()
-    stalk = Physics(model).snapshot().body_q[body - 1, :3].astype(float)
-    cutter = next(c for c in vinebot.cutters if c.group == "gripper_left")
-    home = vinebot.link_poses(vinebot.home)[cutter.frame]
-    ahead = np.array([cutter.half[0] - 0.005, 0.0, 0.0])  # before the blades' cover, not in it
-    mouth = frames.compose(home, frames.pose(np.array(cutter.origin) + ahead))[:3]
-    physics = Physics(model)
-    robot = Robot(physics.rigid, vinebot, "anna", pose=frames.pose(stalk - mouth + np.array([-0.1, 0.0, 0.0])))
-    robot.fit_cutters(physics)
-
-    def cut(group: str) -> tuple:
-        robot.command_cutter(group)
-        robot.control(physics.time)
-        physics.step()
-        return physics.detachments
-
-    assert cut("gripper_left") == ()
-    physics.rigid.place_robot("anna", frames.pose(stalk - mouth), vinebot.home)
-    assert cut("gripper_right") == ()
-    (parting,) = cut("gripper_left")
-    assert (parting.bunch, parting.cause, parting.actor) == (0, "blade", "anna")
-    robot.remove()
-    assert physics.detachment_monitor.blades == []
-    physics.step()
-
-
-def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
-    """Oracle: MuJoCo knows nothing of them, so weight and contact forces must make up the reading at rest."""
-    description = load_description("vinebot")
-    model, _, middle = bunch_scene()
-    physics = Physics(model)
-    tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
-    ahead = np.array([0.15, 0.0, 0.0])  # it comes from beyond the cane's tip
-    place = middle + ahead - frames.rotate(frames.from_yaw(np.pi), tip)
-    robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.from_yaw(np.pi)))
-    met = 0
-    for _ in range(900):
-        met += any(c.link.startswith("gripper_left") for c in physics.contacts)
-        if met < 20:
-            robot.command_base(0.2, 0.0, physics.time)
-        robot.control(physics.time)
-        physics.step()
-    sample = robot.sample(physics.time, physics.contacts)
-    hand = [c for c in sample.contacts if c.link.startswith("gripper_left")]
-    force = np.sum([c.force for c in hand], axis=0)
-    assert np.linalg.norm(force) > 0.3
-    wrench = next(w for w in sample.wrenches if w.name == "wrist_left_ft")
-    turn = robot.frame_pose(wrench.frame)[3:]
-    mass, _ = hand_of(description)
-    felt = frames.rotate(turn, wrench.force) + np.array([0.0, 0.0, 9.81 * mass])
-    np.testing.assert_allclose(felt, force, atol=0.05)
 
 
 def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:

@@ -139,6 +139,14 @@ def test_depth_in_millimetres():
     assert np.abs(millimetres[1:] - 1000.0 * frame.depth[1:]).max() <= 0.5001
 
 
+def test_depth_beyond_sixteen_bits_counts_as_not_measured():
+    depth = camera_frame().depth.copy()
+    depth[5, :3] = 65.535, 65.536, 70.0
+    frame = dataclasses.replace(camera_frame(), depth=depth)
+    millimetres = np.frombuffer(convert.depth_image_millimetres(frame).data, np.uint16).reshape(48, 64)
+    assert millimetres[5, :3].tolist() == [65535, 0, 0]
+
+
 def test_compressed_image_shows_the_same_colours():
     cv2 = pytest.importorskip("cv2")
     frame = camera_frame()

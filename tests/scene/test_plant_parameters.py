@@ -1,5 +1,9 @@
 """Plant parameters: every number has a unit, a grade and a source; a wrong unit is caught."""
 
+import collections
+import pathlib
+import re
+
 import pytest
 
 from vinesim.scene import plant_parameters
@@ -15,14 +19,32 @@ def numbers(part):
         )
 
 
-def test_every_number_has_a_source():
-    found = [
-        *numbers(plant_parameters.load_plant("vine")),
-        *(n for v in plant_parameters.load_varieties() for n in numbers(v)),
-    ]
-    assert len(found) > 40
-    assert all(len(n.source) > 4 for n in found)
-    assert {n.grade for n in found} == {"READ", "DERIVED", "GUESSED"}
+def all_numbers():
+    """Every number of the plant file and of the varieties."""
+    yield from numbers(plant_parameters.load_plant("vine"))
+    for variety in plant_parameters.load_varieties():
+        yield from numbers(variety)
+
+
+def test_every_number_is_graded_and_explained():
+    """A READ number names a publication (a year, or a table of a journal); a DERIVED one the numbers it follows from."""
+    found = list(all_numbers())
+    assert len(found) > 50
+    for number in found:
+        assert len(number.source.split()) >= 2, number
+        if number.grade == "READ":
+            assert re.search(r"\b(19|20)\d\d\b|\btable \d", number.source), number
+        elif number.grade == "DERIVED":
+            assert re.search(r"\d", number.source), number
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/validation.md"])
+def test_the_pages_count_the_guesses(page):
+    grades = collections.Counter(number.grade for number in numbers(plant_parameters.load_plant("vine")))
+    text = (pathlib.Path(__file__).parents[2] / page).read_text()
+    counted = re.search(r"(\d+) of (\d+) plant parameters are guesses", text)
+    assert counted, f"{page} counts no guesses"
+    assert tuple(map(int, counted.groups())) == (grades["GUESSED"], sum(grades.values()))
 
 
 def test_a_wrong_unit_is_told(tmp_path):

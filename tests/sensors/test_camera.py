@@ -9,9 +9,9 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
+from vinesim.scene.camera_geometry import measured_points, project_points
 from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
-from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import pinhole
@@ -53,7 +53,7 @@ def test_a_known_bunch_lies_on_its_pixel(model, primitives) -> None:
         pose[3:] = frames.multiply(pose[3:], frames.exp(np.array([0.0, 0.0, 0.3])))
         frame = camera.render(primitives, pose)
         local = frames.rotate(frames.conjugate(pose[3:]), centre - pose[:3])
-        u, v = np.round(point_cloud.project_points(local, frame.info)).astype(int)
+        u, v = np.round(project_points(local, frame.info)).astype(int)
         if frame.labels[v, u] == label(Organ.BUNCH, bunch):
             found += 1
             near = model.bunch_radius[bunch] + model.bunch_length[bunch]
@@ -142,7 +142,7 @@ def test_depth_conventions() -> None:
 def test_a_cloud_lies_on_the_surface() -> None:
     primitives, _ = sensor_scenes.world(sensor_scenes.thing(sensor_scenes.shape("sphere", 0.2, at=(1.5, 0.1, 1.1))))
     frame = _camera().render(primitives, sensor_scenes.AHEAD)
-    points = point_cloud.point_cloud(frame)
+    points = measured_points(frame)
     assert len(points) == np.isfinite(frame.depth).sum()
     xyz = np.stack([points[k] for k in "xyz"], 1).astype(float)
     at = sensor_scenes.AHEAD[:3] + frames.rotate(sensor_scenes.AHEAD[3:], xyz)
@@ -164,7 +164,7 @@ def test_things_cast_shadows_that_follow_them() -> None:
 
     def ground(x: float, y: float, time: float) -> float:
         local = frames.rotate(frames.conjugate(pose[3:]), np.array([x, y, 0.0]) - pose[:3])
-        u, v = np.round(point_cloud.project_points(local, sensor_scenes.SMALL)).astype(int)
+        u, v = np.round(project_points(local, sensor_scenes.SMALL)).astype(int)
         return float(camera.render(primitives, pose, time).rgb[v - 2 : v + 3, u - 2 : u + 3].mean())
 
     lit, dark = ground(1.3, 0.55, 0.0), ground(1.3, 0.15, 0.0)

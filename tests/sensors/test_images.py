@@ -11,11 +11,6 @@ from vinesim.sensors.export import images
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
-def test_depth_in_millimetres() -> None:
-    depth = np.array([[1.2345, np.nan, np.inf], [-np.inf, 0.0004, 70.0]], np.float32)
-    assert images.depth_millimetres(depth).tolist() == [[1234, 0, 0], [0, 0, 0]]
-
-
 def test_looking_is_level_and_right_handed() -> None:
     pose = images.look_at(np.array([1.0, 2.0, 1.0]), np.array([1.0, 5.0, 1.0]))
     from vinesim import frames

@@ -8,9 +8,9 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim import frames
 from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
+from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame, CameraInfo, RigidVisual
-from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
@@ -293,13 +293,13 @@ def test_flow_of_a_moved_camera_lands_on_the_same_points(grove) -> None:
     ground = one.primitive == -2
     ray = frames.rotate(one.pose[3:], sensor_scenes.pixel_rays(NEAR)[ground])
     at = one.pose[:3] - ray * (one.pose[2] / ray[:, 2:])
-    image = point_cloud.project_points(frames.rotate(frames.conjugate(two.pose[3:]), at - two.pose[:3]), NEAR)
+    image = project_points(frames.rotate(frames.conjugate(two.pose[3:]), at - two.pose[:3]), NEAR)
     row, column = np.nonzero(ground)
     near = one.depth[ground] < 20.0
     assert np.abs(image - np.stack([column, row], 1) - shift[ground])[near].max() < 1e-3
 
 
-def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
+def test_flow_of_a_moved_plant_is_its_motion_alone(grove) -> None:
     model, _, view = grove
     primitives, bunch = Primitives(model, grass=0.0), 22
     pose = _before(model, view, bunch)
@@ -322,7 +322,7 @@ def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
     moved = hub + frames.rotate(turn, point - hub)
     local = frames.rotate(frames.conjugate(pose[3:]), moved - pose[:3])
     row, column = np.nonzero(mine)
-    assert np.abs(point_cloud.project_points(local, NEAR) - np.stack([column, row], 1) - shift[mine]).max() < 5e-3
+    assert np.abs(project_points(local, NEAR) - np.stack([column, row], 1) - shift[mine]).max() < 5e-3
     still = ~carried & np.isfinite(one.depth)
     assert still.sum() > 1000
     assert np.abs(shift[still]).max() < 1e-6
@@ -343,7 +343,7 @@ def test_depth_and_lidar_measure_the_same_scene(grove) -> None:
     fine = CameraInfo(1280, 960, 1000.0, 1000.0, 639.5, 479.5, "optical")
     seen = truth.render_buffers(primitives, fine, pose)
     local = frames.rotate(frames.conjugate(pose[3:]), scan.xyz.astype(float))
-    pixel = np.round(np.nan_to_num(point_cloud.project_points(local, fine), nan=-1.0)).astype(int)
+    pixel = np.round(np.nan_to_num(project_points(local, fine), nan=-1.0)).astype(int)
     inside = ((pixel >= 0) & (pixel < [fine.width, fine.height])).all(1) & (local[:, 2] < 4.0)
     row, column = pixel[inside, 1], pixel[inside, 0]
     same = seen.labels[row, column] == scan.labels[inside]

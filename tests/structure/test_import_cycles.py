@@ -1,4 +1,7 @@
-"""No cycle in the graph of modules: what a module needs at import, for types, or in a function never needs it back."""
+"""No cycle in the graph of modules: what a module imports, at its top or in a function, never imports it back.
+
+Imports under ``if TYPE_CHECKING`` are left out: they only name the types of arguments.
+"""
 
 import ast
 import pathlib
@@ -9,7 +12,16 @@ ROOT = pathlib.Path(__file__).parents[2]
 def imports_of(path: pathlib.Path, modules: set[str]) -> set[str]:
     """Modules of the package that one file imports, wherever in the file."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    only_types = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in ast.walk(block)
+    }
+    for node in ast.walk(tree):
+        if id(node) in only_types:
+            continue
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -18,11 +30,12 @@ def imports_of(path: pathlib.Path, modules: set[str]) -> set[str]:
 
 
 def module_graph() -> dict[str, set[str]]:
+    """Imports of all modules; not of ``vinesim`` itself, whose names of the public API are only loaded when used."""
     files = {
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
         for path in sorted((ROOT / "vinesim").rglob("*.py"))
     }
-    return {name: imports_of(path, set(files)) - {name} for name, path in files.items()}
+    return {name: imports_of(path, set(files)) - {name} if name != "vinesim" else set() for name, path in files.items()}
 
 
 def cycles(graph: dict[str, set[str]]) -> list[list[str]]:

@@ -15,14 +15,6 @@ MAX_FUNCTION_LINES = 80
 """Without the docstring."""
 
 KNOWN = {
-    "kernels/raster/camera_raster_plants.py": 2,
-    "kernels/raster/lidar_raster.py": 1,
-    "kernels/raster/pose_clusters.py": 1,
-    "kernels/sensing/lidar_echoes.py": 1,
-    "kernels/sensing/stereo_depth.py": 1,
-    "kernels/shading/deferred.py": 1,
-    "kernels/shading/materials.py": 1,
-    "kernels/shading/shadow_maps.py": 1,
     "net/codec/messages.py": 1,
     "net/replication/exchange.py": 1,
     "net/transport/zenoh_bus.py": 1,

@@ -20,7 +20,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import Measurement, RigidVisual, Shape, Snapshot
+from vinesim.scene.values import CameraFrame, Measurement, RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import depth_colours, look_at, write_png
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
@@ -36,7 +36,7 @@ VIEWS_PER_RANGE = 8
 """Bunches that are looked at from each of the ranges."""
 LIDARS = ("vlp16", "os1_64")
 MIXED_RETURN_ERROR = 0.05
-"""A lidar's echo counts as mixed if it lies farther than this from what the middle of its beam meets [m]."""
+"""A return counts as mixed if its range differs by more than this [m] from the hit of the beam's axis."""
 SEED = 7
 RENDERER_VIEW = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
 """Where renderers are compared: from, to [m]."""
@@ -65,6 +65,12 @@ def depth_noise_formula(spec: CameraSpec, depth: np.ndarray) -> np.ndarray:
     return np.asarray(depth) ** 2 * spec.stereo.noise.value / (spec.stereo.focal.value * spec.stereo.baseline.value)
 
 
+def _exact_depth(frame: CameraFrame) -> np.ndarray:
+    """[height, width] m"""
+    assert frame.exact_depth is not None
+    return frame.exact_depth
+
+
 def measure_plane(spec: CameraSpec) -> DepthStatistics:
     """Frontal, grey, lit by the sun."""
     found = DepthStatistics()
@@ -78,8 +84,9 @@ def measure_plane(spec: CameraSpec) -> DepthStatistics:
         primitives.update(snapshot)
         camera = Camera(spec, spec.info("optical"), seed=SEED, image_index=number)
         frame = camera.render(primitives, look_at(np.array([0, 0, 1.0]), np.array([1.0, 0, 1.0])))
-        mine = (frame.labels // LABEL_STRIDE == int(Organ.ROBOT)) & (frame.exact_depth < 1.1 * away)
-        found.add(away, frame.exact_depth[mine], frame.depth[mine])
+        exact = _exact_depth(frame)
+        mine = (frame.labels // LABEL_STRIDE == int(Organ.ROBOT)) & (exact < 1.1 * away)
+        found.add(away, exact[mine], frame.depth[mine])
     return found
 
 
@@ -93,11 +100,11 @@ def measure_plants(
     for away in RANGES:
         for _ in range(VIEWS_PER_RANGE):
             frame = camera.render(primitives, _towards_a_bunch(rng, model, snapshot, away))
-            organ = frame.labels // LABEL_STRIDE
+            organ, exact = frame.labels // LABEL_STRIDE, _exact_depth(frame)
             for name, number in (("leaves", Organ.LEAF), ("bunches", Organ.BUNCH)):
                 for at in RANGES:
-                    mine = (organ == int(number)) & (np.abs(frame.exact_depth / at - 1.0) < 0.1)
-                    seen.setdefault((name, at), []).append((frame.exact_depth[mine], frame.depth[mine]))
+                    mine = (organ == int(number)) & (np.abs(exact / at - 1.0) < 0.1)
+                    seen.setdefault((name, at), []).append((exact[mine], frame.depth[mine]))
     found = {"leaves": DepthStatistics(), "bunches": DepthStatistics()}
     for (name, at), parts in seen.items():
         exact, measured = (np.concatenate(column) for column in zip(*parts, strict=True))

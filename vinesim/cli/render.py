@@ -1,4 +1,4 @@
-"""``vinesim render``: one picture of a scene from one place, and all that is true of it."""
+"""``vinesim render``: one picture of a scene with its ground truth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def run(
     hour: float | None = None,
     renderer: str = "warp",
 ) -> int:
-    """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
+    """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
+    from vinesim.scene.camera_geometry import depth_millimetres
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
     from vinesim.scene.spec import load_scene, with_seed
@@ -68,8 +69,8 @@ def run(
     frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
-        "depth": picture.depth_millimetres(frame.exact_depth),
-        "measured": picture.depth_millimetres(frame.depth),
+        "depth": depth_millimetres(frame.exact_depth),
+        "measured": depth_millimetres(frame.depth),
         "labels": formats.encode_labels(frame.labels),
         "overlay": formats.draw_overlay(frame.rgb, truths),
     }
@@ -92,7 +93,7 @@ def run(
 
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:
-    """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
+    """The actors and crates of ``--robot``, ``--person`` and ``--crate``; :class:`UsageError` if one is wrong."""
     from vinesim.client.composition.composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
     from vinesim.robot.description.loader import load_description
     from vinesim.scene import appearance
@@ -102,7 +103,7 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
         name, mark, where = text.rpartition("@")
         if not (mark and name):
             raise UsageError(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
-        load_description(name)  # says what is wrong with it
+        load_description(name)  # raises DescriptionError
         placed_robots.append(RobotPlacement(name, *_parse_place("--robot", where, 3)))
     for text in people:
         parts = text.split(",")

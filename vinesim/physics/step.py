@@ -62,21 +62,15 @@ class Physics:
         p = parameters
         self.model, self.parameters, self.dt = model, p, p.dt
         self.state = State.at_rest(model)
-        self.plants = ArticulationSolver(
-            model, self.state, dt=p.dt, phi=p.phi, device=device, threads=threads, fast_rate=p.fast_joint_rate,
-            max_rate=p.max_joint_rate, fault_rate=p.fault_joint_rate,
-        )  # fmt: skip
+        self.plants = ArticulationSolver(model, self.state, p, device=device, threads=threads)
         self.rigid = RigidWorld(model, parameters=p)
         self.contact_solver = ContactSolver(model, self.plants, self.rigid)
-        self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver)
+        self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
-        self.level_of_detail = LevelOfDetail(
-            self.plants, linger=p.steps(p.detail_duration), quiet=p.detail_rate,
-            patience=p.steps(p.detail_rest_duration),
-        )  # fmt: skip
-        self.sleep_monitor = SleepMonitor(self.plants, quiet=p.sleep_rate, patience=p.steps(p.sleep_duration))
+        self.level_of_detail = LevelOfDetail(self.plants, p)
+        self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """The wind, None for calm; may be set at any time between steps."""
@@ -122,7 +116,7 @@ class Physics:
         if self.wind is not None:
             actors = [self.rigid.actor_position(name) for name in self.rigid.actors]
             observers = (np.array(actors), self.parameters.wind_radius) if actors else None
-            self.wind.update(self.plants, self.time, observers)
+            self.wind.update(self.plants, self.time, observers, self.parameters)
 
     def _refine_bunches(self) -> None:
         self.level_of_detail.update(self.contact_solver.near_trees)

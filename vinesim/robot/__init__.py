@@ -1,1 +1,1 @@
-"""Robots: descriptions, drives and motions."""
+"""Robots: descriptions, drives, controllers and tasks."""

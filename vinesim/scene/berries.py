@@ -87,7 +87,7 @@ def hull_size(count: np.ndarray, seed: np.ndarray) -> np.ndarray:
     return np.stack([_tables()[0][which, count], _tables()[1][which]], -1)
 
 
-def segment_of(position: np.ndarray, length: float, pieces: int) -> np.ndarray:
+def segment_of(position: np.ndarray, length: float | np.ndarray, pieces: int | np.ndarray) -> np.ndarray:
     """Which of the equal pieces of a rachis of this length points [..., 3] belong to; 0 is at the peduncle."""
     return np.clip((position[..., 0] * (pieces / length)).astype(int), 0, pieces - 1)
 

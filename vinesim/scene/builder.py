@@ -1,8 +1,8 @@
-"""Beams to bodies: how a piece of wood becomes mass, inertia and joint springs, and pieces become a :class:`Model`.
+"""Rods to bodies: how a segment of a rod gets its mass, inertia and joint springs, and trees become a :class:`Model`.
 
-A piece of length h bends by half on either side of its middle, each half a spring 2EI/h. A joint is the two halves that
-meet there, one after the other: EI/h in a rod, 2EI/h at a clamp, which has no half (with EI/h the tip is 12.8 % off),
-and where unlike pieces meet what lies between.
+A segment of length h bends by half on either side of its middle, each half a spring 2EI/h. A joint is the two halves that
+meet there in series: EI/h within a rod, 2EI/h at a clamp, which adds no half (with EI/h the tip is 12.8 % off), and
+between unlike segments what their halves give in series.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 MAX_CLUSTERS = 8
-"""Most berry clusters of a bunch."""
+"""Largest number of berry clusters of a bunch."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RodMaterial:
-    """Material of a rod."""
+    """Linear elastic material of a rod, with damping proportional to stiffness."""
 
     modulus: float
-    """Flexural modulus E [Pa]."""
+    """Young's modulus E of bending [Pa]."""
     density: float
     """[kg/m^3]"""
     damping: float = 0.0
@@ -41,28 +41,29 @@ class RodMaterial:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class BunchSegments:
-    """Bunches [n] cut across their rachis into a chain of pieces of equal length: the head first, then clusters.
+    """Bunches [n] cut across their rachis into a chain of segments of equal length: the head first, then clusters.
 
-    Frames stand on the rachis where a piece begins, axes as the bunch's.
+    The frame of a segment is on the rachis where the segment begins, with the axes of the bunch. ``max`` is the largest
+    count of all bunches; rows of a bunch beyond its own count are zero.
     """
 
     count: np.ndarray
-    """[n] pieces; fields are zero behind the last."""
+    """[n] segments of each bunch."""
     length: np.ndarray
-    """[n] of one piece [m]"""
+    """[n] m, of one segment."""
     mass: np.ndarray
-    """[n, most]"""
+    """[n, max] kg"""
     com: np.ndarray
-    """[n, most, 3]"""
+    """[n, max, 3] m, centre of mass in the segment's frame."""
     inertia: np.ndarray
-    """[n, most, 3]"""
+    """[n, max, 3] kg m^2, principal moments about the centre of mass."""
     radius: np.ndarray
-    """[n, most, 2] of the bunch's hull where a piece begins and ends."""
+    """[n, max, 2] m, of the bunch's hull where a segment begins and ends."""
     stiffness: np.ndarray
-    """[n, most, 3] of the joint where a piece begins; the head's is the peduncle's."""
+    """[n, max, 3] N m/rad, of the joint where a segment begins; the head's is the peduncle's."""
 
     def compound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mass [n], centre of mass [n, 3] and moments of inertia [n, 3] of whole bunches, in the head's frame."""
+        """Mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, in the head's frame."""
         along = self.length[:, None] * np.arange(self.mass.shape[1])
         centre = self.com + along[..., None] * [1.0, 0.0, 0.0]
         mass = self.mass.sum(1)
@@ -77,7 +78,17 @@ def segment_bunches(
     mass: np.ndarray, length: np.ndarray, radius: np.ndarray, berry_count: np.ndarray, seed: np.ndarray,
     rachis: plant_parameters.Rachis, stem_share: float,
 ) -> BunchSegments:  # fmt: skip
-    """Cut bunches [n] into pieces that weigh what their own berries and stems weigh; four clusters to eight."""
+    """Cut bunches [n] into segments that weigh what their own berries and stems weigh: a head and four to eight clusters.
+
+    Args:
+        mass: [n] kg.
+        length: [n] m, of the hull.
+        radius: [n] m, of the hull.
+        berry_count: [n].
+        seed: [n], which prototype of :mod:`vinesim.scene.berries`.
+        rachis: parameters of the stem inside the bunch.
+        stem_share: share of the mass that is stem.
+    """
     count = np.clip(np.round(length / rachis.piece.value).astype(int), 5, 1 + MAX_CLUSTERS)
     share, com, inertia = berries.mass_by_segment(berry_count, seed, count)
     number = np.arange(share.shape[1])
@@ -107,13 +118,13 @@ def segment_bunches(
 
 
 class TreeBuilder:
-    """One tree while it grows: a list of bodies, parents before children. Bodies are numbered from 0, the root.
+    """Builds one tree: a list of bodies, parents before children, numbered from 0, the root.
 
-    Berry clusters stand apart: :func:`assemble` numbers them behind all other bodies of their tree.
+    Berry clusters are listed apart: :func:`assemble` numbers them behind all other bodies of their tree.
     """
 
     def __init__(self, pose: np.ndarray, vine: int = -1) -> None:
-        """``pose`` [7]: where the root's joint frame sits in the world."""
+        """``pose`` [7]: the root's joint frame in the world; ``vine``: number of the vine, -1 for none."""
         self.pose = np.asarray(pose, float)
         self.vine = vine
         self.bodies: list[dict[str, Any]] = []
@@ -125,7 +136,11 @@ class TreeBuilder:
     def add_body(
         self, parent: int, *, offset: Any = (0.0, 0.0, 0.0), rest: Any = frames.IDENTITY, **fields: Any
     ) -> int:
-        """Append one body with explicit :class:`Model` fields (names without prefix); returns its number."""
+        """Append one body with explicit :class:`Model` fields (names without prefix) and return its number.
+
+        ``offset`` [3] m and ``rest`` [4] place its joint in the frame of ``parent`` (-1: the world's root frame).
+        :class:`ValueError` if the parent is not in the list yet.
+        """
         if not -1 <= parent < len(self.bodies):
             raise ValueError(f"body {len(self.bodies)} names parent {parent}, which does not stand before it")
         self.bodies.append(
@@ -146,16 +161,26 @@ class TreeBuilder:
         rest: Any = frames.IDENTITY,
         bends: np.ndarray | None = None,
     ) -> list[int]:
-        """Grow a (tapered) rod of ``pieces`` bodies and return their numbers.
+        """Append a (tapered) round rod as a chain of ``segments`` bodies and return their numbers.
 
-        ``rest`` turns the first piece against the parent, ``bends`` [pieces, 4] each piece against the one before.
-        ``offset`` is the joint in the parent's frame, the parent's tip unless given. The first joint is half a piece
-        of this rod and what of the parent, if that is a piece of a rod, lies between its middle and the joint; damping
-        is each wood's in its share.
+        The first joint is half a segment of this rod in series with what of the parent, if that is a segment of a rod,
+        lies between its middle and the joint; each part damps with its own material. :class:`ValueError` if a number is
+        not positive.
+
+        Args:
+            parent: body that it grows on, -1 for a rod clamped at the root frame.
+            length: [m].
+            radius: [m] at the base and at the tip.
+            material: of the whole rod.
+            segments: number of bodies.
+            organ: what the rod is.
+            offset: [3] m, the joint in the parent's frame; the parent's tip unless given.
+            rest: [4] rotation of the first segment against the parent.
+            bends: [segments, 4] rotation of each segment against the one before; straight unless given.
         """
         if length <= 0.0 or min(radius) <= 0.0 or segments < 1 or material.modulus <= 0.0 or material.density <= 0.0:
             raise ValueError(
-                f"rod of length {length} m, radius {radius} m, {segments} pieces, {material}: all must be positive"
+                f"rod of length {length} m, radius {radius} m, {segments} segments, {material}: all must be positive"
             )
         h = length / segments
         edges = radius[0] + (radius[1] - radius[0]) * np.arange(segments + 1) / segments
@@ -210,11 +235,23 @@ class TreeBuilder:
         parameters: plant_parameters.VineParameters | None = None,
         **fields: Any,
     ) -> int:
-        """Hang a bunch of ``count`` berries on a piece of peduncle and return its body's number.
+        """Hang a bunch on a segment of peduncle and return the number of its body.
 
-        It has the size that its berries need, and unless told otherwise clusters, and the joint of the piece it hangs
-        on. ``parts`` gives the rachis (``data/plants/vine.toml`` unless given); ``fields`` are further ``bunch_``
-        fields of the :class:`Model`.
+        Its size follows from its mass and its berries.
+
+        Args:
+            parent: the last segment of the peduncle.
+            mass: [kg].
+            count: number of berries, 1 to 140.
+            seed: which prototype of :mod:`vinesim.scene.berries`.
+            variety: index into :data:`vinesim.scene.berries.VARIETIES`.
+            rest: [4] rotation against the parent.
+            offset: [3] m, its joint in the parent's frame; the parent's tip unless given.
+            stiffness: [3] N m/rad of its joint; the parent's unless given.
+            damping: [3] N m s/rad of its joint; the parent's unless given.
+            clusters: whether it can be refined into berry clusters.
+            parameters: of the rachis; ``data/plants/vine.toml`` unless given.
+            **fields: further ``bunch_`` fields of the :class:`Model`.
         """
         parameters = plant_parameters.load_plant("vine") if parameters is None else parameters
         above = self.bodies[parent]
@@ -223,8 +260,9 @@ class TreeBuilder:
         size = berry.volume_radius * np.cbrt(mass * (1.0 - share) / (count * berry.mass))
         length, radius = berries.hull_size(np.array(count), np.array(seed)) * size
         one = segment_bunches(
-            *(np.array([value]) for value in (mass, length, radius, count, seed)), parameters.rachis, share
-        )
+            np.array([mass]), np.array([length]), np.array([radius]), np.array([count]), np.array([seed]),
+            parameters.rachis, share,
+        )  # fmt: skip
         whole, com, inertia = (value[0] for value in one.compound())
         offset = (above["length"], 0.0, 0.0) if offset is None else offset
         body = self.add_body(
@@ -254,7 +292,7 @@ class TreeBuilder:
         return body
 
     def solve_rest_pose(self) -> None:
-        """Choose rest rotations so that the shape drawn so far is the equilibrium under gravity: see :func:`settle`."""
+        """Choose rest rotations so that the shape drawn so far is in equilibrium: see :func:`solve_rest_pose`."""
         model = solve_rest_pose(assemble([self]))
         for body, rest, settled in zip(
             [*self.bodies, *self.clusters], model.body_rest, model.joint_settled, strict=True
@@ -270,10 +308,18 @@ def segment_properties(
     density: float,
     shear: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Mass [...] and moments of inertia [..., 3] of rod pieces with radii start and end [m], and the springs [..., 3]
-    N m/rad of their halves near the start and far from it: twist, and bending by two axes.
+    """Mass [...] kg, moments of inertia [..., 3] kg m^2 and half springs of tapered round segments of a rod.
 
-    Each half is taken to have the section at its end of the piece, where joints sit.
+    The half springs are [..., 3] N m/rad each, near the start and far from it: twist, and bending by two axes. Each half
+    has the cross-section at its end of the segment, where the joints are.
+
+    Args:
+        length: [...] m.
+        start: [...] m, radius where a segment begins.
+        end: [...] m, radius where it ends.
+        modulus: [...] Pa, Young's modulus.
+        density: [kg/m^3].
+        shear: shear modulus [Pa]; Young's modulus / 2.6 unless given.
     """
     length, start, end, modulus = np.broadcast_arrays(length, start, end, modulus)
     middle = 0.5 * (start + end)
@@ -290,11 +336,12 @@ def segment_properties(
 
 
 def solve_rest_pose(model: Model) -> Model:
-    """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is the equilibrium.
+    """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is in equilibrium.
 
-    The spring must carry the weight hanging below each joint, so it is turned by theta = torque / stiffness (in joint
-    axes), and ``joint_settled`` turns it back: drawn = rest * settled. Writes both fields and returns the model.
-    A bunch with clusters weighs what its head and they weigh.
+    Each spring must carry the weight that hangs below its joint, so its slack axes are turned by theta = torque / stiffness
+    (in joint axes), and ``joint_settled`` turns them back: drawn = rest * settled. Writes both fields of the model and
+    returns it. The weight of a bunch with clusters is that of its head and its clusters. :class:`ValueError` if a
+    joint has no stiffness.
     """
     if not (model.joint_stiffness > 0.0).all():
         body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
@@ -328,7 +375,7 @@ def solve_rest_pose(model: Model) -> Model:
 
 
 def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
-    """One :class:`Model` of all trees; ``others`` are whole arrays of the rest (``fixed_start=...``)."""
+    """One :class:`Model` of all trees, in their order; ``others`` are arrays of its further fields (``fixed_start=...``)."""
     counts = {
         "tree": len(trees),
         "body": sum(len(t.bodies) + len(t.clusters) for t in trees),

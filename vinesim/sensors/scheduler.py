@@ -1,8 +1,8 @@
-"""The thread that sees: takes the newest view of the world, renders what somebody wants, drops what comes too late.
+"""The sensing thread: it takes the latest snapshot, renders the sensors that are due, and drops what is late.
 
-Physics calls :meth:`SensorScheduler.submit` every tick and never waits. Warp's launches release the interpreter lock, so a frame
-costs the physics thread the other core, not its tick. A camera takes a frame at once; a lidar fires at every view the
-shots whose time has come, and delivers a revolution when its last shot is fired.
+Physics calls :meth:`SensorScheduler.submit` every step and never waits. Warp's launches release the interpreter lock, so
+rendering costs the physics thread the other core, not its step. A camera renders a whole frame at once. A lidar fires at
+every snapshot the shots that are due, and delivers a revolution after its last shot.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from typing import Protocol
 
 import numpy as np
 import warp as wp
@@ -31,11 +30,11 @@ from vinesim.sensors.scene.primitives import Primitives
 log = logging.getLogger(__name__)
 
 _MAX_PENDING_POSES = 1024
-"""Poses of a lidar that wait for the thread; more than it ever needs."""
+"""Lidar poses that may wait for the thread; more than it ever needs."""
 
 
 def load_kernels() -> None:
-    """Compile what pictures and scans need, or read it from the cache, before anybody waits for one."""
+    """Compile the kernels of cameras and lidars, or read them from the cache, before the first frame is due."""
     for module in (
         pose_clusters,
         camera_raster,
@@ -49,22 +48,20 @@ def load_kernels() -> None:
         wp.load_module(module, device="cpu")
 
 
-class DemandQuery(Protocol):
-    """Whether anybody listens to a sensor now."""
-
-    def __call__(self) -> bool: ...
+DemandQuery = Callable[[], bool]
+"""Whether a sensor's output is wanted now."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ScheduledSensor:
-    """One sensor and its listener."""
+    """One sensor, the callback for its output, and whether that is wanted."""
 
     sensor: Camera | Lidar
     deliver: Callable[[CameraFrame | LidarScan], None]
     """Called in the sensing thread with every frame or scan."""
     is_wanted: DemandQuery = lambda: True
     is_depth_wanted: DemandQuery = lambda: True
-    """Of a camera: whether anybody looks at its depth, too."""
+    """Of a camera: whether its measured depth is wanted."""
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
 
@@ -75,7 +72,7 @@ class ScheduledSensor:
 
 
 class SensorScheduler:
-    """All sensors of one client in one thread. Use as a context manager, or :meth:`start` and :meth:`stop`."""
+    """Renders all sensors of one client in one thread. Use as a context manager, or :meth:`start` and :meth:`stop`."""
 
     def __init__(
         self,
@@ -111,14 +108,14 @@ class SensorScheduler:
     def start(self) -> SensorScheduler:
         """Start the thread."""
         if self._thread is not None:
-            raise RuntimeError("these eyes are open already; stop them first")
+            raise RuntimeError("the sensing thread runs already; stop it first")
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="eyes", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="sensors", daemon=True)
         self._thread.start()
         return self
 
     def stop(self, timeout: float = 10.0) -> None:
-        """End the thread after the frame it is at; raises what went wrong in it, once."""
+        """End the thread after its present frame; raises RuntimeError with the failure of the thread, once."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
@@ -140,7 +137,7 @@ class SensorScheduler:
                 raise
 
     def submit(self, snapshot: Snapshot, poses: Mapping[str, np.ndarray]) -> None:
-        """Offer the newest view with the world pose [7] of each sensor (optical frame of a camera). Never waits."""
+        """Submit the latest snapshot and the world pose [7] of each sensor (optical frame of a camera). Never waits."""
         self._raise()
         with self._condition:
             self._latest = (snapshot, poses)
@@ -169,6 +166,7 @@ class SensorScheduler:
                     self._condition.wait_for(lambda: self._stopping or self._latest is not None)
                     if self._stopping:
                         return
+                    assert self._latest is not None
                     (snapshot, poses), self._latest = self._latest, None
                     moved += self._moved_trees
                     self._moved_trees = []
@@ -181,37 +179,37 @@ class SensorScheduler:
                     continue
                 self.primitives.update(snapshot, np.concatenate(moved) if moved else np.zeros(0, np.int64))
                 moved = []
-                for sensor in due:
+                for scheduled in due:
                     if self._stopping:
                         return
-                    for result in self._results(sensor, snapshot.time, poses[sensor.name]):
-                        sensor.deliver(result)
-                        self.frames[sensor.name] += 1
-        except BaseException as failure:  # surfaced by the next see() or stop()
+                    for result in self._results(scheduled, snapshot.time, poses[scheduled.name]):
+                        scheduled.deliver(result)
+                        self.frames[scheduled.name] += 1
+        except BaseException as failure:  # raised by the next submit() or stop()
             log.exception("the sensing thread stops")
             self.failure = failure
 
-    def _results(self, sensor: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
-        """What a sensor has to deliver at simulation time ``now``."""
-        if isinstance(sensor.sensor, Camera):
-            yield sensor.sensor.render(self.primitives, pose, now, measure_depth=sensor.is_depth_wanted())
+    def _results(self, scheduled: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
+        """Render what a sensor has to deliver at simulation time ``now`` [s]."""
+        if isinstance(scheduled.sensor, Camera):
+            yield scheduled.sensor.render(self.primitives, pose, now, measure_depth=scheduled.is_depth_wanted())
             return
-        scan = self._scans[sensor.name]
+        scan = self._scans[scheduled.name]
         missed = scan.dropped
         yield from scan.advance(self.primitives, now)
-        self.dropped[sensor.name] += scan.dropped - missed
+        self.dropped[scheduled.name] += scan.dropped - missed
 
-    def _is_due(self, sensor: ScheduledSensor, now: float, poses: Mapping[str, np.ndarray]) -> bool:
-        """Whether a sensor has something to do at simulation time ``now``; counts the frames it has missed."""
-        name = sensor.name
-        if name not in poses or not sensor.is_wanted():
-            self._next_time[name] = -np.inf  # whoever comes back is served at once, and missed nothing
+    def _is_due(self, scheduled: ScheduledSensor, now: float, poses: Mapping[str, np.ndarray]) -> bool:
+        """Whether a sensor has something to render at simulation time ``now`` [s]; counts the frames it has missed."""
+        name = scheduled.name
+        if name not in poses or not scheduled.is_wanted():
+            self._next_time[name] = -np.inf  # a subscriber that returns gets a frame at once, and missed none
             if name in self._scans:
                 self._scans[name].cancel(now)
             return False
         if name in self._scans:
             return self._scans[name].is_due(now)
-        due, period = self._next_time[name], 1.0 / (sensor.rate or sensor.sensor.rate)
+        due, period = self._next_time[name], 1.0 / (scheduled.rate or scheduled.sensor.rate)
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf
         if now < due - 1e-6:

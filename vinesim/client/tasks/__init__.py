@@ -1,1 +1,1 @@
-"""What a robot of a client does: tasks, their planning, start poses."""
+"""Tasks of a robot client, their planning, start poses, and the handler of ROS commands."""

@@ -1,67 +1,69 @@
-"""What a picking robot had better do: which bunch, from where, into which box, and along which way.
+"""Planning of picks: which bunch, from which base pose, into which box, and along which path.
 
-All of it is geometry of the model at rest: what hangs free, where a base has room, and what lies between.
+All of it is geometry of the model at rest: clearances of bunches, room for the base, paths on the ground.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import heapq
 from collections.abc import Iterator
 
 import numpy as np
 
 from vinesim import frames
+from vinesim.client.tasks.path_planning import find_path
 from vinesim.client.tasks.start_poses import PlacementError, bunch_centres, ground_clearance
 from vinesim.robot.tasks.pick import PickPlan
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
 BUNCH_AHEAD, BUNCH_ASIDE = 0.88, 0.28
-"""Where a bunch hangs that an arm picks, in the base's axes [m]: ahead, and on the arm's side."""
+"""[m] Position of the bunch in the base's frame at the pick: ahead, and to the arm's side."""
 HAND_LOWER, HAND_UPPER = np.array([-0.45, -0.11, -0.05]), np.array([0.06, 0.11, 0.09])
-"""What an open hand sweeps about the place where it holds a bunch [m]; x along the hand, z up."""
+"""[m] Corners of the box that an open hand sweeps about the grasp; x along the hand, z up."""
 GRASP_HEIGHT = (1.3, 1.75)
-"""[m] Where a bunch is held that arm and lift reach with the hand level."""
+"""[m] Heights of the grasp that arm and lift reach with the hand level."""
 MAX_BUNCH_RADIUS = 0.060
-"""Largest radius of a bunch that fits between the fingers [m]."""
+"""[m] Largest radius of a bunch that fits between the fingers."""
 GRASP_DEPTH = 0.06
-"""A bunch is held about so far below its upper end [m]."""
+"""[m] Approximate distance of the grasp below the upper end of a bunch."""
 MIN_HAND_CLEARANCE = 0.005
-"""Least gap between the hand on its way and what does not belong to its bunch [m]."""
+"""[m] Smallest gap between the moving hand and anything but its bunch. GUESSED"""
 FULL_CLEARANCE = 0.03
-"""A wider gap than this is no better [m]."""
+"""[m] Wider gaps score no better. GUESSED"""
 BASE_CLEARANCE = 0.68
-"""A base with an arm tucked in needs this much around its middle [m]."""
+"""[m] A base with its arms tucked needs this distance around its centre."""
 BOX_AHEAD, BASE_HALF_WIDTH, BOX_GAP = 0.10, 0.35, 0.06
-"""How far before the base's middle a box stands beside it, half of the base's width, and between both [m]."""
+"""[m] Distance of a box ahead of the base's centre, half of the base's width, and the gap between both."""
 APPROACH_LENGTHS = (1.1, 0.8)
-"""The base comes straight along a box from so far [m]; the first that has room."""
+"""[m] Lengths of the straight approach along a box; the first for which there is room is taken."""
 LANE_HALF_WIDTH = 0.36
-"""What a base that goes straight needs on either side of its middle [m]."""
+"""[m] A base that drives straight needs this on either side of its centre."""
 OBSTACLE_RADIUS = 0.8
-"""What hangs nearer than this to a bunch may be in the hand's way [m]."""
+"""[m] Obstacles farther from a bunch than this cannot meet the hand."""
 MAX_CANDIDATES = 200
-"""So many of the nearest bunches are tried."""
-GRID_SIZE = 0.1
-"""[m] between the points of which a way is made."""
+"""Number of the nearest bunches that are tried."""
 
 
 def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
-    """Tasks that look feasible, the best first: bunches that hang freest, a little better if ``near`` [2] m."""
-    beside_boxes = list(box_approaches(model))
-    if not beside_boxes:
+    """Feasible plans, best first: bunches with most clearance, and among those nearer to ``near`` [2] m.
+
+    Raises :class:`PlacementError` if no box can be approached or no bunch can be picked.
+    """
+    approaches = list(box_approaches(model))
+    if not approaches:
         raise PlacementError(
             f"no box of this scene has {BASE_CLEARANCE} m of room beside it for a robot; place one in an alley"
         )
     found = False
-    for bunch, side, stand in _base_poses(model, near):
-        beside = [park for park in beside_boxes if park.side == side]
-        for park in sorted(beside, key=lambda park: float(np.linalg.norm(park.start - stand[:2]))):
-            points = find_path(model, stand[:2], park.start)
+    for bunch, side, base in _base_poses(model, near):
+        beside = [approach for approach in approaches if approach.side == side]
+        for approach in sorted(beside, key=lambda approach: float(np.linalg.norm(approach.start - base[:2]))):
+            points = find_path(model, base[:2], approach.start, BASE_CLEARANCE)
             if points is not None:
                 found = True
-                yield PickPlan(bunch, side, stand, park.box, np.concatenate([points[1:], [park.place]]), park.heading)
+                path = np.concatenate([points[1:], [approach.place]])
+                yield PickPlan(bunch, side, base, approach.box, path, approach.heading)
                 break
     if not found:
         raise PlacementError(
@@ -70,7 +72,7 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
 
 
 def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarray]]:
-    """Bunch, side and pose [7] of the base, those with most clearance first."""
+    """Bunch, side and pose [7] of the base for all reachable grasps, best first."""
     points, radius, owner = _obstacles(model)
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
@@ -115,7 +117,7 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
 
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Balls that fill wood and bunches at rest: points [n, 3] m, radii [n] m, and whose bunch each belongs to [n]."""
+    """Spheres that fill wood and bunches at rest: centres [n, 3] m, radii [n] m, and the bunch of each [n] or -1."""
     body_q = model.forward_kinematics(model.joint_settled).astype(float)
     owner = model.bunch_of_body()
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
@@ -139,7 +141,7 @@ def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @dataclasses.dataclass(frozen=True)
 class BoxApproach:
-    """Where a base stands with a box beside it, and from where it comes there straight."""
+    """A place of the base with a box beside it, and the start of the straight approach to it."""
 
     box: int
     side: str
@@ -152,7 +154,7 @@ class BoxApproach:
 
 
 def box_approaches(model: Model) -> Iterator[BoxApproach]:
-    """All places along the long sides of boxes that have room for a base and its way there."""
+    """All places along the long sides of boxes with room for a base and its approach."""
     for box, (pose, size) in enumerate(zip(model.box_pose.astype(float), model.box_size.astype(float), strict=True)):
         long = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]) if size[0] >= size[1] else np.array([0.0, 1.0, 0.0]))
         apart = BASE_HALF_WIDTH + BOX_GAP + 0.5 * float(size[:2].min())
@@ -167,54 +169,3 @@ def box_approaches(model: Model) -> Iterator[BoxApproach]:
                     if room > LANE_HALF_WIDTH and float(ground_clearance(model, start[None])[0]) > BASE_CLEARANCE:
                         yield BoxApproach(box, side, place, start, float(np.arctan2(ahead[1], ahead[0])))
                         break
-
-
-def find_path(model: Model, start: np.ndarray, goal: np.ndarray, room: float = BASE_CLEARANCE) -> np.ndarray | None:
-    """Points [n, 2] m of a short way with ``room`` [m] on either side, ends included; None if there is none.
-
-    A* on a grid (Hart, Nilsson and Raphael 1968), then every point is left out that a straight line makes needless.
-    """
-    low = np.minimum(start, goal) - 3.0
-    shape = tuple((np.ceil((np.maximum(start, goal) + 3.0 - low) / GRID_SIZE)).astype(int))
-    at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
-    free = (ground_clearance(model, low + GRID_SIZE * at) > room).reshape(shape)
-    first, last = (tuple(np.round((p - low) / GRID_SIZE).astype(int)) for p in (start, goal))
-    if not free[last] or float(ground_clearance(model, np.array([start]))[0]) < room:
-        return None
-    steps = [(i, j, float(np.hypot(i, j))) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
-    came: dict[tuple[int, int], tuple[int, int]] = {first: first}
-    cost = {first: 0.0}
-    queue = [(0.0, first)]
-    while queue:
-        _, here = heapq.heappop(queue)
-        if here == last:
-            break
-        for i, j, length in steps:
-            there = (here[0] + i, here[1] + j)
-            if not (0 <= there[0] < shape[0] and 0 <= there[1] < shape[1] and free[there]):
-                continue
-            price = cost[here] + length
-            if price < cost.get(there, np.inf):
-                cost[there], came[there] = price, here
-                ahead = float(np.hypot(there[0] - last[0], there[1] - last[1]))
-                heapq.heappush(queue, (price + ahead, there))
-    if last not in came:
-        return None
-    cells = [last]
-    while cells[-1] != first:
-        cells.append(came[cells[-1]])
-    points = [start, *(low + GRID_SIZE * np.array(cell) for cell in cells[-2:0:-1]), goal]
-    kept, i = [points[0]], 0
-    while i < len(points) - 1:
-        i = next(
-            j for j in range(len(points) - 1, i, -1) if j == i + 1 or _is_line_free(model, points[i], points[j], room)
-        )
-        kept.append(points[i])
-    return np.array(kept)
-
-
-def _is_line_free(model: Model, start: np.ndarray, end: np.ndarray, room: float) -> bool:
-    """Whether the straight line has room on either side."""
-    count = max(int(np.linalg.norm(end - start) / (0.5 * GRID_SIZE)), 2)
-    line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-    return bool((ground_clearance(model, line) > room - 0.5 * GRID_SIZE).all())

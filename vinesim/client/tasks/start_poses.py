@@ -1,4 +1,4 @@
-"""Where an actor starts, and what it can reach from there."""
+"""Start poses of actors, and the bunches that they can reach from there."""
 
 from __future__ import annotations
 
@@ -11,27 +11,30 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Spawn
 
 PUSH_REACH = (0.35, 0.85)
-"""How far a bunch may be ahead of a robot's base to be pushed by an arm [m]."""
+"""[m] Horizontal distances from the base at which an arm can push a bunch."""
 PUSH_HEIGHT = (1.2, 1.75)
-"""Height of a bunch's centre that an arm reaches [m]."""
+"""[m] Heights of a bunch's centre that an arm reaches."""
 
 
 BASE_CLEARANCE = 0.55
-"""A robot's base needs this much around its middle [m]."""
+"""[m] A robot's base needs this distance around its centre."""
 
 
 QUEUE_SPACING = 1.5
-"""Between robots of one client that wait behind one another [m]."""
+"""[m] Between robots of one client that start behind one another. GUESSED"""
 MAX_CANDIDATES = 200
-"""So many of the nearest bunches are tried."""
+"""Number of the nearest bunches that are tried."""
 
 
 class PlacementError(ValueError):
-    """A start place or a bunch that the scene does not have; the text says what it has."""
+    """The scene lacks the start place, bunch, box or room that was asked for; the text says what it has."""
 
 
 def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
-    """Pose [7] of a start place, moved backwards by ``back`` [m]; a line beside the vines if the scene names none."""
+    """Pose [7] of a start place, moved backwards by ``back`` [m]; on a line beside the vines if the scene names none.
+
+    Raises :class:`PlacementError` if the scene has no start place of that ``number``.
+    """
     if not scene.spawns:
         return frames.pose([-2.0 - back, 1.5 * number, 0.0])
     if number >= len(scene.spawns):
@@ -54,14 +57,17 @@ def with_start_pose(scene: Scene, x: float, y: float, yaw: float) -> Scene:
 
 
 def bunch_centres(model: Model) -> np.ndarray:
-    """Centres of all bunches at rest [bunch, 3] m."""
+    """Centres of all bunches at rest [bunch, 3] m, world."""
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     return body_q[:, :3] + 0.5 * model.bunch_length[:, None] * axis
 
 
 def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
-    """The bunch that an arm reaches best from a base at ``pose`` [7]: in front, at arm's height, nearest to 0.6 m."""
+    """The bunch that an arm reaches best from a base at ``pose`` [7]: ahead, at arm's height, nearest to 0.6 m.
+
+    Raises :class:`PlacementError` if there is none in reach.
+    """
     local = frames.rotate(frames.conjugate(pose[3:]), bunch_centres(model) - pose[:3])
     distance = np.hypot(local[:, 0], local[:, 1])
     sideways = np.abs(np.arctan2(local[:, 1], local[:, 0]))
@@ -82,16 +88,16 @@ def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
 
 
 def validate_bunch(model: Model, bunch: int | None) -> int | None:
-    """The bunch, if the vineyard has it."""
+    """The number ``bunch``, or None; :class:`PlacementError` if the vineyard has no such bunch."""
     if bunch is not None and not 0 <= bunch < len(model.bunch_body):
         raise PlacementError(f"no bunch {bunch}: this vineyard has 0 to {len(model.bunch_body) - 1}")
     return bunch
 
 
 def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
-    """Distance on the ground from points [n, 2] to the nearest post, trunk or box [n] m (infinite if there is none).
+    """Distance on the ground from points [n, 2] m to the nearest post, trunk or box [n] m; infinite without any.
 
-    ``without``: a box that does not count.
+    ``without``: number of a box that is left out.
     """
     solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
     room = np.full(len(points), np.inf)
@@ -107,7 +113,10 @@ def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> 
 
 
 def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
-    """A bunch that an arm can push, and a pose [7] of a base before it with room around; nearest to ``near`` [2]."""
+    """A bunch that an arm can push, and a pose [7] of the base for it with room around, nearest to ``near`` [2] m.
+
+    Raises :class:`PlacementError` if there is none.
+    """
     centres = bunch_centres(model)
     high = np.flatnonzero((centres[:, 2] > PUSH_HEIGHT[0]) & (centres[:, 2] < PUSH_HEIGHT[1]))
     high = high[np.argsort(np.linalg.norm(centres[high, :2] - near, axis=1), kind="stable")][:MAX_CANDIDATES]
@@ -127,7 +136,7 @@ def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.ndarray:
-    """A pose [7] 1.6 m from a robot at ``place`` [7], where a straight free way of ``length`` [m] ends."""
+    """A pose [7] 1.6 m from a robot at ``place`` [7] at the end of a free straight line of ``length`` [m]."""
     heading = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     best, most = place, -np.inf
     for side in heading:

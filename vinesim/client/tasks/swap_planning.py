@@ -1,24 +1,24 @@
-"""What a logistic robot had better do: which boxes to exchange, and along which ways; and a box to fill for a start."""
+"""Planning of box exchanges: paths between the boxes; and a box filled with bunches for the start."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from vinesim import frames
-from vinesim.client.tasks.pick_planning import find_path
+from vinesim.client.tasks.path_planning import find_path
 from vinesim.client.tasks.start_poses import PlacementError, ground_clearance
 from vinesim.physics.step import Physics
 from vinesim.robot.tasks.swap_boxes import SwapPlan
 from vinesim.scene.model import Model
 
 TURNING_RADIUS = 0.92
-"""A carrier with a box at either end needs this much around its middle to turn [m]."""
+"""[m] A carrier with a box at either end needs this distance around its centre to turn."""
 TURNING_DISTANCES = (1.20, 1.35, 1.50)
-"""It turns so far from the middle of a box [m]; the first that has room."""
+"""[m] Distances from the centre of a box at which it turns; the first with room is taken."""
 LANE_HALF_WIDTH = 0.40
-"""What it needs on either side of its middle as it goes straight [m]."""
+"""[m] It needs this on either side of its centre while it drives straight."""
 BUNCHES_PER_LAYER = 6
-"""Bunches that lie side by side in a box."""
+"""Bunches side by side in one layer of a filled box."""
 
 
 def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> SwapPlan:
@@ -58,9 +58,9 @@ def _turning_places(model: Model, box: int) -> list[np.ndarray]:
 
 
 def fill_box(physics: Physics, box: int, count: int = 6) -> None:
-    """Take ``count`` bunches off their vines and lay them into a box, in layers: a full box to begin with.
+    """Detach ``count`` bunches and put them into a box in layers, as the start of an exchange.
 
-    Between ticks. The bunches farthest from the box are taken, so that those around it still hang.
+    Call it between steps. The bunches farthest from the box are taken, so that those around it stay.
     """
     model = physics.model
     pose, size = model.box_pose[box].astype(float), model.box_size[box].astype(float)

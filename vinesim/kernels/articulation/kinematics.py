@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from vinesim.kernels.articulation.structs import ArticulationModel, BodyState, Factors, JointState
+from vinesim.kernels.articulation.structs import ArticulationModel, BodyState, JointState
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,33 +61,18 @@ def body_kinematics(
 
 
 @wp.func
-def propagate_kinematics(
-    model: ArticulationModel,
-    joints: JointState,
-    tree: int,
-    size: int,
-    bodies_out: BodyState,
-    factors_out: Factors,
-):
-    """From the root to the tips of one tree: pose and velocity of each body, its joint's axes and lever."""
-    first = model.tree_first[tree]
-    for k in range(first, first + size * model.pitch, model.pitch):
-        parent = model.body_parent[k]
-        above = model.tree_pose[tree]
-        motion = wp.spatial_vector()
-        if parent >= 0:
-            above = bodies_out.body_q[parent]
-            motion = bodies_out.body_qd[parent]
-        elif model.body_root[k] >= 0:
-            above = wp.transform(joints.joint_x[k], wp.quat_identity())
-            motion = wp.spatial_vector(joints.joint_xd[k], wp.vec3())
-        axes, lever, pose, velocity = body_kinematics(
-            above, motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
-        )
-        bodies_out.body_q[k] = pose
-        bodies_out.body_qd[k] = velocity
-        factors_out.axes[k] = axes
-        factors_out.lever[k] = lever
+def parent_kinematics(k: int, tree: int, model: ArticulationModel, joints: JointState, bodies: BodyState):
+    """Pose and velocity of what body k hangs on: its parent, the tree's pose, or nothing for a floating root."""
+    parent = model.body_parent[k]
+    pose = model.tree_pose[tree]
+    velocity = wp.spatial_vector()
+    if parent >= 0:
+        pose = bodies.body_q[parent]
+        velocity = bodies.body_qd[parent]
+    elif model.body_root[k] >= 0:
+        pose = wp.transform(joints.joint_x[k], wp.quat_identity())
+        velocity = wp.spatial_vector(joints.joint_xd[k], wp.vec3())
+    return pose, velocity
 
 
 @wp.kernel
@@ -110,15 +95,7 @@ def forward_kinematics(
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
     for k in range(first, first + model.tree_size[tree] * model.pitch, model.pitch):
-        parent = model.body_parent[k]
-        above = model.tree_pose[tree]
-        motion = wp.spatial_vector()
-        if parent >= 0:
-            above = bodies_out.body_q[parent]
-            motion = bodies_out.body_qd[parent]
-        elif model.body_root[k] >= 0:
-            above = wp.transform(joints.joint_x[k], wp.quat_identity())
-            motion = wp.spatial_vector(joints.joint_xd[k], wp.vec3())
+        above, motion = parent_kinematics(k, tree, model, joints, bodies_out)
         _axes, _lever, pose, velocity = body_kinematics(
             above, motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
         )

@@ -7,6 +7,15 @@ that loads lend to levers are implicit; :mod:`vinesim.kernels.articulation` stat
 
 import warp as wp
 
+from vinesim.kernels.articulation.contiguous import (
+    contiguous_bodies,
+    contiguous_factors,
+    contiguous_forces,
+    contiguous_joints,
+    contiguous_model,
+    contiguous_prediction,
+    contiguous_scratch,
+)
 from vinesim.kernels.articulation.forces import (
     drag_coefficient,
     residual_damping,
@@ -15,7 +24,7 @@ from vinesim.kernels.articulation.forces import (
     tension_stiffness,
     tie_force,
 )
-from vinesim.kernels.articulation.kinematics import max_joint_rate, propagate_kinematics
+from vinesim.kernels.articulation.kinematics import body_kinematics, max_joint_rate, parent_kinematics
 from vinesim.kernels.articulation.spatial import (
     cross_rows,
     logarithm,
@@ -96,19 +105,26 @@ def assemble_bodies(
     model: ArticulationModel,
     forces: AppliedForces,
     joints: JointState,
-    bodies: BodyState,
     tree: int,
     phi: float,
+    bodies_out: BodyState,
+    factors_out: Factors,
     scratch_out: Scratch,
 ):
-    """Write the implicit inertia, the bias force and the tension of each body of one tree, by itself."""
+    """From the root to the tips of one tree: pose and velocity of each body, its own implicit inertia, bias, tension."""
     ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     conservative = p.geometric_stiffness > 0.0 and phi == 0.5
     first = model.tree_first[tree]
     for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
-        pose = bodies.body_q[k]
-        motion = bodies.body_qd[k]
+        above, above_motion = parent_kinematics(k, tree, model, joints, bodies_out)
+        axes, lever, pose, motion = body_kinematics(
+            above, above_motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
+        )
+        bodies_out.body_q[k] = pose
+        bodies_out.body_qd[k] = motion
+        factors_out.axes[k] = axes
+        factors_out.lever[k] = lever
         velocity = wp.spatial_top(motion)
         omega = wp.spatial_bottom(motion)
         mass = model.body_mass[k]
@@ -363,14 +379,18 @@ def predict(
     at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
     that is needed later.
     """
+    trees_model = contiguous_model(model)
+    state = contiguous_joints(joints)
+    bodies = contiguous_bodies(bodies_out)
+    factors = contiguous_factors(factors_out)
+    scratch = contiguous_scratch(scratch_out)
     tree = trees[wp.tid()]
-    size = model.tree_moving[tree]
     phi = tree_phi[tree]
-    fastest = max_joint_rate(joints.joint_qd, model.tree_first[tree], size, model.pitch)
+    first = trees_model.tree_first[tree]
+    fastest = max_joint_rate(state.joint_qd, first, trees_model.tree_moving[tree], trees_model.pitch)
     if fastest > p.fast_rate or tree_euler_steps[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
-    propagate_kinematics(model, joints, tree, size, bodies_out, factors_out)
-    assemble_bodies(p, model, forces, joints, bodies_out, tree, phi, scratch_out)
-    eliminate_joints(p, model, joints, bodies_out, tree, phi, factors_out, scratch_out)
-    accelerate_bodies(p.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
+    assemble_bodies(p, trees_model, contiguous_forces(forces), state, tree, phi, bodies, factors, scratch)
+    eliminate_joints(p, trees_model, state, bodies, tree, phi, factors, scratch)
+    accelerate_bodies(p.dt, trees_model, state, bodies, factors, scratch, tree, contiguous_prediction(prediction_out))

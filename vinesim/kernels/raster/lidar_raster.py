@@ -1,4 +1,4 @@
-"""What the rays of a spinning head meet first: primitives rasterised into its grid of azimuths and elevations.
+"""The nearest primitive along each ray of a spinning head: primitives rasterised into its grid of azimuths and elevations.
 
 A primitive is bound by balls: one, or several along a cone or cylinder. A ball reaches over a range of elevations, which
 picks rows, and over a range of azimuths, which picks columns; the rays found are tested eight at a time and kept as a
@@ -77,7 +77,7 @@ def ray_direction(head: LidarHead, at: int) -> wp.vec3:
 
 @wp.func
 def elevation_slot(tangent: float) -> int:
-    """Where an elevation lies between straight down and straight up."""
+    """Slot of an elevation, given by its tangent: 0 straight down, ELEVATION_SLOTS straight up."""
     return int((tangent / (1.0 + wp.abs(tangent)) + 1.0) * (0.5 * float(ELEVATION_SLOTS) - 0.01))
 
 
@@ -120,13 +120,124 @@ def cull_clusters(
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """One thread tells how near one cluster may come to the head, or FAR if no ray can meet it."""
+    """One thread bounds one cluster: its least distance [m] to the head, or FAR if no ray can meet it.
+
+    ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] m.
+    """
     i = wp.tid()
     r = ball[i][3]
     p = head.rotation * (xyz(ball[i]) - head.eye)
     away = wp.length(p) - r
     seen = r > 0.0 and away < head.max_range and may_intersect(head, p, r) == 1
     distance_out[i] = wp.where(seen, wp.max(away, 0.0), FAR)
+
+
+@wp.struct
+class BallChain:
+    """Balls of radius ``r`` [m] that hold a primitive, evenly along the line from a to b, in the head's frame [m]."""
+
+    a: wp.vec3
+    b: wp.vec3
+    r: float
+    count: int
+
+
+@wp.func
+def bounding_balls(shapes: Shapes, i: int, kind: int, head: LidarHead) -> BallChain:
+    """One ball around primitive ``i``, or several along a cone or cylinder, about BALL_SPACING apart."""
+    a4 = shapes.a[i]
+    b4 = shapes.b[i]
+    a = head.rotation * (xyz(a4) - head.eye)
+    b = a
+    r = a4[3]
+    pieces = wp.int32(1)
+    if kind == SPHEROID:
+        r *= wp.max(b4[3], 1.0)
+    elif kind == LEAF:
+        rib = head.rotation * xyz(b4)
+        up = head.rotation * xyz(shapes.c[i])
+        heights = leaf_heights(shapes.d[i])
+        extent = leaf_extent(shapes.hull, int(b4[3]))
+        middle = 0.5 * (extent[1] + extent[2])
+        high = 0.5 * (heights[1] - heights[0])
+        flat = float(0.0)
+        for n in range(8):
+            flat = wp.max(flat, wp.length(shapes.hull[int(b4[3]), n] - wp.vec2(0.0, middle)))
+        a += (rib * middle + up * (0.5 * (heights[0] + heights[1]))) * r
+        b = a
+        r *= wp.sqrt(flat * flat + high * high)
+    elif kind == CONE or kind == CYLINDER:
+        b = head.rotation * (xyz(b4) - head.eye)
+        r = wp.max(r, wp.where(kind == CONE, b4[3], 0.0))
+        long = wp.length(b - a)
+        along = wp.clamp(-wp.dot(a, b - a) / wp.max(long * long, 1.0e-12), 0.0, 1.0)
+        away = wp.length(a + (b - a) * along)
+        pieces = wp.clamp(int(long / wp.max(3.0 * r, BALL_SPACING * away)) + 1, 1, 1000)
+        r += 0.5 * long / float(pieces)
+    elif kind == TRIANGLE:
+        q = head.rotation * (xyz(b4) - head.eye)
+        s = head.rotation * (xyz(shapes.c[i]) - head.eye)
+        middle_of = (a + q + s) / 3.0
+        r = wp.max(wp.max(wp.length(a - middle_of), wp.length(q - middle_of)), wp.length(s - middle_of)) * 1.001
+        a = middle_of
+        b = a
+    elif kind == BOX:
+        r = wp.length(wp.vec3(r, shapes.c[i][0], shapes.c[i][1]))
+    elif kind == ELLIPSOID:
+        r = wp.max(wp.max(r, shapes.c[i][0]), shapes.c[i][1])
+    o = BallChain()
+    o.a = a
+    o.b = b
+    o.r = r
+    o.count = pieces
+    return o
+
+
+@wp.struct
+class LeafFrame:
+    """A blade's axes, over its size, in the head's frame, and where the head is in the blade's frame and unit."""
+
+    side: wp.vec3
+    rib: wp.vec3
+    up: wp.vec3
+    eye: wp.vec3
+    per: float
+    """1 / size [1/m]"""
+
+
+@wp.func
+def leaf_frame(shapes: Shapes, i: int, head: LidarHead) -> LeafFrame:
+    """Frame of blade ``i``."""
+    a4 = shapes.a[i]
+    o = LeafFrame()
+    base = head.rotation * (xyz(a4) - head.eye)
+    o.rib = head.rotation * xyz(shapes.b[i])
+    o.up = head.rotation * xyz(shapes.c[i])
+    o.side = wp.cross(o.rib, o.up)
+    o.per = 1.0 / a4[3]
+    o.eye = wp.vec3(-wp.dot(base, o.side), -wp.dot(base, o.rib), -wp.dot(base, o.up)) * o.per
+    return o
+
+
+@wp.func
+def leaf_ray(leaf: LeafFrame, direction: wp.vec3) -> wp.vec3:
+    """A ray's direction, given in the head's frame, in the blade's frame and unit."""
+    d = direction * leaf.per
+    return wp.vec3(wp.dot(d, leaf.side), wp.dot(d, leaf.rib), wp.dot(d, leaf.up))
+
+
+@wp.func
+def leaf_range(shapes: Shapes, i: int, leaf: LeafFrame, ray: wp.vec3, t: float, max_range: float) -> float:
+    """Range [m] of blade ``i`` along a ray that meets its rectangle at ``t``, FAR where its outline is missed."""
+    number = int(shapes.b[i][3])
+    if t < 0.0:
+        return hit_leaf(shapes.outline, number, shapes.d[i], leaf.eye, ray, 0)
+    if t < max_range:
+        u = leaf.eye[0] + t * ray[0]
+        v = leaf.eye[1] + t * ray[1]
+        if not inside_outline(shapes.outline, number, u, v, 0):
+            return FAR
+    return t
 
 
 @wp.kernel
@@ -143,7 +254,11 @@ def raster_clusters(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread enters every ``lanes``-th primitive of one cluster."""
+    """Enter every ``lanes``-th primitive of one cluster into the keys, a thread each; reason: batches stay in registers.
+
+    lower, upper: [primitive, 3] m; visible: [thread] clusters; keys: [column * row] as in
+    :mod:`vinesim.kernels.raster.pinhole`, range [um] above.
+    """
     k, lane = wp.tid()
     cluster = visible[k]
     kind = clusters.kind[cluster]
@@ -168,44 +283,11 @@ def raster_clusters(
         i = first + member
         a4 = shapes.a[i]
         b4 = shapes.b[i]
-        a = head.rotation * (xyz(a4) - head.eye)
-        b = a
-        r = a4[3]
-        pieces = wp.int32(1)
-        if kind == SPHEROID:
-            r *= wp.max(b4[3], 1.0)
-        elif kind == LEAF:
-            rib = head.rotation * xyz(b4)
-            up = head.rotation * xyz(shapes.c[i])
-            heights = leaf_heights(shapes.d[i])
-            extent = leaf_extent(shapes.hull, int(b4[3]))
-            middle = 0.5 * (extent[1] + extent[2])
-            high = 0.5 * (heights[1] - heights[0])
-            flat = float(0.0)
-            for n in range(8):
-                flat = wp.max(flat, wp.length(shapes.hull[int(b4[3]), n] - wp.vec2(0.0, middle)))
-            a += (rib * middle + up * (0.5 * (heights[0] + heights[1]))) * r
-            b = a
-            r *= wp.sqrt(flat * flat + high * high)
-        elif kind == CONE or kind == CYLINDER:
-            b = head.rotation * (xyz(b4) - head.eye)
-            r = wp.max(r, wp.where(kind == CONE, b4[3], 0.0))
-            long = wp.length(b - a)
-            along = wp.clamp(-wp.dot(a, b - a) / wp.max(long * long, 1.0e-12), 0.0, 1.0)
-            away = wp.length(a + (b - a) * along)
-            pieces = wp.clamp(int(long / wp.max(3.0 * r, BALL_SPACING * away)) + 1, 1, 1000)
-            r += 0.5 * long / float(pieces)
-        elif kind == TRIANGLE:
-            q = head.rotation * (xyz(b4) - head.eye)
-            s = head.rotation * (xyz(shapes.c[i]) - head.eye)
-            middle_of = (a + q + s) / 3.0
-            r = wp.max(wp.max(wp.length(a - middle_of), wp.length(q - middle_of)), wp.length(s - middle_of)) * 1.001
-            a = middle_of
-            b = a
-        elif kind == BOX:
-            r = wp.length(wp.vec3(r, shapes.c[i][0], shapes.c[i][1]))
-        elif kind == ELLIPSOID:
-            r = wp.max(wp.max(r, shapes.c[i][0]), shapes.c[i][1])
+        balls = bounding_balls(shapes, i, kind, head)
+        a = balls.a
+        b = balls.b
+        r = balls.r
+        pieces = balls.count
         for piece in range(pieces):
             p = a + (b - a) * ((float(piece) + 0.5) / float(pieces))
             around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
@@ -261,30 +343,16 @@ def raster_clusters(
                             m += 1
                     elif kind == LEAF:
                         bend = shapes.d[i]
-                        number = int(b4[3])
-                        base = head.rotation * (xyz(a4) - head.eye)
-                        rib = head.rotation * xyz(b4)
-                        up = head.rotation * xyz(shapes.c[i])
-                        side = wp.cross(rib, up)
-                        per = 1.0 / a4[3]
-                        eye = wp.vec3(-wp.dot(base, side), -wp.dot(base, rib), -wp.dot(base, up)) * per
-                        extent = leaf_extent(shapes.hull, number)
+                        extent = leaf_extent(shapes.hull, int(b4[3]))
+                        leaf = leaf_frame(shapes, i, head)
                         while m < whole:
-                            d = ray_direction(head, spots[m]) * per
-                            ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
-                            depths[m] = hit_leaf_rectangle(bend, extent, eye, ray)
+                            depths[m] = hit_leaf_rectangle(
+                                bend, extent, leaf.eye, leaf_ray(leaf, ray_direction(head, spots[m]))
+                            )
                             m += 1
                         for m in range(n):
-                            t = depths[m]
-                            d = ray_direction(head, spots[m]) * per
-                            ray = wp.vec3(wp.dot(d, side), wp.dot(d, rib), wp.dot(d, up))
-                            if t < 0.0:
-                                depths[m] = hit_leaf(shapes.outline, number, bend, eye, ray, 0)
-                            elif t < head.max_range:
-                                u = eye[0] + t * ray[0]
-                                v = eye[1] + t * ray[1]
-                                if not inside_outline(shapes.outline, number, u, v, 0):
-                                    depths[m] = FAR
+                            ray = leaf_ray(leaf, ray_direction(head, spots[m]))
+                            depths[m] = leaf_range(shapes, i, leaf, ray, depths[m], head.max_range)
                     else:
                         back = wp.transpose(head.rotation)
                         for m in range(n):

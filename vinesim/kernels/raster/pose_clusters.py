@@ -21,6 +21,83 @@ from vinesim.kernels.raster.primitives import (
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
+@wp.struct
+class PosedPrimitive:
+    """The four vectors of one primitive in the world, and a box around it [m]."""
+
+    a: wp.vec4
+    b: wp.vec4
+    c: wp.vec4
+    d: wp.vec4
+    lower: wp.vec3
+    upper: wp.vec3
+
+
+@wp.func
+def pose_leaf(local: Shapes, i: int, pose: wp.transform) -> PosedPrimitive:
+    """Blade ``i`` carried by ``pose``; its box holds the octagon around its outline, raised by its curvatures."""
+    q = wp.transform_get_rotation(pose)
+    s = PosedPrimitive()
+    a = wp.transform_point(pose, xyz(local.a[i]))
+    s.a = with_w(a, local.a[i][3])
+    s.d = local.d[i]
+    rib = wp.quat_rotate(q, xyz(local.b[i]))
+    up = wp.quat_rotate(q, xyz(local.c[i]))
+    side = wp.cross(rib, up)
+    heights = leaf_heights(s.d)
+    s.lower = a
+    s.upper = a
+    for k in range(8):
+        corner = local.hull[int(local.b[i][3]), k]
+        flat = a + (side * corner[0] + rib * corner[1]) * s.a[3]
+        for m in range(2):
+            p = flat + up * (heights[m] * s.a[3])
+            s.lower = wp.min(s.lower, p)
+            s.upper = wp.max(s.upper, p)
+    s.b = with_w(rib, local.b[i][3])
+    s.c = with_w(up, local.c[i][3])
+    return s
+
+
+@wp.func
+def pose_solid(local: Shapes, i: int, kind: int, pose: wp.transform) -> PosedPrimitive:
+    """Primitive ``i``, of any kind but a leaf, carried by ``pose``."""
+    q = wp.transform_get_rotation(pose)
+    s = PosedPrimitive()
+    a = wp.transform_point(pose, xyz(local.a[i]))
+    s.a = with_w(a, local.a[i][3])
+    s.b = local.b[i]
+    s.c = local.c[i]
+    s.d = local.d[i]
+    if kind == SPHEROID:
+        s.b = with_w(wp.quat_rotate(q, xyz(s.b)), s.b[3])
+        s.d = with_w(wp.quat_rotate(q, xyz(s.d)), s.d[3])
+        r = s.a[3] * wp.max(1.0, s.b[3])
+        s.lower = a - wp.vec3(r, r, r)
+        s.upper = a + wp.vec3(r, r, r)
+    elif kind == CONE or kind == CYLINDER:
+        b = wp.transform_point(pose, xyz(s.b))
+        r = wp.max(s.a[3], wp.where(kind == CONE, s.b[3], 0.0))
+        s.lower = wp.min(a, b) - wp.vec3(r, r, r)
+        s.upper = wp.max(a, b) + wp.vec3(r, r, r)
+        s.b = with_w(b, s.b[3])
+    elif kind == TRIANGLE:
+        b = wp.transform_point(pose, xyz(s.b))
+        c = wp.transform_point(pose, xyz(s.c))
+        s.lower = wp.min(wp.min(a, b), c)
+        s.upper = wp.max(wp.max(a, b), c)
+        s.b = with_w(b, s.b[3])
+        s.c = with_w(c, s.c[3])
+        s.d = wp.vec4(q[0], q[1], q[2], q[3])
+    else:
+        turn = q * as_quat(s.b)
+        r = wp.length(wp.vec3(s.a[3], s.c[0], s.c[1]))
+        s.lower = a - wp.vec3(r, r, r)
+        s.upper = a + wp.vec3(r, r, r)
+        s.b = wp.vec4(turn[0], turn[1], turn[2], turn[3])
+    return s
+
+
 @wp.kernel
 def pose_clusters(
     # model
@@ -39,76 +116,32 @@ def pose_clusters(
     upper_out: wp.array(dtype=wp.vec3),
     ball_out: wp.array(dtype=wp.vec4),
 ):
-    """One thread carries one cluster from its bodies' frames into the world, and bounds it."""
+    """One thread carries one cluster from its bodies' frames into the world, and bounds it.
+
+    local: [primitive] in the frames of their carriers; carrier: [primitive] row of ``poses``; dirty: [thread] clusters
+    to carry; lower, upper: [primitive] m; ball: [cluster] centre and radius [m], radius -1 where it is hidden.
+    """
     cluster = dirty[wp.tid()]
     kind = clusters.kind[cluster]
     first = clusters.first[cluster]
     lowest = wp.vec3(FAR, FAR, FAR)
     highest = wp.vec3(-FAR, -FAR, -FAR)
     for i in range(first, first + clusters.size[cluster]):
-        pose = poses[carrier[i]]
-        q = wp.transform_get_rotation(pose)
-        a4 = local.a[i]
-        b4 = local.b[i]
-        c4 = local.c[i]
-        d4 = local.d[i]
-        a = wp.transform_point(pose, xyz(a4))
-        a4 = with_w(a, a4[3])
-        lo = a
-        hi = a
+        s = PosedPrimitive()
         if kind == LEAF:
-            rib = wp.quat_rotate(q, xyz(b4))
-            up = wp.quat_rotate(q, xyz(c4))
-            side = wp.cross(rib, up)
-            heights = leaf_heights(d4)
-            for k in range(8):
-                corner = local.hull[int(b4[3]), k]
-                flat = a + (side * corner[0] + rib * corner[1]) * a4[3]
-                for m in range(2):
-                    p = flat + up * (heights[m] * a4[3])
-                    lo = wp.min(lo, p)
-                    hi = wp.max(hi, p)
-            b4 = with_w(rib, b4[3])
-            c4 = with_w(up, c4[3])
-        elif kind == SPHEROID:
-            b4 = with_w(wp.quat_rotate(q, xyz(b4)), b4[3])
-            d4 = with_w(wp.quat_rotate(q, xyz(d4)), d4[3])
-            r = a4[3] * wp.max(1.0, b4[3])
-            reach = wp.vec3(r, r, r)
-            lo = a - reach
-            hi = a + reach
-        elif kind == CONE or kind == CYLINDER:
-            b = wp.transform_point(pose, xyz(b4))
-            r = wp.max(a4[3], wp.where(kind == CONE, b4[3], 0.0))
-            reach = wp.vec3(r, r, r)
-            lo = wp.min(a, b) - reach
-            hi = wp.max(a, b) + reach
-            b4 = with_w(b, b4[3])
-        elif kind == TRIANGLE:
-            b = wp.transform_point(pose, xyz(b4))
-            c = wp.transform_point(pose, xyz(c4))
-            lo = wp.min(wp.min(a, b), c)
-            hi = wp.max(wp.max(a, b), c)
-            b4 = with_w(b, b4[3])
-            c4 = with_w(c, c4[3])
-            d4 = wp.vec4(q[0], q[1], q[2], q[3])
+            s = pose_leaf(local, i, poses[carrier[i]])
         else:
-            turn = q * as_quat(b4)
-            r = wp.length(wp.vec3(a4[3], c4[0], c4[1]))
-            reach = wp.vec3(r, r, r)
-            lo = a - reach
-            hi = a + reach
-            b4 = wp.vec4(turn[0], turn[1], turn[2], turn[3])
+            s = pose_solid(local, i, kind, poses[carrier[i]])
         if clusters.shown[cluster] == 0:
-            lo = wp.vec3(0.0, 0.0, HIDDEN_HEIGHT)
-            hi = lo
-        a_out[i] = a4
-        b_out[i] = b4
-        c_out[i] = c4
-        d_out[i] = d4
-        lower_out[i] = lo
-        upper_out[i] = hi
-        lowest = wp.min(lowest, lo)
-        highest = wp.max(highest, hi)
+            s.lower = wp.vec3(0.0, 0.0, HIDDEN_HEIGHT)
+            s.upper = s.lower
+        a_out[i] = s.a
+        b_out[i] = s.b
+        c_out[i] = s.c
+        d_out[i] = s.d
+        lower_out[i] = s.lower
+        upper_out[i] = s.upper
+        lowest = wp.min(lowest, s.lower)
+        highest = wp.max(highest, s.upper)
     centre = (lowest + highest) * 0.5
     ball_out[cluster] = with_w(centre, wp.where(clusters.shown[cluster] == 0, -1.0, wp.length(highest - centre)))

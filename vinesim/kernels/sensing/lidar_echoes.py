@@ -52,29 +52,32 @@ def label_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int)
     return label[primitive]
 
 
-@wp.kernel
-def detect_returns(
-    # model
+@wp.struct
+class SortedRays:
+    """The rays of one shot that met something in range, nearest first."""
+
+    range: RayValues
+    """[m]"""
+    brightness: RayValues
+    """Reflectance times cosine, over the number of rays."""
+    ray: RayValues
+    """Which ray it was."""
+    count: int
+
+
+@wp.func
+def sorted_rays(
     shapes: Shapes,
-    label: wp.array(dtype=wp.int32),
     organ: wp.array(dtype=wp.int32),
     receiver: Receiver,
-    # in
-    first: int,
+    shot: int,
     pose: wp.transform,
     direction: wp.array(dtype=wp.vec3),
     distance: wp.array(dtype=wp.float32),
     primitive: wp.array(dtype=wp.int32),
-    ground_label: int,
     ground_organ: int,
-    noise: wp.array2d(dtype=wp.float32),
-    # out
-    xyz_out: wp.array2d(dtype=wp.vec3),
-    intensity_out: wp.array2d(dtype=wp.float32),
-    label_out: wp.array2d(dtype=wp.int32),
-):
-    """One thread makes one or two returns of one shot's rays; label -1 where there is none."""
-    shot = first + wp.tid()
+) -> SortedRays:
+    """What the rays of one shot met, sorted by range (insertion sort)."""
     rays = receiver.rays
     t = RayValues()
     bright = RayValues()
@@ -103,7 +106,30 @@ def detect_returns(
             bright[j] = light
             name[j] = float(ray)
             count += 1
-    # echoes: what lies closer together along the beam than the pulse is long comes back as one
+    o = SortedRays()
+    o.range = t
+    o.brightness = bright
+    o.ray = name
+    o.count = count
+    return o
+
+
+@wp.struct
+class Echoes:
+    """Echoes of one shot, each (signal, range [m], brightness, ray that shows most of it); signal 0: none."""
+
+    strongest: wp.vec4
+    second: wp.vec4
+    last: wp.vec4
+
+
+@wp.func
+def find_echoes(receiver: Receiver, rays: SortedRays, flicker: float) -> Echoes:
+    """Rays closer together along the beam than the pulse is long come back as one echo, at their mean range."""
+    t = rays.range
+    bright = rays.brightness
+    name = rays.ray
+    count = rays.count
     strongest = wp.vec4(0.0, 0.0, 0.0, 0.0)
     second = wp.vec4(0.0, 0.0, 0.0, 0.0)
     last = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -125,13 +151,53 @@ def detect_returns(
                 shown = name[k]
             end = t[k]
             k += 1
-        if signal > 0.0 and signal * wp.exp(receiver.flicker * noise[shot, 2]) > receiver.weakest:
+        if signal > 0.0 and signal * wp.exp(receiver.flicker * flicker) > receiver.weakest:
             last = wp.vec4(signal, moment / signal, sum_light, shown)
             if signal > strongest[0]:
                 second = strongest
                 strongest = last
             elif signal > second[0]:
                 second = last
+    o = Echoes()
+    o.strongest = strongest
+    o.second = second
+    o.last = last
+    return o
+
+
+@wp.kernel
+def detect_returns(
+    # model
+    shapes: Shapes,
+    label: wp.array(dtype=wp.int32),
+    organ: wp.array(dtype=wp.int32),
+    receiver: Receiver,
+    # in
+    first: int,
+    pose: wp.transform,
+    direction: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=wp.float32),
+    primitive: wp.array(dtype=wp.int32),
+    ground_label: int,
+    ground_organ: int,
+    noise: wp.array2d(dtype=wp.float32),
+    # out
+    xyz_out: wp.array2d(dtype=wp.vec3),
+    intensity_out: wp.array2d(dtype=wp.float32),
+    label_out: wp.array2d(dtype=wp.int32),
+):
+    """One thread makes one or two returns of one shot's rays; label -1 where there is none.
+
+    first: number of the first thread's shot; pose: of the lidar in the world; direction: [ray] unit vectors in the
+    lidar's frame; distance: [ray] m; primitive: [ray] -2 the ground, -1 nothing; noise: [shot, 3] standard normal, for
+    the two ranges and the signal; xyz: [shot, return] m in the lidar's frame; intensity: [shot, return] 0 to 255.
+    """
+    shot = first + wp.tid()
+    rays = receiver.rays
+    met = sorted_rays(shapes, organ, receiver, shot, pose, direction, distance, primitive, ground_organ)
+    echoes = find_echoes(receiver, met, noise[shot, 2])
+    strongest = echoes.strongest
+    last = echoes.last
     d = direction[shot * rays]
     echo = strongest
     if receiver.returns == 1:
@@ -143,7 +209,7 @@ def detect_returns(
         intensity_out[shot, 0] = wp.clamp(100.0 * echo[2], 0.0, 255.0)
     if receiver.returns == 2:
         if last[1] == strongest[1]:
-            last = second
+            last = echoes.second
         label_out[shot, 1] = -1
         if last[0] > 0.0 and wp.abs(last[1] - strongest[1]) >= receiver.separation:
             label_out[shot, 1] = label_of(primitive[int(last[3])], label, ground_label)

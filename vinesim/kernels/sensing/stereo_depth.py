@@ -71,6 +71,159 @@ def first_pixel(cell: int, scale: float) -> int:
     return int(wp.ceil(float(cell) / scale))
 
 
+@wp.struct
+class WindowStatistics:
+    """What 3 x 3 places of a window show."""
+
+    nearest: float
+    """Largest disparity [px]."""
+    farthest: float
+    """Smallest disparity [px]."""
+    total: float
+    """Sum of the disparities [px]."""
+    across: float
+    """Sum of the right column minus the left one [px]."""
+    down: float
+    """Sum of the lowest row minus the uppermost one [px]."""
+    brightness: float
+    """Mean grey level."""
+    darkest: float
+    brightest: float
+
+
+@wp.func
+def window_statistics(
+    disparity: wp.array(dtype=wp.float32), grey: wp.array(dtype=wp.uint8), lens: Pinhole, x: int, y: int, stride: int
+) -> WindowStatistics:
+    """Statistics of the window around pixel (x, y): disparity and grey level [pixel], places ``2 stride`` apart."""
+    o = WindowStatistics()
+    own = disparity[y * lens.width + x]
+    o.nearest = own
+    o.farthest = own
+    o.darkest = 255.0
+    for k in range(9):
+        i = wp.clamp(x + (k % 3 - 1) * 2 * stride, 0, lens.width - 1)
+        j = wp.clamp(y + (k // 3 - 1) * 2 * stride, 0, lens.height - 1)
+        at = j * lens.width + i
+        d = disparity[at]
+        o.nearest = wp.max(o.nearest, d)
+        o.farthest = wp.min(o.farthest, d)
+        o.total += d
+        o.across += d * float(k % 3 - 1)
+        o.down += d * float(k // 3 - 1)
+        light = float(grey[at])
+        o.brightness += light / 9.0
+        o.darkest = wp.min(o.darkest, light)
+        o.brightest = wp.max(o.brightest, light)
+    return o
+
+
+@wp.func
+def surface_slant(stereo: Stereo, lens: Pinhole, window: WindowStatistics, x: int, y: int, own: float) -> float:
+    """Cosine between ray and normal of the surface in a window.
+
+    1 / z is linear in the picture: its slopes are those of the surface.
+    """
+    ray = pixel_ray(lens, x, y)
+    per = 1.0 / (12.0 * float(stereo.stride) * stereo.focal_baseline)
+    a = window.across * per * lens.fx
+    b = window.down * per * lens.fy
+    inverse = own / stereo.focal_baseline
+    normal = wp.vec3(a, b, inverse - a * ray[0] - b * ray[1])
+    return inverse / (wp.length(normal) * wp.length(ray))
+
+
+@wp.func
+def match_window(
+    stereo: Stereo,
+    disparity: wp.array(dtype=wp.float32),
+    lens: Pinhole,
+    window: WindowStatistics,
+    x: int,
+    y: int,
+    own: float,
+) -> wp.vec2:
+    """Disparity [px] of the surface that fills most of a window at an edge, and the share of the window it fills."""
+    disparities = WindowDisparities()
+    nearest = window.nearest
+    farthest = window.farthest
+    for k in range(WINDOW_SIDE * WINDOW_SIDE):
+        i = wp.clamp(x + (k % WINDOW_SIDE - WINDOW_SIDE // 2) * stereo.stride, 0, lens.width - 1)
+        j = wp.clamp(y + (k // WINDOW_SIDE - WINDOW_SIDE // 2) * stereo.stride, 0, lens.height - 1)
+        d = disparity[j * lens.width + i]
+        disparities[k] = d
+        nearest = wp.max(nearest, d)
+        farthest = wp.min(farthest, d)
+    best = float(-1.0)
+    found = window.total / 9.0
+    agree = float(1.0)
+    for c in range(3):
+        candidate = wp.where(c == 0, nearest, wp.where(c == 1, own, farthest))
+        within = surface_gap(stereo.slope, candidate)
+        votes = float(0.0)
+        mean = float(0.0)
+        for k in range(WINDOW_SIDE * WINDOW_SIDE):
+            mine = wp.where(wp.abs(disparities[k] - candidate) < within, 1.0, 0.0)
+            votes += mine
+            mean += mine * disparities[k]
+        weight = votes * wp.where(c == 0, stereo.fattening, 1.0)
+        if weight > best:
+            best = weight
+            agree = votes / float(WINDOW_SIDE * WINDOW_SIDE)
+            found = mean / votes
+    return wp.vec2(found, agree)
+
+
+@wp.func
+def seen_by_second(
+    stereo: Stereo,
+    lens: Pinhole,
+    second: Pinhole,
+    second_depth: wp.array(dtype=wp.float32),
+    x: int,
+    y: int,
+    own: float,
+) -> bool:
+    """Whether the second imager sees the surface of disparity ``own`` [px] at pixel (x, y): in view and not occluded."""
+    column = int(wp.round((float(x) - lens.cx) / lens.fx * second.fx - own + second.cx))
+    row = int(wp.round((float(y) - lens.cy) / lens.fy * second.fy + second.cy))
+    row = wp.clamp(row, 0, second.height - 1)
+    if column < 0 or column >= second.width:
+        return False
+    near = second_depth[row * second.width + column] * (own + surface_gap(stereo.slope, own))
+    return not (stereo.focal_baseline > near)
+
+
+@wp.func
+def loss_probability(stereo: Stereo, window: WindowStatistics, slant: float, own: float) -> float:
+    """How likely a window is not matched: too slanted, without texture, or overexposed."""
+    lost = 1.0 - linear_step(stereo.slant_lost, stereo.slant_kept, slant)
+    if window.brightest - window.darkest < stereo.contrast:
+        lost = wp.max(lost, linear_step(stereo.projector, 2.0 * stereo.projector, stereo.focal_baseline / own))
+    if window.brightness >= stereo.saturation:
+        lost = 1.0
+    return lost
+
+
+@wp.func
+def reported_depth(stereo: Stereo, disparity: float, is_matched: bool, noise: float) -> float:
+    """Depth [m] by REP-118 of a disparity [px] with a standard normal ``noise``."""
+    z = float(wp.inf)
+    if disparity > 0.0:
+        noisy = disparity + stereo.sigma * noise
+        if stereo.step > 0.0:
+            noisy = wp.round(noisy / stereo.step) * stereo.step
+        if noisy > 0.0:
+            z = stereo.focal_baseline / noisy
+    if z > stereo.farthest:
+        z = float(wp.inf)
+    elif z < stereo.nearest:
+        z = -float(wp.inf)
+    elif not is_matched:
+        z = float(wp.nan)
+    return z
+
+
 @wp.kernel
 def measure_depth(
     # model
@@ -86,114 +239,40 @@ def measure_depth(
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread measures ``run`` pixels of the imager for the picture; NaN where no match is found (REP-118)."""
+    """One thread measures ``run`` pixels of the imager for the picture.
+
+    disparity: [pixel] px of the imager, exact; grey: [pixel] 0 to 255; second_depth: [pixel of the second imager] m;
+    noise: [2, row, column] standard normal, of the disparity and of the match; depth: [pixel] m, REP-118: NaN where no
+    match is found, infinite beyond the range of the sensor.
+    """
     first = wp.tid() * run
     columns = noise.shape[2]
-    focal_baseline = stereo.focal_baseline
-    slope = stereo.slope
-    stride = stereo.stride
     width = lens.width
-    height = lens.height
     for cell in range(first, first + run):
         column = cell % columns
         row = cell // columns
         left = first_pixel(column, stereo.scale)
         right = wp.min(first_pixel(column + 1, stereo.scale), width)
         top = first_pixel(row, stereo.scale)
-        bottom = wp.min(first_pixel(row + 1, stereo.scale), height)
+        bottom = wp.min(first_pixel(row + 1, stereo.scale), lens.height)
         x = wp.min((left + right) // 2, width - 1)
-        y = wp.min((top + bottom) // 2, height - 1)
-        pixel = y * width + x
-        own = disparity[pixel]
-        # what stands in the window, and how bright it is
-        nearest = own
-        farthest = own
-        total = float(0.0)
-        across = float(0.0)
-        down = float(0.0)
-        bright = float(0.0)
-        darkest = float(255.0)
-        brightest = float(0.0)
-        for k in range(9):
-            i = wp.clamp(x + (k % 3 - 1) * 2 * stride, 0, width - 1)
-            j = wp.clamp(y + (k // 3 - 1) * 2 * stride, 0, height - 1)
-            at = j * width + i
-            d = disparity[at]
-            nearest = wp.max(nearest, d)
-            farthest = wp.min(farthest, d)
-            total += d
-            across += d * float(k % 3 - 1)
-            down += d * float(k // 3 - 1)
-            light = float(grey[at])
-            bright += light / 9.0
-            darkest = wp.min(darkest, light)
-            brightest = wp.max(brightest, light)
-        found = total / 9.0
-        agree = float(1.0)
+        y = wp.min((top + bottom) // 2, lens.height - 1)
+        own = disparity[y * width + x]
+        window = window_statistics(disparity, grey, lens, x, y, stereo.stride)
+        match = wp.vec2(window.total / 9.0, 1.0)
         slant = float(1.0)
-        if wp.max(nearest - own, own - farthest) < surface_gap(slope, own):
-            if own > 0.0:  # 1 / z is linear in the picture: its slopes are those of the surface
-                ray = pixel_ray(lens, x, y)
-                per = 1.0 / (12.0 * float(stride) * focal_baseline)
-                a = across * per * lens.fx
-                b = down * per * lens.fy
-                inverse = own / focal_baseline
-                normal = wp.vec3(a, b, inverse - a * ray[0] - b * ray[1])
-                slant = inverse / (wp.length(normal) * wp.length(ray))
-        else:  # an edge: the window goes to the surface that fills most of it
-            disparities = WindowDisparities()
-            for k in range(WINDOW_SIDE * WINDOW_SIDE):
-                i = wp.clamp(x + (k % WINDOW_SIDE - WINDOW_SIDE // 2) * stride, 0, width - 1)
-                j = wp.clamp(y + (k // WINDOW_SIDE - WINDOW_SIDE // 2) * stride, 0, height - 1)
-                d = disparity[j * width + i]
-                disparities[k] = d
-                nearest = wp.max(nearest, d)
-                farthest = wp.min(farthest, d)
-            best = float(-1.0)
-            for c in range(3):
-                candidate = wp.where(c == 0, nearest, wp.where(c == 1, own, farthest))
-                within = surface_gap(slope, candidate)
-                votes = float(0.0)
-                mean = float(0.0)
-                for k in range(WINDOW_SIDE * WINDOW_SIDE):
-                    mine = wp.where(wp.abs(disparities[k] - candidate) < within, 1.0, 0.0)
-                    votes += mine
-                    mean += mine * disparities[k]
-                weight = votes * wp.where(c == 0, stereo.fattening, 1.0)
-                if weight > best:
-                    best = weight
-                    agree = votes / float(WINDOW_SIDE * WINDOW_SIDE)
-                    found = mean / votes
-        # what is not measured at all
-        kept = agree >= stereo.support
+        if wp.max(window.nearest - own, own - window.farthest) < surface_gap(stereo.slope, own):
+            if own > 0.0:
+                slant = surface_slant(stereo, lens, window, x, y, own)
+        else:  # an edge
+            match = match_window(stereo, disparity, lens, window, x, y, own)
+        is_matched = match[1] >= stereo.support
         lost = float(0.0)
         if own > 0.0:
-            there = int(wp.round((float(x) - lens.cx) / lens.fx * second.fx - own + second.cx))
-            level = int(wp.round((float(y) - lens.cy) / lens.fy * second.fy + second.cy))
-            level = wp.clamp(level, 0, second.height - 1)
-            if there < 0 or there >= second.width:
-                kept = False
-            elif focal_baseline > second_depth[level * second.width + there] * (own + surface_gap(slope, own)):
-                kept = False  # something else stands before it there
-            lost = 1.0 - linear_step(stereo.slant_lost, stereo.slant_kept, slant)
-            if brightest - darkest < stereo.contrast:
-                lost = wp.max(lost, linear_step(stereo.projector, 2.0 * stereo.projector, focal_baseline / own))
-            if bright >= stereo.saturation:
-                lost = 1.0
-        kept = kept and normal_cdf(noise[1, row, column]) >= lost
-        z = float(wp.inf)
-        if found > 0.0:
-            noisy = found + stereo.sigma * noise[0, row, column]
-            if stereo.step > 0.0:
-                noisy = wp.round(noisy / stereo.step) * stereo.step
-            if noisy > 0.0:
-                z = focal_baseline / noisy
-        if z > stereo.farthest:
-            z = float(wp.inf)
-        elif z < stereo.nearest:
-            z = -float(wp.inf)
-        elif not kept:
-            z = float(wp.nan)
+            is_matched = is_matched and seen_by_second(stereo, lens, second, second_depth, x, y, own)
+            lost = loss_probability(stereo, window, slant, own)
+        is_matched = is_matched and normal_cdf(noise[1, row, column]) >= lost
+        z = reported_depth(stereo, match[0], is_matched, noise[0, row, column])
         for j in range(top, bottom):
             for i in range(left, right):
                 depth_out[j * width + i] = z

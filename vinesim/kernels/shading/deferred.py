@@ -19,9 +19,9 @@ from vinesim.kernels.shading.materials import (
     mix,
     sample_bilinear,
     smoothstep,
-    solid_surface,
 )
 from vinesim.kernels.shading.shadow_maps import ShadowMap, sun_visibility
+from vinesim.kernels.shading.solid_materials import solid_surface
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -101,6 +101,37 @@ def reflected_light(materials: Materials, light: Light, r: wp.vec3, sky: float) 
 
 
 @wp.func
+def specular_light(
+    materials: Materials, light: Light, s: Surface, kind: int, d: wp.vec3, n: wp.vec3, ndl: float, lit: float
+) -> wp.vec3:
+    """Highlight of the sun and reflection of the surroundings (Schlick's Fresnel term) against the unit ray ``d``.
+
+    ``n`` faces the ray, ``ndl`` is its cosine to the sun, ``lit`` the share of the sun's disc that is seen.
+    """
+    colour = wp.vec3(0.0, 0.0, 0.0)
+    grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
+    g2 = grazing * grazing
+    fresnel = s.specular + (1.0 - s.specular) * g2 * g2 * grazing * wp.min(s.specular * 14.0, 1.0) * 0.8
+    if lit > 0.0 and ndl > -0.05:
+        half = wp.normalize(light.sun - d)
+        peak = 1.0 - wp.max(wp.dot(n, half), 0.0)
+        if s.shininess * peak < 8.0:
+            colour += light.sun_colour * (
+                fresnel * wp.exp(-s.shininess * peak) * (s.shininess * 0.14 + 0.4) * lit * (ndl + 0.05)
+            )
+    if s.reflectivity * fresnel > 0.006:
+        r = d - n * (2.0 * wp.dot(n, d))
+        if kind == LEAF:
+            above = mix(light.canopy_colour * 0.45, light.sky_colour, s.sky * s.sky)
+            colour += mix(light.ground_colour, above, 0.5 + 0.5 * r[2]) * (
+                wp.min(fresnel, 0.16) * s.reflectivity * s.occlusion
+            )
+        else:
+            colour += reflected_light(materials, light, r, s.sky) * (fresnel * s.reflectivity * s.occlusion)
+    return colour
+
+
+@wp.func
 def shade_surface(
     materials: Materials,
     light: Light,
@@ -154,27 +185,48 @@ def shade_surface(
                 + ambient_light(light, -n, s.sky) * (0.30 * s.occlusion),
             )
     if s.specular > 0.0:
-        grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
-        g2 = grazing * grazing
-        fresnel = s.specular + (1.0 - s.specular) * g2 * g2 * grazing * wp.min(s.specular * 14.0, 1.0) * 0.8
-        if lit > 0.0 and ndl > -0.05:
-            half = wp.normalize(light.sun - d)
-            peak = 1.0 - wp.max(wp.dot(n, half), 0.0)
-            if s.shininess * peak < 8.0:
-                colour += light.sun_colour * (
-                    fresnel * wp.exp(-s.shininess * peak) * (s.shininess * 0.14 + 0.4) * lit * (ndl + 0.05)
-                )
-        if s.reflectivity * fresnel > 0.006:
-            r = d - n * (2.0 * wp.dot(n, d))
-            if kind == LEAF:
-                above = mix(light.canopy_colour * 0.45, light.sky_colour, s.sky * s.sky)
-                colour += mix(light.ground_colour, above, 0.5 + 0.5 * r[2]) * (
-                    wp.min(fresnel, 0.16) * s.reflectivity * s.occlusion
-                )
-            else:
-                colour += reflected_light(materials, light, r, s.sky) * (fresnel * s.reflectivity * s.occlusion)
+        colour += specular_light(materials, light, s, kind, d, n, ndl, lit)
     colour += s.albedo * s.emission
     return mix(colour, light.haze_colour, 0.6 * (1.0 - wp.exp(-t * 0.006)))
+
+
+@wp.func
+def surface_light(
+    shapes: Shapes,
+    materials: Materials,
+    light: Light,
+    near: ShadowMap,
+    far: ShadowMap,
+    lens: Pinhole,
+    i: int,
+    ray: wp.vec3,
+    z: float,
+    left: int,
+    top: int,
+    block: int,
+) -> wp.vec3:
+    """Light from primitive ``i`` (-2: the ground) at depth ``z`` [m] along ``ray``, for the block at (left, top) [px]."""
+    scale = wp.length(ray)
+    d = ray / scale
+    p = lens.eye + ray * z
+    footprint = z * float(block) / lens.fx
+    # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
+    f = 0.06711056 * float(left) + 0.00583715 * float(top)
+    f = 52.9829189 * (f - wp.floor(f))
+    turn = light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
+    kind = wp.int32(-1)
+    s = Surface()
+    if i >= 0:
+        kind = shapes.kind[i]
+        if kind == LEAF:
+            s = leaf_surface(shapes, materials, i, p, d, footprint)
+        elif kind == SPHEROID and materials.material[i] == BERRY:
+            s = berry_surface(shapes, materials, i, p, footprint)
+        else:
+            s = solid_surface(shapes, materials, i, p, footprint)
+    else:
+        s = ground_surface(materials, p, footprint, footprint * z * scale / lens.eye[2])
+    return shade_surface(materials, light, near, far, s, kind, p, d, z * scale, turn)
 
 
 @wp.kernel
@@ -194,8 +246,12 @@ def shade_pixels(
     # out
     radiance_out: wp.array(dtype=wp.vec3),
 ):
-    """One thread lights ``run`` neighbouring blocks, 1 or 2 pixels wide; there each primitive is lit once, at its middle."""
-    half = block - 1  # corners are told apart by bits: divisions would cost as much as the light
+    """One thread lights ``run`` neighbouring blocks, 1 or 2 pixels wide; there each primitive is lit once, at its middle.
+
+    primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; near, far: shadow maps;
+    block: [px]; radiance: [pixel] linear RGB.
+    """
+    half = block - 1  # corners are numbered by bits: divisions would cost as much as the shading
     across = (lens.width + half) >> half
     first = wp.tid() * run
     corners = block * block
@@ -210,7 +266,7 @@ def shade_pixels(
             y = top + (c >> half)
             if x < lens.width and y < lens.height:
                 i = primitive[y * lens.width + x]
-                for k in range(c):  # whoever comes first speaks for all that see the same
+                for k in range(c):  # the first corner that shows a primitive stands for all that show it
                     if primitive[(top + (k >> half)) * lens.width + left + (k & half)] == i:
                         i = -3
             if i != -3:
@@ -233,31 +289,11 @@ def shade_pixels(
                 z = depth * per * 1.0e-6
                 if i == -2:
                     z = -lens.eye[2] / ray[2]
-                scale = wp.length(ray)
-                d = ray / scale
                 colour = wp.vec3(0.0, 0.0, 0.0)
                 if i == -1:
-                    colour = sky_radiance(light, d)
+                    colour = sky_radiance(light, ray / wp.length(ray))
                 else:
-                    p = lens.eye + ray * z
-                    footprint = z * float(block) / lens.fx
-                    # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
-                    f = 0.06711056 * float(left) + 0.00583715 * float(top)
-                    f = 52.9829189 * (f - wp.floor(f))
-                    turn = light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
-                    kind = wp.int32(-1)
-                    s = Surface()
-                    if i >= 0:
-                        kind = shapes.kind[i]
-                        if kind == LEAF:
-                            s = leaf_surface(shapes, materials, i, p, d, footprint)
-                        elif kind == SPHEROID and materials.material[i] == BERRY:
-                            s = berry_surface(shapes, materials, i, p, footprint)
-                        else:
-                            s = solid_surface(shapes, materials, i, p, footprint)
-                    else:
-                        s = ground_surface(materials, p, footprint, footprint * z * scale / lens.eye[2])
-                    colour = shade_surface(materials, light, near, far, s, kind, p, d, z * scale, turn)
+                    colour = surface_light(shapes, materials, light, near, far, lens, i, ray, z, left, top, block)
                 for k in range(c, corners):
                     x = left + (k & half)
                     y = top + (k >> half)
@@ -276,7 +312,10 @@ def meter_luminance(
     # out
     sum_out: wp.array(dtype=wp.int64),
 ):
-    """One thread adds log2 luminance of one pixel in ``step`` squared to a sum of millionths, the same in any order."""
+    """One thread adds the log2 luminance of one pixel in ``step`` squared to a sum of integers, the same in any order.
+
+    radiance: [pixel] linear RGB; sum: sum of log2 luminance times 65536, and number of pixels.
+    """
     i = wp.tid()
     across = width // step
     x = (i % across) * step + step / 2
@@ -301,7 +340,11 @@ def update_exposure(
     sum_out: wp.array(dtype=wp.int64),
     exposure_out: wp.array(dtype=wp.float32),
 ):
-    """One thread goes a ``share`` of the stops from the usual exposure to the key's, and keeps some of the old one."""
+    """One thread updates the exposure: ``share`` of the stops from the usual one to the key value's, smoothed in time.
+
+    key: exposed geometric mean of the luminance that is aimed at (Reinhard et al. 2002); keep: weight of the old exposure,
+    in stops; sum: as from :func:`meter_luminance`, set to 0; exposure: [1].
+    """
     mean = float(sum_out[0]) / (65536.0 * float(wp.max(sum_out[1], wp.int64(1))))
     wanted = wp.clamp(usual * wp.pow(key * wp.pow(2.0, -mean) / usual, share), least, most)
     old = exposure_out[0]
@@ -323,7 +366,10 @@ def tone_map(
     # out
     rgb_out: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread turns the light of ``run`` neighbouring pixels, each of ``samples`` squared samples, into 8-bit sRGB."""
+    """One thread turns the light of ``run`` neighbouring pixels, each of ``samples`` squared samples, into 8-bit sRGB.
+
+    radiance: [sample] linear RGB; balance: white balance, factors; tone: [4096] sRGB of sqrt(light / 4); rgb: [pixel, 3].
+    """
     first = wp.tid() * run
     per = 1.0 / float(samples * samples)
     gain = balance * exposure[0]

@@ -51,7 +51,11 @@ def sky_visibility(
     # out
     sky_out: wp.array(dtype=wp.float32),
 ):
-    """One thread finds the share of sky light that reaches one point through leaf area density [1/m] (13 directions)."""
+    """One thread finds the share of the sky light that reaches one point through leaves (Beer-Lambert, 13 directions).
+
+    density: [x, y, z] leaf area per volume [1/m] in cells of ``cell`` [m] from ``corner`` on; position: [point] m;
+    sky: [point] 0 to 1.
+    """
     i = wp.tid()
     total = float(0.0)
     weight = float(0.0)
@@ -79,6 +83,218 @@ def write_depth(m: ShadowMap, x: int, y: int, z: float, depth_out: wp.array(dtyp
     wp.atomic_min(depth_out, y * m.side + x, z)
 
 
+@wp.func
+def shadow_spheroid(
+    m: ShadowMap, r: float, x: float, y: float, z: float, part: int, slices: int, depth_out: wp.array(dtype=wp.float32)
+):
+    """Draw a sphere of radius ``r`` [m] at texel (x, y) and depth ``z`` [m] from the sun; every ``slices``-th row."""
+    rt = r / m.texel
+    for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
+        for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
+            dx = float(px) - x
+            dy = float(py) - y
+            h = rt * rt - dx * dx - dy * dy
+            if h > 0.0:
+                write_depth(m, px, py, z - wp.sqrt(h) * m.texel, depth_out)
+
+
+@wp.func
+def shadow_cone(
+    m: ShadowMap,
+    shapes: Shapes,
+    i: int,
+    smallest: float,
+    x: float,
+    y: float,
+    z: float,
+    part: int,
+    slices: int,
+    depth_out: wp.array(dtype=wp.float32),
+):
+    """Draw cone or cylinder ``i`` that begins at texel (x, y) and depth ``z`` [m], if it is thicker than ``smallest`` texels."""
+    kind = shapes.kind[i]
+    r = shapes.a[i][3]
+    b4 = shapes.b[i]
+    rb = wp.where(kind == CONE, b4[3], r)
+    if wp.max(r, rb) > smallest * m.texel:
+        q = xyz(b4) - m.corner
+        ex = wp.dot(q, m.right) / m.texel - x
+        ey = wp.dot(q, m.up) / m.texel - y
+        ez = SUN_DISTANCE - wp.dot(q, m.sun) - z
+        wide = wp.max(wp.max(r, rb) / m.texel, 0.55)
+        per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
+        y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
+        y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, m.side)
+        for py in range(y0 + part, y1, slices):
+            x0 = wp.min(x, x + ex) - wide
+            x1 = wp.max(x, x + ex) + wide
+            if wp.abs(ey) > 4.0:
+                s = wp.clamp((float(py) - wide - y) / ey, 0.0, 1.0)
+                t = wp.clamp((float(py) + wide - y) / ey, 0.0, 1.0)
+                x0 = x + wp.min(ex * s, ex * t) - wide
+                x1 = x + wp.max(ex * s, ex * t) + wide
+            for px in range(wp.max(int(x0), 0), wp.min(int(x1) + 2, m.side)):
+                fx = float(px) - x
+                fy = float(py) - y
+                s = wp.clamp((fx * ex + fy * ey) * per, 0.0, 1.0)
+                fx -= s * ex
+                fy -= s * ey
+                rr = wp.max((r + (rb - r) * s) / m.texel, 0.55)
+                h = rr * rr - fx * fx - fy * fy
+                if h > 0.0:
+                    write_depth(m, px, py, z + ez * s - wp.sqrt(h) * m.texel, depth_out)
+
+
+@wp.struct
+class LeafShadow:
+    """An octagon around a blade as the sun sees it [texel]: lowest and highest x and y, x + y and x - y."""
+
+    xy: wp.vec4
+    sums: wp.vec4
+    """Lowest and highest x + y, lowest and highest x - y."""
+
+
+@wp.func
+def leaf_shadow(m: ShadowMap, shapes: Shapes, i: int, x: float, y: float, per_leaf: float) -> LeafShadow:
+    """Bounds of blade ``i`` whose petiole's end is at texel (x, y); ``per_leaf`` is one texel in leaf units."""
+    number = int(shapes.b[i][3])
+    bend = shapes.d[i]
+    rib = xyz(shapes.b[i])
+    up = xyz(shapes.c[i])
+    across = wp.cross(rib, up)
+    bulge = leaf_bulge(shapes.hull, number, bend)
+    lx = float(1.0e9)
+    hx = float(-1.0e9)
+    ly = float(1.0e9)
+    hy = float(-1.0e9)
+    ls = float(1.0e9)
+    hs = float(-1.0e9)
+    ld = float(1.0e9)
+    hd = float(-1.0e9)
+    for n in range(8):
+        corner = shapes.hull[number, n]
+        flat = across * corner[0] + rib * corner[1]
+        height = leaf_height(bend, corner[0], corner[1]) - bulge[1]
+        for level in range(2):
+            q = (flat + up * (height + float(level) * (bulge[0] + bulge[1]))) / per_leaf
+            qx = x + wp.dot(m.right, q)
+            qy = y + wp.dot(m.up, q)
+            lx = wp.min(lx, qx)
+            hx = wp.max(hx, qx)
+            ly = wp.min(ly, qy)
+            hy = wp.max(hy, qy)
+            ls = wp.min(ls, qx + qy)
+            hs = wp.max(hs, qx + qy)
+            ld = wp.min(ld, qx - qy)
+            hd = wp.max(hd, qx - qy)
+    o = LeafShadow()
+    o.xy = wp.vec4(lx, hx, ly, hy)
+    o.sums = wp.vec4(ls, hs, ld, hd)
+    return o
+
+
+@wp.func
+def shadow_leaf(
+    m: ShadowMap,
+    shapes: Shapes,
+    i: int,
+    x: float,
+    y: float,
+    z: float,
+    part: int,
+    slices: int,
+    depth_out: wp.array(dtype=wp.float32),
+):
+    """Draw blade ``i`` whose petiole's end is at texel (x, y) and depth ``z`` [m]; edge-on blades are left out."""
+    texels = IntBatch()
+    depths = FloatBatch()
+    r = shapes.a[i][3]
+    b4 = shapes.b[i]
+    c4 = shapes.c[i]
+    rib = xyz(b4)
+    up = xyz(c4)
+    across = wp.cross(rib, up)
+    slant = wp.dot(m.sun, up)
+    if wp.abs(slant) > 0.1:
+        # sun rays are parallel: leaf coordinates are affine in the texel, then one step for the curvature
+        bend = shapes.d[i]
+        number = int(b4[3])
+        per_leaf = m.texel / r
+        tu = wp.dot(m.sun, across) / slant
+        tv = wp.dot(m.sun, rib) / slant
+        rn = wp.dot(m.right, up)
+        un = wp.dot(m.up, up)
+        ux = (wp.dot(m.right, across) - rn * tu) * per_leaf
+        uy = (wp.dot(m.up, across) - un * tu) * per_leaf
+        vx = (wp.dot(m.right, rib) - rn * tv) * per_leaf
+        vy = (wp.dot(m.up, rib) - un * tv) * per_leaf
+        o = leaf_shadow(m, shapes, i, x, y, per_leaf)
+        su = wp.dot(m.sun, across)
+        sv = wp.dot(m.sun, rib)
+        for py in range(wp.max(int(o.xy[2]), 0) + part, wp.min(int(o.xy[3]) + 2, m.side), slices):
+            row = float(py)
+            first_x = wp.max(int(wp.max(wp.max(o.xy[0], wp.max(o.sums[0] - row, o.sums[2] + row)), 0.0)), 0)
+            last_x = wp.min(int(wp.max(wp.min(o.xy[1], wp.min(o.sums[1] - row, o.sums[3] + row)) + 2.0, 0.0)), m.side)
+            for start in range(first_x, last_x, BATCH):
+                run = wp.min(last_x - start, BATCH)
+                whole = (run + 7) // 8 * 8
+                lot = wp.int32(0)
+                while lot < whole:  # without a branch: eight texels at once
+                    fx = float(start + lot) - x
+                    u0 = ux * fx + uy * (row - y)
+                    v0 = vx * fx + vy * (row - y)
+                    w = leaf_height(bend, u0, v0)
+                    u = u0 + tu * w
+                    v = v0 + tv * w
+                    over = u > -0.99 and u < 0.99 and v > -0.74 and v < 1.24
+                    over = over and u0 > -1.2 and u0 < 1.2 and v0 > -1.0 and v0 < 1.5
+                    texel = int((v + 0.75) * 128.0) * 256 + int((u + 1.0) * 128.0)
+                    texels[lot] = wp.where(over, texel, 0)  # no blade has its corner
+                    depths[lot] = z - (su * u + sv * v + slant * leaf_height(bend, u, v)) * r
+                    lot += 1
+                for lot in range(run):
+                    texel = texels[lot]
+                    inside = int(shapes.outline[number, texel >> 8, texel & 255]) > 0
+                    write_depth(m, start + lot, py, wp.where(inside, depths[lot], FAR), depth_out)
+
+
+@wp.func
+def shadow_solid(m: ShadowMap, shapes: Shapes, i: int, part: int, slices: int, depth_out: wp.array(dtype=wp.float32)):
+    """Draw box, ellipsoid or triangle ``i``: one ray from the sun for each texel of its bounding sphere."""
+    kind = shapes.kind[i]
+    a4 = shapes.a[i]
+    b4 = shapes.b[i]
+    c4 = shapes.c[i]
+    r = a4[3]
+    o = xyz(a4)
+    reach_i = r
+    half = wp.vec3(r, c4[0], c4[1])
+    ray = wp.quat_rotate_inv(as_quat(b4), -m.sun)
+    if kind == TRIANGLE:
+        o = (xyz(a4) + xyz(b4) + xyz(c4)) / 3.0
+        reach_i = wp.max(wp.max(wp.length(xyz(a4) - o), wp.length(xyz(b4) - o)), wp.length(xyz(c4) - o))
+    else:
+        reach_i = wp.length(half)
+    p = o - m.corner
+    x = wp.dot(p, m.right) / m.texel
+    y = wp.dot(p, m.up) / m.texel
+    rt = reach_i / m.texel
+    for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
+        for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
+            from_sun = m.corner + m.right * (float(px) * m.texel) + m.up * (float(py) * m.texel) + m.sun * SUN_DISTANCE
+            t = FAR
+            if kind == TRIANGLE:
+                t = hit_triangle(xyz(a4) - from_sun, xyz(b4) - from_sun, xyz(c4) - from_sun, -m.sun)
+            else:
+                eye = wp.quat_rotate_inv(as_quat(b4), from_sun - xyz(a4))
+                if kind == BOX:
+                    t = hit_box(eye, ray, half)
+                else:
+                    t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
+            if t < FAR:
+                write_depth(m, px, py, t, depth_out)
+
+
 @wp.kernel
 def raster_shadow_map(
     # model
@@ -94,10 +310,12 @@ def raster_shadow_map(
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it."""
+    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it.
+
+    ball: [cluster] centre and radius [m]; which: [thread] clusters; smallest: thinner canes are left out [texel];
+    depth: [side * side] from SUN_DISTANCE above the map's corner along the sunlight [m], the least is kept.
+    """
     k, lane, part = wp.tid()
-    texels = IntBatch()
-    depths = FloatBatch()
     cluster = which[k]
     kind = clusters.kind[cluster]
     bound = ball[cluster]
@@ -110,155 +328,18 @@ def raster_shadow_map(
         first = clusters.first[cluster]
         for i in range(first + lane, first + clusters.size[cluster], lanes):
             a4 = shapes.a[i]
-            b4 = shapes.b[i]
-            c4 = shapes.c[i]
             p = xyz(a4) - m.corner
             x = wp.dot(p, m.right) / m.texel
             y = wp.dot(p, m.up) / m.texel
             z = SUN_DISTANCE - wp.dot(p, m.sun)
-            r = a4[3]
             if kind == SPHEROID:
-                rt = r / m.texel
-                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
-                    for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
-                        dx = float(px) - x
-                        dy = float(py) - y
-                        h = rt * rt - dx * dx - dy * dy
-                        if h > 0.0:
-                            write_depth(m, px, py, z - wp.sqrt(h) * m.texel, depth_out)
+                shadow_spheroid(m, a4[3], x, y, z, part, slices, depth_out)
             elif kind == CONE or kind == CYLINDER:
-                rb = wp.where(kind == CONE, b4[3], r)
-                if wp.max(r, rb) > smallest * m.texel:
-                    q = xyz(b4) - m.corner
-                    ex = wp.dot(q, m.right) / m.texel - x
-                    ey = wp.dot(q, m.up) / m.texel - y
-                    ez = SUN_DISTANCE - wp.dot(q, m.sun) - z
-                    wide = wp.max(wp.max(r, rb) / m.texel, 0.55)
-                    per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
-                    y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
-                    y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, m.side)
-                    for py in range(y0 + part, y1, slices):
-                        x0 = wp.min(x, x + ex) - wide
-                        x1 = wp.max(x, x + ex) + wide
-                        if wp.abs(ey) > 4.0:
-                            s = wp.clamp((float(py) - wide - y) / ey, 0.0, 1.0)
-                            t = wp.clamp((float(py) + wide - y) / ey, 0.0, 1.0)
-                            x0 = x + wp.min(ex * s, ex * t) - wide
-                            x1 = x + wp.max(ex * s, ex * t) + wide
-                        for px in range(wp.max(int(x0), 0), wp.min(int(x1) + 2, m.side)):
-                            fx = float(px) - x
-                            fy = float(py) - y
-                            s = wp.clamp((fx * ex + fy * ey) * per, 0.0, 1.0)
-                            fx -= s * ex
-                            fy -= s * ey
-                            rr = wp.max((r + (rb - r) * s) / m.texel, 0.55)
-                            h = rr * rr - fx * fx - fy * fy
-                            if h > 0.0:
-                                write_depth(m, px, py, z + ez * s - wp.sqrt(h) * m.texel, depth_out)
+                shadow_cone(m, shapes, i, smallest, x, y, z, part, slices, depth_out)
             elif kind == LEAF:
-                rib = xyz(b4)
-                up = xyz(c4)
-                across = wp.cross(rib, up)
-                slant = wp.dot(m.sun, up)
-                if wp.abs(slant) > 0.1:
-                    # sun rays are parallel: leaf coordinates are affine in the texel, then one step for the curvature
-                    bend = shapes.d[i]
-                    number = int(b4[3])
-                    per_leaf = m.texel / r
-                    tu = wp.dot(m.sun, across) / slant
-                    tv = wp.dot(m.sun, rib) / slant
-                    rn = wp.dot(m.right, up)
-                    un = wp.dot(m.up, up)
-                    ux = (wp.dot(m.right, across) - rn * tu) * per_leaf
-                    uy = (wp.dot(m.up, across) - un * tu) * per_leaf
-                    vx = (wp.dot(m.right, rib) - rn * tv) * per_leaf
-                    vy = (wp.dot(m.up, rib) - un * tv) * per_leaf
-                    # octagon around the blade as the sun sees it: bounds of x, y, x + y, x - y
-                    bulge = leaf_bulge(shapes.hull, number, bend)
-                    lx = float(1.0e9)
-                    hx = float(-1.0e9)
-                    ly = float(1.0e9)
-                    hy = float(-1.0e9)
-                    ls = float(1.0e9)
-                    hs = float(-1.0e9)
-                    ld = float(1.0e9)
-                    hd = float(-1.0e9)
-                    for n in range(8):
-                        corner = shapes.hull[number, n]
-                        flat = across * corner[0] + rib * corner[1]
-                        height = leaf_height(bend, corner[0], corner[1]) - bulge[1]
-                        for level in range(2):
-                            q = (flat + up * (height + float(level) * (bulge[0] + bulge[1]))) / per_leaf
-                            qx = x + wp.dot(m.right, q)
-                            qy = y + wp.dot(m.up, q)
-                            lx = wp.min(lx, qx)
-                            hx = wp.max(hx, qx)
-                            ly = wp.min(ly, qy)
-                            hy = wp.max(hy, qy)
-                            ls = wp.min(ls, qx + qy)
-                            hs = wp.max(hs, qx + qy)
-                            ld = wp.min(ld, qx - qy)
-                            hd = wp.max(hd, qx - qy)
-                    su = wp.dot(m.sun, across)
-                    sv = wp.dot(m.sun, rib)
-                    for py in range(wp.max(int(ly), 0) + part, wp.min(int(hy) + 2, m.side), slices):
-                        row = float(py)
-                        first_x = wp.max(int(wp.max(wp.max(lx, wp.max(ls - row, ld + row)), 0.0)), 0)
-                        last_x = wp.min(int(wp.max(wp.min(hx, wp.min(hs - row, hd + row)) + 2.0, 0.0)), m.side)
-                        for start in range(first_x, last_x, BATCH):
-                            run = wp.min(last_x - start, BATCH)
-                            whole = (run + 7) // 8 * 8
-                            lot = wp.int32(0)
-                            while lot < whole:  # without a branch: eight texels at once
-                                fx = float(start + lot) - x
-                                u0 = ux * fx + uy * (row - y)
-                                v0 = vx * fx + vy * (row - y)
-                                w = leaf_height(bend, u0, v0)
-                                u = u0 + tu * w
-                                v = v0 + tv * w
-                                over = u > -0.99 and u < 0.99 and v > -0.74 and v < 1.24
-                                over = over and u0 > -1.2 and u0 < 1.2 and v0 > -1.0 and v0 < 1.5
-                                texel = int((v + 0.75) * 128.0) * 256 + int((u + 1.0) * 128.0)
-                                texels[lot] = wp.where(over, texel, 0)  # no blade has its corner
-                                depths[lot] = z - (su * u + sv * v + slant * leaf_height(bend, u, v)) * r
-                                lot += 1
-                            for lot in range(run):
-                                texel = texels[lot]
-                                inside = int(shapes.outline[number, texel >> 8, texel & 255]) > 0
-                                write_depth(m, start + lot, py, wp.where(inside, depths[lot], FAR), depth_out)
+                shadow_leaf(m, shapes, i, x, y, z, part, slices, depth_out)
             else:
-                o = xyz(a4)
-                reach_i = r
-                half = wp.vec3(r, c4[0], c4[1])
-                ray = wp.quat_rotate_inv(as_quat(b4), -m.sun)
-                if kind == TRIANGLE:
-                    o = (xyz(a4) + xyz(b4) + xyz(c4)) / 3.0
-                    reach_i = wp.max(wp.max(wp.length(xyz(a4) - o), wp.length(xyz(b4) - o)), wp.length(xyz(c4) - o))
-                else:
-                    reach_i = wp.length(half)
-                p = o - m.corner
-                x = wp.dot(p, m.right) / m.texel
-                y = wp.dot(p, m.up) / m.texel
-                rt = reach_i / m.texel
-                for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
-                    for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
-                        from_sun = (
-                            m.corner
-                            + m.right * (float(px) * m.texel)
-                            + m.up * (float(py) * m.texel)
-                            + m.sun * SUN_DISTANCE
-                        )
-                        t = FAR
-                        if kind == TRIANGLE:
-                            t = hit_triangle(xyz(a4) - from_sun, xyz(b4) - from_sun, xyz(c4) - from_sun, -m.sun)
-                        else:
-                            eye = wp.quat_rotate_inv(as_quat(b4), from_sun - xyz(a4))
-                            if kind == BOX:
-                                t = hit_box(eye, ray, half)
-                            else:
-                                t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
-                        if t < FAR:
-                            write_depth(m, px, py, t, depth_out)
+                shadow_solid(m, shapes, i, part, slices, depth_out)
 
 
 @wp.func

@@ -13,6 +13,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -21,8 +22,6 @@ from vinesim.scene.values import Contact, Parting
 
 STUB_MASS = 1e-3
 """What stays of a bunch on the tree [kg]."""
-PATIENCE = 3
-"""[tick] A peduncle parts when it has been strained too much for so long: one tick's peak is not a pull."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -45,7 +44,15 @@ class Blade:
 class DetachmentMonitor:
     """Watches the peduncles of awake trees and the blades that close, and takes off what parts."""
 
-    def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver) -> None:
+    def __init__(
+        self,
+        plants: ArticulationSolver,
+        rigid: RigidWorld,
+        contact_solver: ContactSolver,
+        parameters: PhysicsParameters = PhysicsParameters(),
+    ) -> None:
+        """``parameters``: ``detachment_duration`` says how long a peduncle must be overloaded."""
+        self._overload_limit = parameters.steps(parameters.detachment_duration)
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
@@ -90,7 +97,7 @@ class DetachmentMonitor:
             self._overloaded_steps[bunches] = 0
             return
         self._overloaded_steps[bunches] = np.where(strained, self._overloaded_steps[bunches] + 1, 0)
-        for i in np.flatnonzero(self._overloaded_steps[bunches] >= PATIENCE):
+        for i in np.flatnonzero(self._overloaded_steps[bunches] >= self._overload_limit):
             bunch = int(bunches[i])
             self._pick(
                 bunch, "pull" if pulled[i] >= bent[i] else "bend", self._hardest_pressing_actor(bunch), carried[i]

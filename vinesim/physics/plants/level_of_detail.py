@@ -1,31 +1,27 @@
-"""How finely bunches move: berries in clusters where somebody is near or looks closely, one compound each elsewhere.
+"""Level of detail of bunches: berries move in clusters where an actor is near or watches, as one compound elsewhere.
 
-Switching changes no pose and no momentum (:meth:`ArticulationSolver.refine`, :meth:`ArticulationSolver.coarsen`), so it may happen in any tick.
-Refining is never late: it happens in the tick in which somebody's box reaches into the tree's. Coarsening waits until
-everybody is gone for a while and the clusters have come to rest against their bunch.
+Switching changes no pose and no momentum (:meth:`ArticulationSolver.refine`, :meth:`ArticulationSolver.coarsen`), so
+it may happen in any step. Refining is never late: it happens in the step in which an actor's box reaches into the
+tree's. Coarsening waits until no actor has been near for a while and the clusters have come to rest on their bunch.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-
-LINGER = 100
-"""[tick] A tree stays fine for so long after the last one has gone."""
-QUIET = 0.05
-"""[rad/s] Clusters are at rest while all of a tree's turn slower than this against what they hang on."""
-PATIENCE = 25
-"""[tick] So long must they be at rest: longer than the turning point of any swing of theirs."""
 
 
 class LevelOfDetail:
-    """Refines the trees that somebody is near or watches, and coarsens them when that is over."""
+    """Refines the trees that an actor is near to or watches, and coarsens them when that is over."""
 
-    def __init__(
-        self, plants: ArticulationSolver, *, linger: int = LINGER, quiet: float = QUIET, patience: int = PATIENCE
-    ) -> None:
-        self.plants, self.linger, self.quiet, self.patience = plants, linger, quiet, patience
+    def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` say when a tree is coarsened."""
+        p = parameters
+        self.plants, self.rest_rate = plants, p.detail_rate
+        self.fine_steps, self.rest_steps = p.steps(p.detail_duration), p.steps(p.detail_rest_duration)
+        """Steps that a tree stays fine with nobody near, and that its clusters must be at rest."""
         model = plants.model
         trees = len(model.tree_first)
         self._clustered = np.flatnonzero(model.bunch_clusters > 0)
@@ -47,7 +43,7 @@ class LevelOfDetail:
         return np.flatnonzero(self.plants.state.tree_fine)
 
     def update(self, near: np.ndarray) -> None:
-        """Before ``predict()``: ``near`` [k] are the awake trees that somebody reaches into."""
+        """Before ``predict()``: ``near`` [k] are the awake trees that an actor reaches into."""
         plants, state = self.plants, self.plants.state
         attached = int(np.count_nonzero(state.bunch_attached))
         if attached != self._attached:  # a tree whose bunches are gone has nothing to refine
@@ -63,8 +59,8 @@ class LevelOfDetail:
             self._wanted[wanted] = True
             self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)
             self._wanted[wanted] = False
-            self._still[fine] = np.where(self._rate(fine) < self.quiet, self._still[fine] + 1, 0)
-            done = fine[(self._alone[fine] > self.linger) & (self._still[fine] >= self.patience)]
+            self._still[fine] = np.where(self._rate(fine) < self.rest_rate, self._still[fine] + 1, 0)
+            done = fine[(self._alone[fine] > self.fine_steps) & (self._still[fine] >= self.rest_steps)]
             if len(done):
                 plants.coarsen(done)
         fresh = wanted[~state.tree_fine[wanted]]

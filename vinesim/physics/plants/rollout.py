@@ -118,9 +118,7 @@ class Rollout:
             find_device(device),
         )
         self.state = State.at_rest(model)
-        plants = ArticulationSolver(
-            model, self.state, buffers=DeviceBuffers("cpu")
-        )  # what the kernels are given there they are given here
+        plants = ArticulationSolver(model, self.state, buffers=DeviceBuffers("cpu"))  # for the arrays of its kernels
         if fine:
             plants.refine(np.arange(len(model.tree_first)))
         self._host = plants.buffers.host

@@ -27,7 +27,9 @@ def validate(model: Model, state: State) -> None:
     owner = np.repeat(np.arange(len(model.tree_first)), model.tree_size)
     start = np.cumsum(model.tree_size) - model.tree_size
     if len(owner) != count or (model.tree_first != start).any() or (model.tree_size < 1).any():
-        raise ValueError("tree_first and tree_size do not tile the bodies; build the model with grow.assemble")
+        raise ValueError(
+            "tree_first and tree_size do not tile the bodies; build the model with vinesim.scene.builder.assemble"
+        )
     refuse(model.body_tree != owner, "is listed in tree", model.body_tree, "body_tree must agree with tree_first")
     parent = model.body_parent
     refuse(parent >= np.arange(count), "parent", parent, "a parent stands before its children (no cycles); reorder")

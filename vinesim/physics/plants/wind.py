@@ -13,17 +13,12 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.kernels.articulation.forces import AIR_DENSITY
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import GRAVITY
 
 GUST_WAVES = 48
 """Plane waves of which gusts are made."""
-
-WAKE_DRAG_RATIO = 0.05
-"""A sleeping tree wakes when the drag on it has changed by this share of its weight since it fell asleep."""
-
-ROUND = 32
-"""[tick] In so many updates all sleepers are looked at once, an equal number in each."""
 
 
 class Wind:
@@ -65,11 +60,15 @@ class Wind:
         return self.mean + np.cos((points - self.mean * time) @ self._wave.T + self._phase) @ self._sway
 
     def update(
-        self, plants: ArticulationSolver, time: float, observers: tuple[np.ndarray, float] | None = None
+        self,
+        plants: ArticulationSolver,
+        time: float,
+        observers: tuple[np.ndarray, float] | None = None,
+        parameters: PhysicsParameters = PhysicsParameters(),
     ) -> None:
         """Set ``plants.tree_air`` of awake trees for the next tick; wake sleepers that the wind would move.
 
-        Wind blows everywhere and gusts let nothing rest, but ten thousand awake trees fit in no tick. ``reach`` =
+        Wind blows everywhere and gusts let nothing rest, but ten thousand awake trees fit in no tick. ``observers`` =
         (points [n, 3] m, distance [m]) says who is there to see: only trees whose foot is so near to one of the points
         feel the wind. All others keep the air they felt last, so that they come to rest in it and stay asleep.
         """
@@ -83,13 +82,14 @@ class Wind:
         awake = self._near_observers(plants.awake, observers)
         plants.tree_air[awake] = self.velocity_at(self._foot[awake], time)
 
-        self._round = (self._round + 1) % ROUND
-        some = np.arange(self._round, len(self._foot), ROUND)
+        rounds = parameters.steps(parameters.wind_check_period)  # all sleepers are looked at once in so many steps
+        self._round = (self._round + 1) % rounds
+        some = np.arange(self._round, len(self._foot), rounds)
         some = self._near_observers(some[~plants.state.tree_awake[some] & (self._area[some] > 0.0)], observers)
         air, felt = self.velocity_at(self._foot[some], time), plants.tree_air[some].astype(float)
         change = air * np.linalg.norm(air, axis=-1, keepdims=True) - felt * np.linalg.norm(felt, axis=-1, keepdims=True)
         force = 0.5 * AIR_DENSITY * self._area[some] * np.linalg.norm(change, axis=-1)
-        stirred = force > WAKE_DRAG_RATIO * self._weight[some]
+        stirred = force > parameters.wind_wake_load * self._weight[some]
         plants.tree_air[some[stirred]] = air[stirred]
         plants.wake(some[stirred])
 

@@ -29,10 +29,17 @@ from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 from vinesim import frames
 from vinesim.ros.commands.types import BaseVelocity, JointPositions, JointTrajectory
 from vinesim.ros.messages.transforms import split_time
+from vinesim.scene.camera_geometry import (
+    DISTORTION,
+    DISTORTION_MODEL,
+    POINT_DTYPE,
+    depth_millimetres,
+    intrinsic_matrix,
+    write_points,
+)
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
-COLOURED_POINT = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("rgb", "u4")])
 """One point of a depth camera's cloud; rgb is 0x00RRGGBB, which PointCloud2 carries as a float32 (PCL's way)."""
 
 LIDAR_POINT = np.dtype(
@@ -129,9 +136,8 @@ def depth_image(frame: CameraFrame) -> Image:
 
 
 def depth_image_millimetres(frame: CameraFrame) -> Image:
-    """Depth along z [mm], 16UC1; 0 where there is none (REP-118, OpenNI's form)."""
-    millimetres = 1000.0 * np.where(np.isfinite(frame.depth), frame.depth, 0.0)
-    return _image(frame, np.clip(np.rint(millimetres), 0, 65535), "16UC1", np.uint16)
+    """Depth along z [mm], 16UC1; 0 where there is none or it is beyond 65.535 m (REP-118)."""
+    return _image(frame, depth_millimetres(frame.depth), "16UC1", np.uint16)
 
 
 def label_image(frame: CameraFrame) -> Image:
@@ -158,9 +164,9 @@ def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
 def camera_info(info: CameraInfo, time: float) -> CameraInfoMessage:
     """Intrinsics: plumb_bob without distortion, rectification is the identity."""
     message = CameraInfoMessage(header=header(time, info.frame_id), width=info.width, height=info.height)
-    message.distortion_model = "plumb_bob"
-    message.d = array.array("d", bytes(5 * 8))
-    message.k = [info.fx, 0.0, info.cx, 0.0, info.fy, info.cy, 0.0, 0.0, 1.0]
+    message.distortion_model = DISTORTION_MODEL
+    message.d = array.array("d", DISTORTION)
+    message.k = intrinsic_matrix(info)
     message.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     message.p = [info.fx, 0.0, info.cx, 0.0, 0.0, info.fy, info.cy, 0.0, 0.0, 0.0, 1.0, 0.0]
     return message
@@ -168,14 +174,8 @@ def camera_info(info: CameraInfo, time: float) -> CameraInfoMessage:
 
 def depth_cloud(frame: CameraFrame) -> PointCloud2:
     """Depth and colour as an organised cloud in the optical frame; NaN where there is no depth."""
-    message, points = _cloud(frame.time, frame.info.frame_id, COLOURED_POINT, frame.info.height, frame.info.width)
-    depth = np.where(np.isfinite(frame.depth), frame.depth, np.float32(np.nan))
-    across, down = _rays(frame.info)
-    np.multiply(depth, across, out=points["x"])
-    np.multiply(depth, down[:, None], out=points["y"])
-    points["z"] = depth
-    red, green, blue = (frame.rgb[..., i].astype(np.uint32) for i in range(3))
-    points["rgb"] = red << 16 | green << 8 | blue
+    message, points = _cloud(frame.time, frame.info.frame_id, POINT_DTYPE, frame.info.height, frame.info.width)
+    write_points(frame, points)
     message.is_dense = False
     return message
 
@@ -278,14 +278,6 @@ def _fields(point: np.dtype) -> tuple[PointField, ...]:
     return tuple(
         PointField(name=name, offset=offset, datatype=_FIELD_TYPES[kind], count=1) for name, kind, offset in described
     )
-
-
-@functools.lru_cache(maxsize=16)
-def _rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
-    """x per z of every column [width] and y per z of every row [height]; pixel centres are whole numbers."""
-    across = (np.arange(info.width, dtype=np.float32) - np.float32(info.cx)) / np.float32(info.fx)
-    down = (np.arange(info.height, dtype=np.float32) - np.float32(info.cy)) / np.float32(info.fy)
-    return across, down
 
 
 def _bytes(values: np.ndarray) -> array.array:

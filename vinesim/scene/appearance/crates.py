@@ -81,8 +81,8 @@ def crate_shapes(size: tuple[float, float, float], number: int, name: str = "cra
             wall(-reach, reach, shelf, height, inner)
             wall(-reach, reach, 0.0, t + one.slat, thin)
             for end in (-1.0, 1.0):
-                edges = sorted((end * reach, end * (half - one.post)))
-                wall(*edges, 0.0, shelf, inner)
+                low, high = sorted((end * reach, end * (half - one.post)))
+                wall(low, high, 0.0, shelf, inner)
             level = t + one.slat + one.gap
             hole = one.grip[0] / 2.0 if along else 0.0
             while level < shelf - 0.3 * one.gap:

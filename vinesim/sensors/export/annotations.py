@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 
 from vinesim.scene.berries import VARIETIES
-from vinesim.scene.ids import Kind, Organ, thing, thing_name
+from vinesim.scene.camera_geometry import DISTORTION, DISTORTION_MODEL, intrinsic_matrix
+from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
-"""What annotations tell of a bunch beside what COCO asks for."""
+"""Fields of a bunch in annotations beside those of COCO."""
 MIN_ANNOTATED_PIXELS = 16
 """A bunch is annotated (COCO, YOLO) if at least so many pixels show it; records name all."""
 
@@ -29,7 +30,7 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
     from pycocotools import mask as coco
 
     encoded = coco.encode(np.asfortranarray(mask, np.uint8))
-    return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}
+    return {"size": [int(n) for n in encoded["size"]], "counts": encoded["counts"].decode("ascii")}  # pyright: ignore[reportAttributeAccessIssue]  # bytes, not str
 
 
 def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
@@ -38,9 +39,9 @@ def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, A
         "model": model,
         "width": info.width,
         "height": info.height,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5,
-        "k": [info.fx, 0.0, info.cx, 0.0, info.fy, info.cy, 0.0, 0.0, 1.0],
+        "distortion_model": DISTORTION_MODEL,
+        "d": list(DISTORTION),
+        "k": intrinsic_matrix(info),
         "frame": "optical (REP-103): x right, y down, z forward",
         "position": pose[:3].tolist(),
         "quaternion_xyzw": pose[3:].tolist(),
@@ -57,7 +58,7 @@ def bunch_records(
     return [
         {
             "bunch": one.bunch,
-            "name": thing_name(thing(Kind.BUNCH, one.bunch)),
+            "name": object_name(object_id(ObjectKind.BUNCH, one.bunch)),
             "label": one.label,
             "tree": one.tree,
             "variety": VARIETIES[one.variety].name,
@@ -171,7 +172,7 @@ def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:
 
 
 def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
-    """A picture with what is true of it: visible boxes green, amodal boxes where they differ white, cut points yellow
+    """A picture with its ground truth: visible boxes green, amodal boxes where they differ white, cut points yellow
     discs (rings where hidden), and of each bunch its number, berries seen and share that is hidden.
     """
     scale = max(1, round(1280 / rgb.shape[1]))

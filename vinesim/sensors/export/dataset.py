@@ -1,4 +1,4 @@
-"""Random pictures of random vineyards with all that is true of them, as files that a killed run leaves whole.
+"""Data sets: random pictures of random vineyards with their ground truth, in files that a killed run leaves whole.
 
 What an image shows follows from (plan, its number) alone: any process may draw it, in any order, and gets the same
 bits. An image is done when its record is there; the record is written last, and every file is renamed into place.
@@ -19,6 +19,7 @@ import numpy as np
 import vinesim
 from vinesim import frames
 from vinesim.scene.berries import VARIETIES
+from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
@@ -34,21 +35,21 @@ from vinesim.sensors.spec_file import SensorError
 from vinesim.sensors.truth import truth
 
 IMAGES_PER_VINEYARD = 5
-"""So many images are taken in one vineyard before another one is grown."""
+"""Images of one vineyard before the next one is generated."""
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 16, 4096
 """Width and height of pictures [px]."""
 CAMERA_HEIGHT = (0.7, 1.7)
-"""Of the camera above the ground [m]: robots' arms and heads."""
+"""Height of the camera above the ground [m]: robots' arms and heads."""
 BUNCH_DISTANCE = (0.35, 1.8)
-"""From the camera to the bunch it looks at [m]."""
+"""Distance from the camera to the bunch it looks at [m]."""
 MAX_ACTOR_DISTANCE = 2.5
-"""So far from where something happens hangs the bunch that is looked at [m]."""
+"""Horizontal distance [m] from the centre of the activity to the bunch in view, at most."""
 MIN_CLEARANCE = 0.15
-"""What is nearer [m] than this and fills more than a fiftieth of the picture makes it a bad one."""
+"""A picture is rejected if more than a fiftieth of it is nearer than this [m]."""
 LATITUDE = np.radians(41.6)
 """Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
 MIN_ACTOR_SHARE = 0.01
-"""Share of the pixels that show somebody or something else than the vineyard, where something happens."""
+"""Least share of the pixels that show actors or boxes, where there are any."""
 _MAX_TRIES, _TRIES_WITH_ACTORS = 60, 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 
@@ -72,14 +73,14 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
 
 
 class SnapshotSource(Protocol):
-    """What moves in an image and who is there beside the vines; sensors draw it and do not know where it comes from."""
+    """Random scenes with actors and wind; sensors draw the snapshots and do not know how they are made."""
 
     def settings(self) -> dict[str, Any]:
-        """All that decides what happens, as JSON."""
+        """All that decides the scenes, as JSON."""
         ...
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
-        """What there is, near which point [2] m of the ground to look, and a record of it; None if nothing happens.
+        """Snapshot, point [2] m of the ground to look at, and a record of it; None for the vineyard at rest.
 
         It follows from the model and the random numbers alone. ``actors`` of the record are what
         :func:`formats.actors` takes.
@@ -97,7 +98,7 @@ class DatasetPlan:
     size: tuple[int, int] | None = None
     """Width and height [px]; the camera's own unless given."""
     snapshot_source: SnapshotSource | None = None
-    """Without it plants hang at rest and nobody is there."""
+    """Actors and wind; without it all plants hang at rest."""
     renderer: str = "warp"
 
     def settings(self) -> dict[str, Any]:
@@ -130,10 +131,10 @@ class VineyardRenderer:
         self.model = generate(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
-        self.still: Snapshot = rest_snapshot(self.model)
+        self.rest: Snapshot = rest_snapshot(self.model)
         self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
         self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer)
-        self.primitives.update(self.still)
+        self.primitives.update(self.rest)
         self.caster = RayCaster(self.primitives)
         self.spec = CameraSpec.load(plan.camera)
         self.info = resized_intrinsics(self.spec, plan.size)
@@ -142,13 +143,14 @@ class VineyardRenderer:
         """Write everything about one image; its record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _random_sun(rng)
-        snapshot, near, happens = self._pose_scene(image)
-        seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in happens.get("actors", [])])
+        snapshot, near, activity = self._pose_scene(image)
+        seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
         truths = truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image)
         frame = camera.render(self.primitives, seen.pose)
+        assert frame.exact_depth is not None
         bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)
-        happens["actors"] = formats.actor_records(happens.get("actors", []), seen.labels)
+        activity["actors"] = formats.actor_records(activity.get("actors", []), seen.labels)
         name = f"{image:06d}"
         record = {
             "image": image,
@@ -161,14 +163,14 @@ class VineyardRenderer:
                 "yellow": self.scene.season.yellow,
             },
             "sun": {"hour": hour, "direction": list(sun)},
-            **happens,
+            **activity,
             "camera": formats.camera_record(self.spec.model, self.info, seen.pose),
             "bunches": bunches,
         }
         images = {
             "images": frame.rgb,
-            "depth": picture.depth_millimetres(frame.exact_depth),
-            "measured": picture.depth_millimetres(frame.depth),
+            "depth": depth_millimetres(frame.exact_depth),
+            "measured": depth_millimetres(frame.depth),
             "ids": formats.encode_labels(frame.labels),
             "berries": formats.encode_berry_numbers(seen),
         }
@@ -181,22 +183,22 @@ class VineyardRenderer:
             formats.write_json(part, record)
 
     def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
-        """What there is in an image, drawn; whatever was there in the image before leaves no trace."""
-        every = np.arange(len(self.model.tree_first))
-        self.primitives.update(self.still, every)
-        life = self.plan.snapshot_source
-        happens = life and life.snapshot(self.model, np.random.default_rng([self.plan.seed, 5, image]))
-        if happens is None:
-            return self.still, None, {}
-        self.primitives.update(happens[0], every)
-        return happens
+        """Pose the primitives for one image, whatever the image before showed: snapshot, place [2] m, record of it."""
+        all_trees = np.arange(len(self.model.tree_first))
+        self.primitives.update(self.rest, all_trees)
+        source = self.plan.snapshot_source
+        activity = source.snapshot(self.model, np.random.default_rng([self.plan.seed, 5, image])) if source else None
+        if activity is None:
+            return self.rest, None, {}
+        self.primitives.update(activity[0], all_trees)
+        return activity
 
     def _choose_view(
         self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
     ) -> truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 
-        If something happens, the bunch hangs ``near`` there, and somebody of the ``actors`` [m] is seen too, if a
+        If there are actors, the bunch hangs ``near`` them, and one of the ``actors`` [m] is seen too, if a
         place for that is soon found.
         """
         model = self.model
@@ -302,7 +304,7 @@ def _check_same_settings(there: dict[str, Any], wanted: dict[str, Any], folder: 
 
 
 def remove_partial_files(folder: pathlib.Path) -> None:
-    """Take away what a killed run left half-written."""
+    """Remove files that a killed run left unfinished."""
     for part in folder.glob("**/.*.part"):
         part.unlink(missing_ok=True)
 

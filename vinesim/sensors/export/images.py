@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from vinesim import frames
+from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
@@ -35,12 +36,6 @@ def depth_colours(depth: np.ndarray, farthest: float = 6.0) -> np.ndarray:
     colours[~np.isfinite(depth)] = 0
     colours[np.isposinf(depth)] = 255
     return colours
-
-
-def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth [height, width] m as the 16UC1 of REP-118: millimetres, 0 where nothing was measured."""
-    millimetres = np.where(np.isfinite(depth), depth * 1000.0, 0.0)
-    return np.where(millimetres < 65535.5, np.round(millimetres), 0.0).astype(np.uint16)
 
 
 _ORGAN_COLOUR = {

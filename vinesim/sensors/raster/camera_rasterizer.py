@@ -142,6 +142,7 @@ class CameraRasterizer:
 
     def _rasterize(self, primitives: PosedPrimitives, lens: Pinhole, seen: np.ndarray) -> None:
         """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
+        assert self._keys is not None, "these kernels draw on a CPU only"
         self._keys.fill(int(EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vinesim.kernels.raster import primitives
 from vinesim.sensors.raster.primitive_arrays import CONE
@@ -15,41 +16,80 @@ class Batch:
     """Primitives of one kind in the frames of their carriers; neither groups nor bunches ever mix in one cluster."""
 
     kind: int
+    """A number of :data:`vinesim.sensors.raster.primitive_arrays.KINDS`."""
     a: np.ndarray
+    """[n, 4] float32; ``a`` to ``d`` as in :mod:`vinesim.kernels.raster.primitives`."""
     b: np.ndarray
     c: np.ndarray
     d: np.ndarray
     material: np.ndarray
+    """[n] int32, a number of :mod:`vinesim.kernels.shading.materials`."""
     tint: np.ndarray
+    """[n, 3] linear RGB reflectance, 0.004 to 1."""
     organ: np.ndarray
+    """[n] int32, :class:`vinesim.scene.ids.Organ`."""
     label: np.ndarray
+    """[n] int32, :func:`vinesim.scene.ids.label`."""
     carrier: np.ndarray
+    """[n] int32, row of the pose that moves it."""
     group: np.ndarray
+    """[n] int32, primitives of two groups never share a cluster."""
     bunch: np.ndarray
-    """Which bunch a primitive belongs to while that hangs; -1 for none."""
+    """[n] int32, bunch it belongs to while that hangs; -1 for none."""
 
     def __len__(self) -> int:
         return len(self.a)
 
 
-def make_batch(kind: int, a, *, b=0.0, c=0.0, d=0.0, material, tint, organ, label, carrier, group, bunch=-1) -> Batch:
-    """A batch with scalars and rows broadcast to the count of ``a`` [n, 4]."""
+def make_batch(
+    kind: int,
+    a: ArrayLike,
+    *,
+    b: ArrayLike = 0.0,
+    c: ArrayLike = 0.0,
+    d: ArrayLike = 0.0,
+    material: ArrayLike,
+    tint: ArrayLike,
+    organ: ArrayLike,
+    label: ArrayLike,
+    carrier: ArrayLike,
+    group: ArrayLike,
+    bunch: ArrayLike = -1,
+) -> Batch:
+    """A batch of primitives of one ``kind``; scalars and single rows are broadcast to the count of ``a`` [n, 4]."""
     a = np.atleast_2d(np.asarray(a, np.float32))
     n = len(a)
-    wide = [np.broadcast_to(np.asarray(v, np.float32), (n, 4)) for v in (b, c, d)]
-    flat = [np.broadcast_to(np.asarray(v, np.int32), n) for v in (organ, label, carrier, group, bunch)]
-    tint = np.broadcast_to(np.clip(np.asarray(tint, np.float32), 0.004, 1.0), (n, 3))
-    return Batch(kind, a, *wide, np.broadcast_to(np.asarray(material, np.int32), n), tint, *flat)
+
+    def rows(values: ArrayLike) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, np.float32), (n, 4))
+
+    def integers(values: ArrayLike) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, np.int32), n)
+
+    return Batch(
+        kind=kind,
+        a=a,
+        b=rows(b),
+        c=rows(c),
+        d=rows(d),
+        material=integers(material),
+        tint=np.broadcast_to(np.clip(np.asarray(tint, np.float32), 0.004, 1.0), (n, 3)),
+        organ=integers(organ),
+        label=integers(label),
+        carrier=integers(carrier),
+        group=integers(group),
+        bunch=integers(bunch),
+    )
 
 
-def stack_columns(*parts) -> np.ndarray:
+def stack_columns(*parts: ArrayLike) -> np.ndarray:
     """Vectors [n, k] and scalars, one or [n], side by side."""
     columns = [np.asarray(p, float).reshape(-1, 1) if np.ndim(p) < 2 else np.asarray(p, float) for p in parts]
     n = max(len(c) for c in columns)
     return np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in columns], 1)
 
 
-def placeholder_batch(still: int) -> Batch:
+def placeholder_batch(static_carrier: int) -> Batch:
     """A stand-in for a world without plants, far below the ground: no array is ever empty."""
     return make_batch(
         CONE,
@@ -59,6 +99,6 @@ def placeholder_batch(still: int) -> Batch:
         tint=0.0,
         organ=0,
         label=0,
-        carrier=still,
+        carrier=static_carrier,
         group=0,
     )

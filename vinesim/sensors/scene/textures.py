@@ -28,7 +28,7 @@ def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def leaf_scale(shape: np.ndarray) -> np.ndarray:
+def leaf_scale(shape: int | np.ndarray) -> np.ndarray:
     """Length from petiole to tip in units of ``Model.leaf_size``, by outline [shape]."""
     tips = np.array([leaves.blade_outline(np.zeros(1), i)[0] for i in range(leaves.SHAPE_COUNT)])
     return tips[shape]

@@ -1,4 +1,4 @@
-"""What a picture truly shows: which bunches, how much of each, where, and how every pixel moves.
+"""Ground truth of pictures: which bunches are seen, how much of each, where, and how every pixel moves.
 
 All of it follows from the primitives, not from the picture: noise and range limits of a camera change nothing here.
 Everything is tied to ids that are the same on every client: bunch numbers of the model, and berry numbers as
@@ -14,10 +14,10 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.kernels.raster.primitives import FAR
+from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
-from vinesim.sensors.camera import point_cloud
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
@@ -83,7 +83,7 @@ class PixelBuffers:
     berries: np.ndarray
     """[height, width] int32, number of the berry in its bunch; -1 where none is seen."""
     carrier_poses: np.ndarray
-    """[primitive, 7] poses of what carries the primitives, for :func:`flow`."""
+    """[primitive, 7] poses of what carries the primitives, for :func:`optical_flow`."""
     layout_version: int
     """:attr:`Primitives.built`: only numbers of the same set of primitives mean the same."""
 
@@ -190,7 +190,7 @@ def bunch_truths(
 ) -> tuple[BunchTruth, ...]:
     """Every bunch of which some pixel would be seen if it were alone, by index.
 
-    ``primitives`` as they were posed by ``view`` when ``seen`` was taken; ``caster`` saves building one.
+    ``primitives`` as posed by ``snapshot`` when ``seen`` was taken; ``caster`` saves building one.
     """
     model, info = primitives.model, seen.info
     alone, lens = CameraRasterizer(info.width, info.height, primitives.device), pinhole(info, seen.pose)
@@ -200,7 +200,7 @@ def bunch_truths(
     fruit = fruit[np.isin(named[fruit], named[fruit][alone.cluster_distances(primitives, lens)[fruit] < float(FAR)])]
     fruit = fruit[primitives.clusters_shown()[fruit]]
     count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
-    posed = [getattr(primitives.shapes, k).numpy() for k in "ab"]
+    a, b = primitives.shapes.a.numpy(), primitives.shapes.b.numpy()
     loose = {one.index: k for k, one in enumerate(snapshot.visuals) if one.organ == Organ.BUNCH}
     cuts = {
         int(bunch): cut_point(model, snapshot.body_q, int(bunch))
@@ -220,19 +220,19 @@ def bunch_truths(
         visible = seen.labels[window] == label(Organ.BUNCH, bunch)
         parts = np.concatenate(
             [
-                np.arange(primitives.cluster_first[k], primitives.cluster_first[k] + primitives.cluster_size[k])
-                for k in mine
+                first + np.arange(size)
+                for first, size in zip(primitives.cluster_first[mine], primitives.cluster_size[mine], strict=True)
             ]
         )
         attached = bool(snapshot.bunch_attached[bunch])
         turn = (snapshot.body_q[model.bunch_body[bunch]] if attached else snapshot.visual_q[loose[bunch]])[3:]
         frame, size = _box_around(
-            *(p[parts] for p in posed), np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
+            a[parts], b[parts], np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
         )
         pixel = None
         if attached:
             local = frames.rotate(frames.conjugate(seen.pose[3:]), cuts[bunch] - seen.pose[:3])
-            pixel = point_cloud.project_points(local, info) if local[2] > 0.0 else None
+            pixel = project_points(local, info) if local[2] > 0.0 else None
         found.append(
             BunchTruth(
                 bunch=bunch,
@@ -292,7 +292,7 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
     # as a difference, so that what did not move does not move by a rounding either
     still = frames.rotate(before[:, 3:], attached) + before[:, :3]
     moved[solid] += frames.rotate(after[:, 3:], attached) + after[:, :3] - still
-    there = point_cloud.project_points(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
+    there = project_points(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
     shift = np.full((info.height, info.width, 2), np.nan)
     shift[v, u] = there - np.stack([u, v], 1)
     shown = np.zeros((info.height, info.width), bool)
@@ -328,7 +328,7 @@ def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray
 
 
 def _box_of(mask: np.ndarray, window: Box) -> Box | None:
-    """Box in the picture of a mask that lies in a window of it."""
+    """Box in the picture of a mask [rows, columns] of a window of it; None for an empty mask."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return None

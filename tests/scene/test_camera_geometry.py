@@ -1,0 +1,60 @@
+"""Pinhole geometry of pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim.scene.camera_geometry import (
+    depth_millimetres,
+    intrinsic_matrix,
+    measured_points,
+    pixel_rays,
+    project_points,
+)
+from vinesim.scene.values import CameraFrame, CameraInfo
+
+INFO = CameraInfo(6, 4, 50.0, 51.0, 2.4, 1.6, "optical")
+
+
+def _frame() -> CameraFrame:
+    rng = np.random.default_rng(2)
+    depth = rng.uniform(0.5, 3.0, (4, 6)).astype(np.float32)
+    depth[0, :3] = np.nan, np.inf, -np.inf
+    rgb = rng.integers(0, 256, (4, 6, 3), np.uint8)
+    return CameraFrame(0.0, "camera", INFO, np.array([0, 0, 0, 0, 0, 0, 1.0]), rgb, depth, np.zeros((4, 6), np.int32))
+
+
+def test_depth_in_millimetres() -> None:
+    depth = np.array([[1.2345, np.nan, np.inf], [-np.inf, 0.0004, 70.0]], np.float32)
+    assert depth_millimetres(depth).tolist() == [[1234, 0, 0], [0, 0, 0]]
+    assert depth_millimetres(np.array([65.535, 65.536], np.float32)).tolist() == [65535, 0]
+
+
+def test_measured_points_project_to_their_pixels() -> None:
+    frame = _frame()
+    points = measured_points(frame)
+    assert len(points) == 4 * 6 - 3
+    xyz = np.stack([points[axis] for axis in "xyz"], 1)
+    v, u = np.nonzero(np.isfinite(frame.depth))
+    assert project_points(xyz, INFO) == pytest.approx(np.stack([u, v], 1), abs=1e-4)
+    assert np.array_equal(points["z"], frame.depth[v, u])
+    assert np.array_equal(points["rgb"] >> 8 & 255, frame.rgb[v, u, 1])
+
+
+def test_every_second_row_and_column() -> None:
+    frame = _frame()
+    frame.depth[0, :3] = 1.0
+    whole = measured_points(frame).reshape(4, 6)
+    assert np.array_equal(measured_points(frame, step=2).reshape(2, 3), whole[::2, ::2])
+
+
+def test_what_is_behind_the_camera_has_no_pixel() -> None:
+    assert np.isnan(project_points(np.array([0.1, 0.2, -1.0]), INFO)).all()
+
+
+def test_rays_and_matrix_agree() -> None:
+    across, down = pixel_rays(INFO)
+    matrix = np.array(intrinsic_matrix(INFO)).reshape(3, 3)
+    u, v, w = matrix @ [across[4], down[3], 1.0]
+    assert (u, v, w) == pytest.approx((4.0, 3.0, 1.0), abs=1e-5)
