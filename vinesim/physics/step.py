@@ -27,10 +27,10 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import (
     Contact,
+    Detachment,
     HandSample,
     HumanPose,
     HumanSpec,
-    Parting,
     RigidVisual,
     RobotSpec,
     Snapshot,
@@ -74,7 +74,7 @@ class Physics:
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """The wind, None for calm; may be set at any time between steps."""
-        self.detachments: tuple[Parting, ...] = ()
+        self.detachments: tuple[Detachment, ...] = ()
         """What left its plant in the last step, or by command before it; sorted by body."""
         self.remotely_posed = np.zeros(0, np.int32)
         """[k] Trees that were posed by :meth:`apply_remote_rest`; the reader of snapshots clears it."""
