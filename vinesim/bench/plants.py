@@ -82,5 +82,9 @@ def plant_measurements() -> Iterator[Measurement]:
         for seconds in interleaved_medians(lambda: run_steps(whole, steps), together, mujoco_steps)
     )
     name = f"MuJoCo {mujoco.mj_versionString()} discrete"
-    yield Measurement("plants", f"{CANE_COUNT} canes awake, one thread", one, "ms/tick", name, reference, reference / one)
-    yield Measurement("plants", f"{CANE_COUNT} canes awake, two threads", two, "ms/tick", name, reference, reference / two)
+    yield Measurement(
+        "plants", f"{CANE_COUNT} canes awake, one thread", one, "ms/tick", name, reference, reference / one
+    )
+    yield Measurement(
+        "plants", f"{CANE_COUNT} canes awake, two threads", two, "ms/tick", name, reference, reference / two
+    )
