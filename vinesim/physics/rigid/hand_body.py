@@ -17,7 +17,7 @@ from vinesim.scene.values import HandSample
 class HandBody:
     """State of one hand and its indices in MuJoCo's arrays.
 
-    A hand follows its controller freely until it touches something. From then on it is pulled to its controller by a
+    A hand follows its controller until it touches something. From then on it is pulled to its controller by a
     spring, until it has touched nothing for ``hand_contact_duration``. A hand that holds something touches nothing.
     """
 
