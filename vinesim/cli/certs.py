@@ -6,7 +6,7 @@ import pathlib
 
 from vinesim.errors import UsageError
 from vinesim.net.transport.access_control import SERVER, Role
-from vinesim.net.transport.certificates import new as new_certificate
+from vinesim.net.transport.certificates import create as new_certificate
 
 
 def new(actor: str, folder: pathlib.Path, role: str, hosts: list[str]) -> int:

@@ -28,7 +28,7 @@ from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
-from vinesim.net.replication.exchange import Exchange, Inbox
+from vinesim.net.replication.exchange import Inbox, Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_posture import standing_pose
@@ -66,7 +66,7 @@ class Client:
         pose: np.ndarray,
         source: Callable[[float], HumanPose] | None = None,
         height: float = 1.75,
-        interest_radius: float = interest.NEAR,
+        interest_radius: float = interest.INTEREST_RADIUS,
         jitter_buffer: float = 0.0,
         device: str = "cpu",
         threads: int = 1,
@@ -88,7 +88,7 @@ class Client:
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
         """Humans that this client simulates, by name."""
-        self.replicators: dict[str, Exchange] = {}
+        self.replicators: dict[str, Replicator] = {}
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators)
         self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
@@ -126,27 +126,27 @@ class Client:
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
             seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
+        replicator = Replicator(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
-        self._add_replicator(name, exchange)
+        self._add_replicator(name, replicator)
         return robot
 
     def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> LocalHuman:
-        """Move one more person as ``source`` says (see :class:`Person`; None: still); ``bus`` is opened in its name."""
+        """Add a local human with the poses of ``source(time)`` (None: still); ``bus`` must have its name."""
         hello = Hello(
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
-        self.humans[spec.name] = person = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
-        self._add_replicator(spec.name, exchange)
-        return person
+        replicator = Replicator(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
+        self.humans[spec.name] = human = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
+        self._add_replicator(spec.name, replicator)
+        return human
 
-    def _add_replicator(self, name: str, exchange: Exchange) -> None:
-        self.replicators[name] = exchange
+    def _add_replicator(self, name: str, replicator: Replicator) -> None:
+        self.replicators[name] = replicator
         for own, share in self.replicators.items():
-            share.kin = self.replicators.keys() - {own}
+            share.local_actors = self.replicators.keys() - {own}
 
     def tick(self) -> None:
         """Simulate one step of ``physics.dt``."""
@@ -176,18 +176,21 @@ class Client:
             if name in self.spawner and (other := self.spawner.spawn(name, update)) is not None:
                 self.remote_actors[name] = other
                 self.physics.contact_solver.remote_actors.add(name)
-            if name in self.remote_actors:
-                self.remote_actors[name].follow(update)
+            match self.remote_actors.get(name), update:
+                case RemoteRobot() as robot, RobotUpdate():
+                    robot.follow(update)
+                case RemoteHuman() as human, HumanUpdate():
+                    human.follow(update)
         self._apply_remote_trees(inbox)
 
     def control(self) -> None:
         """Run the callbacks of :attr:`pre_step`, then the drives of robots and the poses of humans."""
-        for job in self.pre_step:
-            job(self.physics.time)
+        for callback in self.pre_step:
+            callback(self.physics.time)
         for robot in self.robots.values():
             robot.control(self.physics.time)
-        for person in self.humans.values():
-            person.control(self.physics.time)
+        for human in self.humans.values():
+            human.control(self.physics.time)
 
     def sense(self) -> None:
         """Record the traced bunch, then run the callbacks of :attr:`post_step`."""
@@ -198,42 +201,43 @@ class Client:
             for contact in self.physics.contacts:
                 if contact.body in self.trace.bodies:
                     force -= contact.force
-            told = int(self.model.body_tree[body]) in self._remote_trees
-            self.trace.add(self.physics.time, self.physics.state.body_q[body], force, told)
-        for sense in self.post_step:
-            sense(self)
+            is_remote = int(self.model.body_tree[body]) in self._remote_trees
+            self.trace.add(self.physics.time, self.physics.state.body_q[body], force, is_remote)
+        for callback in self.post_step:
+            callback(self)
 
     def send(self, now: float) -> None:
         """Publish poses of local actors, and to actors nearby the states of what they touch."""
-        things = self.objects
-        things.collect()
-        moving, touching = things.moving, False
+        objects = self.objects
+        objects.collect()
+        moving, touching = objects.moving, False
         for name, actor in (*self.robots.items(), *self.humans.items()):
-            exchange, pose = self.replicators[name], actor.update(now)
-            mine = exchange.mine
-            parted = things.detached_by(name, all_others=name == self.name)
-            touched = things.touched_by(name, mine)
+            replicator, pose = self.replicators[name], actor.update(now)
+            mine = replicator.owned
+            detached = objects.detached_by(name, all_others=name == self.name)
+            touched = objects.touched_by(name, mine)
             touching |= bool(touched)
-            settled = exchange.send(
-                now, pose, touched=touched, moving=moving, read=things.read_state,
-                grabbed=things.with_trees(parted), parted=parted, cut=things.cut_roots, changed=things.is_changed,
-                lies=self.physics.support_tracker.pose_on_support, pushed=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
+            settled = replicator.send(
+                now, pose, touched=touched, moving=moving, read=objects.read_state,
+                grabbed=objects.with_trees(detached), parted=detached, cut=objects.cut_roots, changed=objects.is_changed,
+                lies=self.physics.support_tracker.pose_on_support,
+                pushed=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip
             for update in settled:
                 # the last message is what all copies hold: hold the same, quantised state
-                things.blend_tree(update, 1.0)
-            for number in mine - exchange.mine:
-                things.mark_resting(exchange.fact(number))
+                objects.blend_tree(update, 1.0)
+            for number in mine - replicator.owned:
+                objects.mark_resting(replicator.record(number))
         self.interest_audit.update(self, touching)
 
     def leave(self) -> None:
         """Before the buses close: publish objects at rest on local robots in the world frame, as their parent goes."""
         now = self._clock()
         for name, robot in self.robots.items():
-            riders = self.objects.supported_by(name)
-            if riders:
+            supported = self.objects.supported_by(name)
+            if supported:
                 self.replicators[name].send(
-                    now, robot.update(now), read=self.objects.read_state, grabbed=riders, parted=riders,
+                    now, robot.update(now), read=self.objects.read_state, grabbed=supported, parted=supported,
                     lies=self.physics.support_tracker.pose_on_support,
                 )  # fmt: skip
 
@@ -246,63 +250,63 @@ class Client:
     # ------------------------------------------------------------------ remote actors
 
     def _receive_all(self, now: float) -> Inbox:
-        """What all exchanges brought: of another actor, what is heard where it is nearest."""
-        inboxes = {name: exchange.receive(now) for name, exchange in self.replicators.items()}
+        """Merge the inboxes of all local actors; of each remote actor the update of its nearest one counts."""
+        inboxes = {name: replicator.receive(now) for name, replicator in self.replicators.items()}
         for name in self.robots:
-            self._apply_remote_wrenches(name, inboxes[name].pushes)
+            self._apply_remote_wrenches(name, inboxes[name].wrenches)
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
         here = {name: self.physics.rigid.actor_position(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
-        loose = {update.thing: update for update in inbox.things}
+        moved = {update.object: update for update in inbox.objects}
         nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
-        for name, heard in inboxes.items():
-            for other, update in (*heard.robots.items(), *heard.people.items()):
+        for name, other_inbox in inboxes.items():
+            for other, update in (*other_inbox.robots.items(), *other_inbox.people.items()):
                 away = float(np.hypot(*(update.base_q[:2] - here[name])))
                 if other not in nearest or away < nearest[other][0]:
                     nearest[other] = away, update
-            trees.update((update.tree, update) for update in heard.trees)
-            loose.update((update.thing, update) for update in heard.things)
-            if heard is not inbox:
-                inbox.facts += heard.facts
+            trees.update((update.tree, update) for update in other_inbox.trees)
+            moved.update((update.object, update) for update in other_inbox.objects)
+            if other_inbox is not inbox:
+                inbox.records += other_inbox.records
         shown = [update for _, (_, update) in sorted(nearest.items())]
         inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
         inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
         inbox.trees = [trees[tree] for tree in sorted(trees)]
-        inbox.things = [loose[number] for number in sorted(loose) if self._is_owned_remotely(number)]
+        inbox.objects = [moved[number] for number in sorted(moved) if self._is_owned_remotely(number)]
         return inbox
 
-    def _is_owned_remotely(self, thing: int) -> bool:
+    def _is_owned_remotely(self, number: int) -> bool:
         """Whether an actor of another client owns an object or tree."""
-        owners = {exchange.owner(thing) for exchange in self.replicators.values()} - {None}
+        owners = {replicator.owner(number) for replicator in self.replicators.values()} - {None}
         return bool(owners) and not owners & self.replicators.keys()
 
-    def _apply_remote_wrenches(self, name: str, pushes: dict[str, np.ndarray]) -> None:
+    def _apply_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
         """Apply the wrenches [6] N, N m of remote humans to the links of a local robot."""
         try:
-            self.physics.rigid.set_remote_wrenches(name, pushes)
+            self.physics.rigid.set_remote_wrenches(name, wrenches)
         except RobotError as error:
             log.debug("a wrench on an unknown link: %s", error)
 
     def _apply_remote_trees(self, inbox: Inbox) -> None:
         """Blend trees of remote owners towards their states, in every tick; local physics goes on beside."""
-        things, told = self.objects, self.physics.contact_solver.remote_trees
+        objects, is_remote = self.objects, self.physics.contact_solver.remote_trees
         for update in inbox.trees:
             if update.tree not in self._remote_trees:
                 self.physics.plants.wake(update.tree)
-                things.blend_tree(update, 1.0)
-                told[update.tree] = True
+                objects.blend_tree(update, 1.0)
+                is_remote[update.tree] = True
             self._remote_trees[update.tree] = update
         for tree in [tree for tree in self._remote_trees if not self._is_owned_remotely(tree)]:
             update = self._remote_trees.pop(tree)
-            told[tree] = False
+            is_remote[tree] = False
             if update.resting:
-                things.blend_tree(update, 1.0)
+                objects.blend_tree(update, 1.0)
         for tree, update in self._remote_trees.items():
             self.physics.plants.wake(tree)
-            things.blend_tree(update, BLEND_PER_STEP)
-        things.receive(inbox)
+            objects.blend_tree(update, BLEND_PER_STEP)
+        objects.receive(inbox)
 
 
 class InterestAudit:
@@ -320,12 +324,12 @@ class InterestAudit:
 
     def update(self, client: Client, touching: bool) -> None:
         """Count one tick, by the positions of the remote actors' copies."""
-        sent = sum(exchange.counters.environment.bytes_out for exchange in client.replicators.values())
+        sent = sum(replicator.counters.environment.bytes_out for replicator in client.replicators.values())
         rigid = client.physics.rigid
         here = [rigid.actor_position(name)[:2] for name in client.replicators]
         there = [rigid.actor_position(name)[:2] for name in client.remote_actors]
         distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
-        if distance > client.replicator.near + self.MARGIN:
+        if distance > client.replicator.interest_radius + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching
         self._seen = sent

@@ -10,7 +10,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.client import Client, label_index
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import ONLOOKER, Exchange
+from vinesim.net.replication.exchange import SPECTATOR, Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
@@ -53,10 +53,10 @@ class Spectator(Client):
     ) -> None:  # fmt: skip
         self.pose = np.asarray(pose, float)
         hello = Hello(
-            name=self.name, kind=ONLOOKER, scene=self.scene.name, digest=self.model.digest(),
+            name=self.name, kind=SPECTATOR, scene=self.scene.name, digest=self.model.digest(),
             index=label_index(self.name), joints=0, seed=self.scene.seed,
         )  # fmt: skip
-        self.replicators[self.name] = Exchange(
+        self.replicators[self.name] = Replicator(
             bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer
         )
 

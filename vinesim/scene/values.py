@@ -464,10 +464,10 @@ class TreeUpdate:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class ThingUpdate:
+class ObjectUpdate:
     """State of one box or loose bunch that moves, as it crosses the network."""
 
-    thing: int
+    object: int
     """:func:`vinesim.scene.ids.thing`"""
     owner: str
     ownership: int

@@ -12,7 +12,7 @@ import numpy as np
 
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import DISTORTION, DISTORTION_MODEL, intrinsic_matrix
-from vinesim.scene.ids import Kind, Organ, thing, thing_name
+from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
 
@@ -58,7 +58,7 @@ def bunch_records(
     return [
         {
             "bunch": one.bunch,
-            "name": thing_name(thing(Kind.BUNCH, one.bunch)),
+            "name": object_name(object_id(ObjectKind.BUNCH, one.bunch)),
             "label": one.label,
             "tree": one.tree,
             "variety": VARIETIES[one.variety].name,
