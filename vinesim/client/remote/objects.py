@@ -104,7 +104,7 @@ class ObjectSync:
         return bodiless
 
     def _apply_tree_record(self, record: RetainedRecord, holds: bool) -> list[TreeUpdate]:
-        """Cut off the bodies that a record names; returns the tree's state of rest if the record has one and ``holds``."""
+        """Cut off the bodies that a record names; the tree's state of rest if the record has one and ``holds``."""
         for body in record.cut:
             if self.physics.model.body_tree[body] == record.object and not self.physics.state.body_cut[body]:
                 self.apply_remote_cut(body)
@@ -219,7 +219,7 @@ class ObjectSync:
                 self._record_cut(detachment.body)
 
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
-        """Objects that the local actor ``name`` detached in the last step; those of no local actor too if ``all_others``."""
+        """Objects that actor ``name`` detached in the last step; and those of no local actor if ``all_others``."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
         return [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
 
@@ -229,7 +229,7 @@ class ObjectSync:
         return [*detached, *trees]
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
-        """All that moves and that a local actor touches, itself or by an object it owns (``mine``), or that slips off it."""
+        """All that moves and that a local actor touches, itself or by an object of ``mine``, or that slips off it."""
         tracker = self.physics.support_tracker
         found = {
             number for number in tracker.moving if self._supporting_actor(number) == name
