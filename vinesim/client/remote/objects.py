@@ -17,7 +17,7 @@ from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.physics.rigid.support_tracking import GROUND
 from vinesim.physics.step import Physics
 from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name, split_object_id
-from vinesim.scene.values import ObjectUpdate, Parting, TreeUpdate
+from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 
 BLEND_PER_STEP = 0.2
 """Share of the difference to its owner's state by which a copy is corrected in one step."""
@@ -43,7 +43,7 @@ class ObjectSync:
         """Trees that picks or cuts have changed."""
         self._cut_bodies: dict[int, list[int]] = {}
         """Bodies that were cut off each tree, in rising order."""
-        self._detachments: tuple[Parting, ...] = ()
+        self._detachments: tuple[Detachment, ...] = ()
 
     # ------------------------------------------------------------------ received
 
