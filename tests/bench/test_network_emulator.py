@@ -13,7 +13,7 @@ import pytest
 
 from tests.support.live_server import need_links, wait
 from vinesim.bench.support import network_emulator
-from vinesim.bench.support.network_emulator import Count, Emulator, Line, Way
+from vinesim.bench.support.network_emulator import Count, Link, LinkProfile, NetworkEmulator
 
 ECHO = """
 import socket, sys
@@ -51,21 +51,21 @@ def _links():
     need_links()
 
 
-def probe(net: Emulator, end: str, count: int, *flood: str) -> tuple[list[float], int]:
+def probe(net: NetworkEmulator, end: str, count: int, *flood: str) -> tuple[list[float], int]:
     command = [sys.executable, "-c", PROBE, net.hub(end), str(count), *flood]
     process = net.start(end, command, stdout=subprocess.PIPE, text=True)
     trips, answered = json.loads(process.communicate(timeout=20)[0])
     return trips, answered
 
 
-def echo(net: Emulator) -> None:
+def echo(net: NetworkEmulator) -> None:
     server = net.start("hub", [sys.executable, "-c", ECHO], stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
     assert server.stdout.readline() == "ready\n"
 
 
 def test_links_delay_each_way_and_count_every_byte():
-    with Emulator({"near": Line(), "far": Line(Way(0.03), Way(0.02, 0.005))}) as net:
+    with NetworkEmulator({"near": Link(), "far": Link(LinkProfile(0.03), LinkProfile(0.02, 0.005))}) as net:
         echo(net)
         near, _ = probe(net, "near", 20)
         far, _ = probe(net, "far", 20)
@@ -78,15 +78,15 @@ def test_links_delay_each_way_and_count_every_byte():
 
 
 def test_links_lose_their_share_and_can_be_cut_and_mended():
-    with Emulator({"bad": Line(Way(loss=0.2), Way())}, seed=3) as net:
+    with NetworkEmulator({"bad": Link(LinkProfile(loss=0.2), LinkProfile())}, seed=3) as net:
         echo(net)
         _, answered = probe(net, "bad", 200, "flood")
         there, back = net.counts("bad")
         assert 20 <= there.lost <= 65
         assert answered == there.packets - there.lost == back.packets
-        net.cut("bad")
+        net.disconnect("bad")
         assert probe(net, "bad", 10, "flood")[1] == 0
-        net.shape("bad", Line())
+        net.shape("bad", Link())
         assert probe(net, "bad", 10, "flood")[1] == 10
 
 
@@ -111,7 +111,7 @@ def test_nothing_stays_behind_even_of_one_that_is_killed():
     left = f"{network_emulator._PREFIX}-{gone.pid}-1-hub"
     subprocess.run(["ip", "netns", "add", left], check=True)
     start = time.monotonic()
-    with Emulator({"a": Line()}):
+    with NetworkEmulator({"a": Link()}):
         assert left not in network_emulator._spaces()
     assert not [s for s in network_emulator._spaces() if f"-{os.getpid()}-" in s]
     assert time.monotonic() - start < 20.0
@@ -119,6 +119,6 @@ def test_nothing_stays_behind_even_of_one_that_is_killed():
 
 def test_what_cannot_be_is_refused_in_words():
     with pytest.raises(ValueError, match="loss from 0 to 1"):
-        Way(loss=2.0)
+        LinkProfile(loss=2.0)
     with pytest.raises(ValueError, match="end 'hub'"):
-        Emulator({"hub": Line()})
+        NetworkEmulator({"hub": Link()})

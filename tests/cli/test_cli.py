@@ -11,8 +11,8 @@ import threading
 import pytest
 
 from vinesim.net.codec import messages
-from vinesim.net.recording.mcap_file import Recording
-from vinesim.net.server.admission import Plan
+from vinesim.net.recording.mcap_file import RecordingWriter
+from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
@@ -106,10 +106,10 @@ def test_port_taken():
 def test_files_that_cannot_be_replayed(tmp_path):
     (tmp_path / "scene.toml").write_text('name = "demo"\n')
     refused(vinesim("replay", "scene.toml", "--out", "pictures", cwd=tmp_path), 2, "scene.toml", "no MCAP file")
-    with Recording(tmp_path / "old.mcap", {"protocol": "0", "release": "0.0.9"}):
+    with RecordingWriter(tmp_path / "old.mcap", {"protocol": "0", "release": "0.0.9"}):
         pass
     refused(vinesim("replay", "old.mcap", "--out", "pictures", cwd=tmp_path), 2, "version 0", "0.0.9")
-    with Recording(tmp_path / "empty.mcap"):
+    with RecordingWriter(tmp_path / "empty.mcap"):
         pass
     refused(vinesim("replay", "empty.mcap", "--out", "pictures", cwd=tmp_path), 2, "empty.mcap", "no message")
     assert not (tmp_path / "pictures").exists()
@@ -187,7 +187,7 @@ def test_a_journal_that_is_none_is_left_alone(tmp_path):
 
 
 def test_a_client_of_another_scene_is_refused_by_both_digests():
-    with Server("tcp/127.0.0.1:0", plan=Plan("vsp", "0123456789abcdef")) as server:
+    with Server("tcp/127.0.0.1:0", plan=SceneId("vsp", "0123456789abcdef")) as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "ada", "--no-ros", "--seconds", "1"]
         refused(vinesim(*arguments), 4, "'ada'", "'demo'", "'vsp'", "0123456789abcdef", "scene and seed")
 

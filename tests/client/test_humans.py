@@ -103,7 +103,7 @@ def test_people_and_robots_meet_and_part(vinebot):
 def test_who_stands_still_is_the_same_everywhere_to_the_bit():
     """F89: what copies hold is what crossed the network, and nothing makes it up anew."""
     world = World()
-    pose = poses.quantised(standing_pose(SIDE, 1.8))
+    pose = poses.quantise_pose(standing_pose(SIDE, 1.8))
     world.join("eva", None, SIDE, lambda _: pose, height=1.8)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(4.0)

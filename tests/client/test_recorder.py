@@ -10,14 +10,14 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.support.recorded_world import TICK, Light, vineyard
-from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Recorder, Stand, grid
+from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, Recorder, grid
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Fact
-from vinesim.net.recording.mcap_file import Recording, Tape, read
-from vinesim.net.replication.exchange import Mismatch
-from vinesim.net.replication.interest import NEAR
+from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.recording.mcap_file import Recording, RecordingWriter, read
+from vinesim.net.replication.exchange import WorldMismatch
+from vinesim.net.replication.interest import INTEREST_RADIUS
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.scene.ids import Kind, thing
+from vinesim.scene.ids import ObjectKind, object_id
 
 EPOCH = 1.7e9
 
@@ -28,14 +28,16 @@ class World:
     def __init__(self, path: pathlib.Path | None, apart: float = 2.0, **options) -> None:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
-        server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + self.hub.time))
-        fact = Fact(thing(Kind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
-        server.serve("snap/0/0", lambda _: messages.encode_facts([fact]))
+        server.declare_queryable(
+            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + self.hub.time)
+        )
+        fact = RetainedRecord(object_id(ObjectKind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
+        server.declare_queryable("snap/0/0", lambda _: messages.encode_records([fact]))
         self.ada, self.bob = Light(self.hub.bus("ada"), 0.5), Light(self.hub.bus("bob"), 0.5 + apart)
         self.clients = [self.ada, self.bob]
         self.steps = [lambda: None]
         if path is not None:
-            self.recording = Recording(path, {"world": "memory"})
+            self.recording = RecordingWriter(path, {"world": "memory"})
             self.recorder = Recorder(
                 self.hub.bus("recorder", live=False), self.recording, clock=lambda: self.hub.time, **options
             )
@@ -57,13 +59,13 @@ class World:
         self.ada.touched = set()
         self.run(0.5)
 
-    def tape(self) -> Tape:
+    def tape(self) -> Recording:
         self.recording.close()
         return read(self.recording.path)
 
 
-def families(tape: Tape) -> set[str]:
-    return {entry.key.partition("/")[0] for entry in tape.entries}
+def families(tape: Recording) -> set[str]:
+    return {entry.key.partition("/")[0] for entry in tape.messages}
 
 
 def test_what_was_said_is_on_the_tape(tmp_path):
@@ -77,22 +79,22 @@ def test_what_was_said_is_on_the_tape(tmp_path):
     assert tape.damage == ""
     assert families(tape) == {"a", "c", "own", "hello", "live", "snap"}
     about = {"scene": "rows", "seed": "5", "digest": vineyard().digest(), "world": "memory", "protocol": "1"}
-    assert tape.about.items() >= about.items()
-    assert [(e.key, bool(e.payload)) for e in tape.entries if e.key.startswith("live")] == [
+    assert tape.metadata.items() >= about.items()
+    assert [(e.key, bool(e.payload)) for e in tape.messages if e.key.startswith("live")] == [
         ("live/ada", True), ("live/bob", True), ("live/bob", False),
     ]  # fmt: skip
-    assert {messages.decode_hello(e.payload).name for e in tape.entries if e.key.startswith("hello")} == {"ada", "bob"}
+    assert {messages.decode_hello(e.payload).name for e in tape.messages if e.key.startswith("hello")} == {"ada", "bob"}
 
     # all that bob heard of trees and events is there, in the same order and to the bit
-    heard = [messages.decode_trees(e.payload) for e in tape.entries if e.key == "c/0/0/ada"]
+    heard = [messages.decode_trees(e.payload) for e in tape.messages if e.key == "c/0/0/ada"]
     assert len(heard) > 90
-    last = [e for e in tape.entries if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.TREES][-1]
+    last = [e for e in tape.messages if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.TREES][-1]
     rest = messages.decode_trees(last.payload)
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.ada.read(0)[0])
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.bob.read(0)[0])
 
     # log time is network time: a journey, and a poll, after what the author wrote
-    for entry in tape.entries:
+    for entry in tape.messages:
         if entry.key == "c/0/0/ada":
             assert 0.0 < entry.time - messages.time_of(entry.payload) < 0.03
     assert tape.start == pytest.approx(EPOCH, abs=0.2)
@@ -108,15 +110,15 @@ def test_the_recorder_changes_not_one_byte(tmp_path):
             before = [client.bus.bytes_out for client in world.clients]
             world.touch()
             sent[apart, path is None] = [c.bus.bytes_out - b for c, b in zip(world.clients, before, strict=True)]
-            if apart > NEAR:
+            if apart > INTEREST_RADIUS:
                 assert world.ada.environment() == 0
             else:
                 assert world.ada.environment() > 5_000
             if path is not None:
                 tape = world.tape()
-                assert ("c" in families(tape)) == (apart < NEAR)
-                fast = sum(entry.key == "a/ada" for entry in tape.entries)
-                assert (fast > 100) == (apart < NEAR)
+                assert ("c" in families(tape)) == (apart < INTEREST_RADIUS)
+                fast = sum(entry.key == "a/ada" for entry in tape.messages)
+                assert (fast > 100) == (apart < INTEREST_RADIUS)
     assert sent[2.0, True] == sent[2.0, False]
     assert sent[40.0, True] == sent[40.0, False]
     assert sent[40.0, True][0] > 0  # slow poses
@@ -137,21 +139,21 @@ def test_a_recorder_that_asks_for_everything_hears_one_who_is_alone(tmp_path):
     world.bob.bus.close()
     world.clients.remove(world.bob)
     digest = vineyard().digest()
-    stand = Stand(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
+    stand = Observer(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
     world.recorder.own.add("recorder-1")
     world.steps.append(lambda: stand.step(world.hub.time))
     world.run(2.0)
     world.touch()
     tape = world.tape()
     assert families(tape) == {"a", "c", "own", "hello", "live", "snap"}
-    assert sum(entry.key == "a/ada" for entry in tape.entries) > 150
-    assert sum(entry.key == "c/0/0/ada" for entry in tape.entries) > 90
-    assert not any("recorder" in entry.key for entry in tape.entries)
+    assert sum(entry.key == "a/ada" for entry in tape.messages) > 150
+    assert sum(entry.key == "c/0/0/ada" for entry in tape.messages) > 90
+    assert not any("recorder" in entry.key for entry in tape.messages)
 
 
 def test_two_recorders_do_not_keep_each_other_listening(tmp_path):
     world = World(tmp_path / "run.mcap")
-    with Recording(tmp_path / "other.mcap") as recording:
+    with RecordingWriter(tmp_path / "other.mcap") as recording:
         other = Recorder(world.hub.bus("other", live=False), recording, clock=lambda: world.hub.time)
         world.steps.append(other.step)
         world.run(1.0)
@@ -174,7 +176,7 @@ def test_only(tmp_path, only):
 
 def test_another_vineyard_is_refused_and_a_late_stranger_ignored(tmp_path):
     world = World(tmp_path / "other.mcap", digest="elsewhere")
-    with pytest.raises(Mismatch, match=r"'(ada|bob)' has scene 'rows' .*elsewhere.*same|used there"):
+    with pytest.raises(WorldMismatch, match=r"'(ada|bob)' has scene 'rows' .*elsewhere.*same|used there"):
         world.run(0.5)
     world.recording.close()
 
@@ -182,7 +184,7 @@ def test_another_vineyard_is_refused_and_a_late_stranger_ignored(tmp_path):
     world.run(0.5)
     Light(world.hub.bus("eve"), 1.0, digest="elsewhere")  # it serves its greeting
     world.run(0.5)
-    greetings = {e.key for e in world.tape().entries if e.key.startswith("hello/")}
+    greetings = {e.key for e in world.tape().messages if e.key.startswith("hello/")}
     assert greetings == {"hello/ada", "hello/bob"}
 
 
@@ -225,7 +227,7 @@ def test_the_grid_leaves_nothing_out():
         stands = np.array(grid(area))
         x, y = np.meshgrid(np.linspace(area[0], area[2], 60), np.linspace(area[1], area[3], 60))
         away = np.hypot(x[..., None] - stands[:, 0], y[..., None] - stands[:, 1]).min(-1)
-        assert away.max() <= NEAR
+        assert away.max() <= INTEREST_RADIUS
     for wrong in ((0.0, 0.0, 40.0, 40.0), (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, float("nan"), 1.0)):
         with pytest.raises(AreaTooLarge, match="give"):
             grid(wrong)
@@ -238,5 +240,5 @@ def test_nonsense_is_kept_and_counted(tmp_path):
     assert fool.put(b"not a message")
     world.run(0.1)
     tape = world.tape()
-    assert [entry.payload for entry in tape.entries if entry.key == "own/0/0/fool"] == [b"not a message"]
+    assert [entry.payload for entry in tape.messages if entry.key == "own/0/0/fool"] == [b"not a message"]
     assert world.recorder.malformed == 1

@@ -12,14 +12,14 @@ from tests.client.test_recorder import EPOCH, World
 from tests.support.recorded_world import TICK, Light, vineyard
 from vinesim.client.recording.replay import Replay, ReplayBus
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Fact
-from vinesim.net.recording.mcap_file import Tape, read
-from vinesim.net.transport.bus import EVERY, MemoryHub, NameTaken
-from vinesim.scene.ids import Kind, thing
+from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.recording.mcap_file import Recording, read
+from vinesim.net.transport.bus import KEEP_ALL, MemoryHub, NameTaken
+from vinesim.scene.ids import ObjectKind, object_id
 
 
 @pytest.fixture(scope="module")
-def tape(tmp_path_factory) -> Tape:
+def tape(tmp_path_factory) -> Recording:
     """Ada bends a tree beside Bob; after a second of rest Bob leaves, and 0.3 s later a bunch falls."""
     world = World(tmp_path_factory.mktemp("tape") / "run.mcap")
     world.run(1.0)
@@ -28,13 +28,13 @@ def tape(tmp_path_factory) -> Tape:
     world.bob.bus.close()
     world.clients.remove(world.bob)
     world.run(0.3)
-    fact = Fact(thing(Kind.BUNCH, 4), 1, 0, "ada", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
-    assert world.ada.bus.publisher("fact/0/0/ada", reliable=True).put(messages.encode_facts([fact]))
+    fact = RetainedRecord(object_id(ObjectKind.BUNCH, 4), 1, 0, "ada", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
+    assert world.ada.bus.publisher("fact/0/0/ada", reliable=True).put(messages.encode_records([fact]))
     world.run(0.2)
     return world.tape()
 
 
-def watch(tape: Tape, **span: float) -> tuple[Light, list[bytes], list[tuple]]:
+def watch(tape: Recording, **span: float) -> tuple[Light, list[bytes], list[tuple]]:
     """One who stands beside the tree while the tape is played: it, its states, and what it saw move, tick by tick."""
     bus = ReplayBus(tape, "viewer", **span)
     viewer = Light(bus, 1.5, kind="spectator", joints=0)
@@ -48,8 +48,8 @@ def watch(tape: Tape, **span: float) -> tuple[Light, list[bytes], list[tuple]]:
     return viewer, states, seen
 
 
-def recorded_trees(tape: Tape) -> list[messages.Trees]:
-    kinds = (entry.payload for entry in tape.entries if entry.key in ("c/0/0/ada", "own/0/0/ada"))
+def recorded_trees(tape: Recording) -> list[messages.TreeStates]:
+    kinds = (entry.payload for entry in tape.messages if entry.key in ("c/0/0/ada", "own/0/0/ada"))
     return [messages.decode_trees(payload) for payload in kinds if messages.kind_of(payload) == messages.TREES]
 
 
@@ -91,36 +91,36 @@ def test_actors_come_and_go_as_they_did(tape):
 def test_from_and_to(tape):
     start = tape.length - 1.5
     bus = ReplayBus(tape, "viewer", start=start, end=start + 0.5)
-    bus.subscribe("a/*/far", EVERY)
+    bus.subscribe("a/*/far", KEEP_ALL)
     assert bus.time == pytest.approx(tape.start + start)
-    bus.ask("hello/bob")  # who came before is there
-    assert messages.decode_hello(bus.answers()[0].payload).name == "bob"
+    bus.query("hello/bob")  # who came before is there
+    assert messages.decode_hello(bus.replies()[0].payload).name == "bob"
     for _ in range(100):
         bus.play(TICK)
     assert bus.ended
-    times = [messages.time_of(payload) - tape.start for _, payload in bus.drain()]
+    times = [messages.time_of(payload) - tape.start for _, payload in bus.poll()]
     assert start - 0.1 < min(times) < max(times) < start + 0.5
 
 
 def test_facts_are_answered_as_the_server_would(tape):
     bus = ReplayBus(tape, "viewer")
-    before, told = thing(Kind.BUNCH, 3), thing(Kind.BUNCH, 4)
+    before, told = object_id(ObjectKind.BUNCH, 3), object_id(ObjectKind.BUNCH, 4)
 
     def known() -> set[int]:
-        bus.ask("snap/0/0")
-        return {fact.thing for answer in bus.answers() for fact in messages.decode_facts(answer.payload)}
+        bus.query("snap/0/0")
+        return {fact.object for answer in bus.replies() for fact in messages.decode_records(answer.payload)}
 
     assert known() == {before}
     while not bus.ended:
         bus.play(TICK)
     assert known() == {before, told}
-    bus.ask("snap/9/9")
-    (empty,) = bus.answers()
-    assert (empty.key, messages.decode_facts(empty.payload)) == ("snap/9/9", [])
-    bus.ask("snap/*/*")
-    assert {answer.key for answer in bus.answers()} == {"snap/0/0"}
-    bus.ask("snap/nonsense")
-    assert bus.answers() == []
+    bus.query("snap/9/9")
+    (empty,) = bus.replies()
+    assert (empty.key, messages.decode_records(empty.payload)) == ("snap/9/9", [])
+    bus.query("snap/*/*")
+    assert {answer.key for answer in bus.replies()} == {"snap/0/0"}
+    bus.query("snap/nonsense")
+    assert bus.replies() == []
 
 
 def test_a_name_on_the_tape_is_taken(tape):
@@ -130,22 +130,22 @@ def test_a_name_on_the_tape_is_taken(tape):
 
 def test_the_clock_is_that_of_the_recording(tape):
     bus = ReplayBus(tape, "viewer", start=0.5)
-    bus.ask("clock", messages.encode_time(3.0))
-    assert messages.decode_time(bus.answers()[0].payload) == (3.0, pytest.approx(EPOCH + 0.6, abs=0.2))
+    bus.query("clock", messages.encode_time(3.0))
+    assert messages.decode_time(bus.replies()[0].payload) == (3.0, pytest.approx(EPOCH + 0.6, abs=0.2))
 
 
 class Stage:
     """A network in memory to which a tape is played."""
 
-    def __init__(self, tape: Tape, **span: float) -> None:
+    def __init__(self, tape: Recording, **span: float) -> None:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
-        server.serve(
+        server.declare_queryable(
             "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 5e8 + self.hub.time)
         )  # fmt: skip
-        self.kept: list[Fact] = []
+        self.kept: list[RetainedRecord] = []
         self.server = server
-        server.subscribe("fact/**", EVERY)
+        server.subscribe("fact/**", KEEP_ALL)
         self.viewer = Light(self.hub.bus("viewer"), 1.5, kind="spectator", joints=0)
         self.replay = Replay(tape, self.hub.bus("replay", live=False), self.hub.bus, self.hub.time, **span)
 
@@ -158,20 +158,20 @@ class Stage:
         self.hub.advance(TICK)
         self.replay.step(self.hub.time)
         self.viewer.tick(self.hub.time)
-        self.kept += [fact for _, payload in self.server.drain() for fact in messages.decode_facts(payload)]
+        self.kept += [fact for _, payload in self.server.poll() for fact in messages.decode_records(payload)]
 
 
 def test_on_a_network_it_happens_again(tape):
     stage = Stage(tape)
     stage.run()
     assert sorted(stage.viewer.joined) == ["ada", "bob"]
-    assert "bob" not in stage.viewer.exchange.actors
+    assert "bob" not in stage.viewer.exchange.peers
     rest = recorded_trees(tape)[-1]
     np.testing.assert_array_equal(stage.viewer.read(0)[0], rest.joint_q.astype(np.float32))
     # stamped anew: nobody extrapolates from the year of the recording, and velocities are believed
     heard = stage.viewer.exchange._actors.known["ada"].update
     assert 0.0 <= 5e8 + stage.hub.time - heard.time < 1.0  # since Bob left she had nobody to tell
-    assert {fact.thing for fact in stage.kept} == {thing(Kind.BUNCH, 3), thing(Kind.BUNCH, 4)}
+    assert {fact.object for fact in stage.kept} == {object_id(ObjectKind.BUNCH, 3), object_id(ObjectKind.BUNCH, 4)}
     stage.replay.close()
     stage.hub.advance(0.1)
     assert stage.viewer.bus.alive() == {"viewer"}
@@ -191,10 +191,10 @@ def test_faster_and_slower(tape):
 def test_a_recording_of_a_replay_is_the_recording(tape, tmp_path):
     """Record what a replay says, and read that: the same messages, stamped anew."""
     from vinesim.client.recording.recorder import Recorder
-    from vinesim.net.recording.mcap_file import Recording
+    from vinesim.net.recording.mcap_file import RecordingWriter
 
     stage = Stage(tape)
-    with Recording(tmp_path / "again.mcap") as recording:
+    with RecordingWriter(tmp_path / "again.mcap") as recording:
         recorder = Recorder(stage.hub.bus("recorder", live=False), recording, clock=lambda: stage.hub.time)
         hub_tick = stage.viewer.tick
 
@@ -206,9 +206,9 @@ def test_a_recording_of_a_replay_is_the_recording(tape, tmp_path):
         stage.run()
     again = read(tmp_path / "again.mcap")
 
-    def bodies(recorded: Tape) -> list[bytes]:
-        return [e.payload[14:] for e in recorded.entries if e.key == "c/0/0/ada"]
+    def bodies(recorded: Recording) -> list[bytes]:
+        return [e.payload[14:] for e in recorded.messages if e.key == "c/0/0/ada"]
 
     assert bodies(again) == bodies(tape)
-    assert dataclasses.replace(again, entries=[]).about["digest"] == vineyard().digest()
+    assert dataclasses.replace(again, messages=[]).metadata["digest"] == vineyard().digest()
     assert isinstance(again.path, pathlib.Path)

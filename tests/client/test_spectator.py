@@ -20,7 +20,7 @@ from vinesim.client.spectator import EYE_HEIGHT, FOLLOW_DISTANCE, Spectator, fol
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
-from vinesim.net.recording.mcap_file import NotARecording, Recording, Tape, read
+from vinesim.net.recording.mcap_file import InvalidRecording, Recording, RecordingWriter, read
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
@@ -28,7 +28,7 @@ from vinesim.scene.spec import load_scene
 
 
 @pytest.fixture(scope="module")
-def bent(tmp_path_factory) -> Tape:
+def bent(tmp_path_factory) -> Recording:
     """Ada bends a tree beside Bob and leaves it at rest."""
     world = World(tmp_path_factory.mktemp("bent") / "run.mcap")
     world.run(1.0)
@@ -37,7 +37,7 @@ def bent(tmp_path_factory) -> Tape:
     return world.tape()
 
 
-def watch(tape: Tape) -> tuple[list[bytes], dict[int, np.ndarray]]:
+def watch(tape: Recording) -> tuple[list[bytes], dict[int, np.ndarray]]:
     """States of all plants of a spectator beside the tree, tick by tick; those of the tree by the tick's number."""
     bus = ReplayBus(tape, "viewer")
     pose = standing_view(1.5, 0.0, np.pi)
@@ -117,7 +117,7 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
     path = tmp_path_factory.mktemp("robot") / "run.mcap"
     hub = MemoryHub(delay=0.004)
     clock = hub.bus("server", live=False)
-    clock.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e9 + hub.time))
+    clock.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e9 + hub.time))
     scene = load_scene("demo")
     model = generate(scene)
     start = spawn_pose(scene, 0)
@@ -126,7 +126,7 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
     )
     eyes = follow_view(start)
     spectator = Spectator(scene, model, None, hub.bus("viewer"), name="viewer", pose=eyes, clock=lambda: hub.time)
-    with Recording(path) as recording:
+    with RecordingWriter(path) as recording:
         recorder = Recorder(hub.bus("recorder", live=False), recording, clock=lambda: hub.time)
         picker.robot.command_position([0.5], ["head_1_joint"])
         for _ in range(200):
@@ -148,7 +148,7 @@ def options(file: pathlib.Path, out: pathlib.Path, **more) -> dict:
 
 
 def test_a_replay_is_looked_at(robot_tape, tmp_path, capsys):
-    assert read(robot_tape).about.items() >= {"scene": "demo", "seed": "7"}.items()
+    assert read(robot_tape).metadata.items() >= {"scene": "demo", "seed": "7"}.items()
     assert replay(**options(robot_tape, tmp_path, end=1.5)) == 0
     assert "picker" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir())[:4] == ["depth.png", "depth_mm.png", "labels.png", "rgb.png"]
@@ -159,7 +159,7 @@ def test_a_replay_is_looked_at(robot_tape, tmp_path, capsys):
 
 
 def test_another_vineyard_is_refused(robot_tape, tmp_path):
-    with pytest.raises(NotARecording, match=r"digest .*: give its --scene and --seed"):
+    with pytest.raises(InvalidRecording, match=r"digest .*: give its --scene and --seed"):
         replay(**options(robot_tape, tmp_path / "out", seed=8))
     assert not (tmp_path / "out").exists()
     with pytest.raises(UsageError, match=r"lasts \d"):

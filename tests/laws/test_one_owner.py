@@ -11,7 +11,7 @@ from tests.support.shared_vineyard import BOX, BUNCH, Server, vineyard
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.exchange import Exchange
+from vinesim.net.replication.exchange import Replicator
 from vinesim.net.transport.bus import MemoryHub
 from vinesim.scene.ids import is_tree
 from vinesim.scene.values import RobotUpdate
@@ -38,9 +38,9 @@ class Least:
     def __init__(self, hub: MemoryHub, name: str, start: Claim) -> None:
         self.hub, self.name, self.model = hub, name, vineyard()
         self.bus = hub.bus(name)
-        self.exchange = Exchange(self.bus, Hello(name, scene="rows", digest="same", joints=0), self.model)
+        self.exchange = Replicator(self.bus, Hello(name, scene="rows", digest="same", joints=0), self.model)
         for thing in THINGS:
-            self.exchange._own[thing].claim = start
+            self.exchange._ownership[thing].claim = start
         self.x = -1.5 + NAMES.index(name)
         self.robot = RobotUpdate(name, 0.0, frames.pose([self.x, 0.0, 0.0]), np.zeros(6), np.zeros(0), np.zeros(0))
         self.touched: set[int] = set()
@@ -51,14 +51,14 @@ class Least:
     def tick(self) -> None:
         now = self.hub.time
         inbox = self.exchange.receive(now)
-        for fact, holds in inbox.facts:
-            if not is_tree(fact.thing):
-                self.picked.add(fact.thing)
+        for fact, holds in inbox.records:
+            if not is_tree(fact.object):
+                self.picked.add(fact.object)
                 if holds:
-                    self.pose[fact.thing] = np.array(fact.pose)
-        for update in inbox.things:
-            self.picked.add(update.thing)
-            self.pose[update.thing] = update.pose
+                    self.pose[fact.object] = np.array(fact.pose)
+        for update in inbox.objects:
+            self.picked.add(update.object)
+            self.pose[update.object] = update.pose
         there = {thing for thing in self.touched if thing in self.picked or thing in (0, BOX(0))}
         for thing in there - {0}:
             self.pose[thing] = self.pose[thing] + [0.002 * self.x, 0.001, 0, 0, 0, 0, 0]
@@ -132,8 +132,8 @@ def test_once_all_have_let_go_everything_lies_where_everybody_says_within_a_roun
     for thing in THINGS:
         owners = {client.exchange.owner(thing) for client in clients.values()}
         assert owners == {None}, [client.exchange.claim(thing) for client in clients.values()]
-        facts = {client.exchange.fact(thing) for client in clients.values()}
-        assert facts == {server.facts.of(thing)}
+        facts = {client.exchange.record(thing) for client in clients.values()}
+        assert facts == {server.facts.get(thing)}
     for client in clients.values():
         # nothing picked hangs again, nothing is picked for some only
         assert client.picked - {BOX(0)} == picked - {BOX(0)}

@@ -11,32 +11,26 @@ import time
 import pytest
 import zenoh
 
+from tests.support.waiting import wait
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Fact, Hello
-from vinesim.net.server.admission import Plan
+from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus
-from vinesim.net.transport.access_control import NoCertificate, Role, secured
-from vinesim.net.transport.bus import EVERY, BusError, Refused
-from vinesim.net.transport.certificates import new, roles
+from vinesim.net.transport.access_control import CertificateError, Role, tls_config
+from vinesim.net.transport.bus import KEEP_ALL, BusError, JoinRejected
+from vinesim.net.transport.certificates import create, roles
 from vinesim.net.transport.endpoints import parse
 from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus, close_session, config, open_session
-from vinesim.scene.ids import Kind, thing
-
-
-def wait(condition, what):
-    end = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for: {what}"
-        time.sleep(0.002)
+from vinesim.scene.ids import ObjectKind, object_id
 
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory) -> pathlib.Path:
     folder = tmp_path_factory.mktemp("pki") / "certs"
     for name in ("ada", "bob"):
-        new(folder, name)
-    new(folder, "guest", Role.SPECTATOR)
+        create(folder, name)
+    create(folder, "guest", Role.SPECTATOR)
     return folder
 
 
@@ -58,7 +52,7 @@ def hello(name, digest="D1"):
 def session(name, server, certs):
     """What a program of its own making could do with a certificate."""
     endpoint = parse(server.endpoint, secured=True)
-    one = open_session(config("client", connect__endpoints=[endpoint.locator], **secured(certs, name)))
+    one = open_session(config("client", connect__endpoints=[endpoint.locator], **tls_config(certs, name)))
     try:
         yield one
     finally:
@@ -122,12 +116,15 @@ def test_another_world_does_not_exist(server, certs):
         assert set(heard) == {"vs/1/vineyard/own/9/9/ada"}
         for each in (elsewhere, everywhere, ears):
             each.undeclare()
-    with bus("ada", server, certs, world="other") as ada, pytest.raises(Refused, match="lets nobody named 'ada' in"):
+    with (
+        bus("ada", server, certs, world="other") as ada,
+        pytest.raises(JoinRejected, match="lets nobody named 'ada' in"),
+    ):
         ada.join(hello("ada"))
 
 
 def test_nobody_gets_in_without_a_certificate_of_this_authority(server, certs, tmp_path, monkeypatch):
-    monkeypatch.setattr(zenoh_bus, "PATIENCE", 0.7)  # Zenoh tries again for as long as it may
+    monkeypatch.setattr(zenoh_bus, "CONNECT_TIMEOUT", 0.7)  # Zenoh tries again for as long as it may
     address = server.endpoint.partition("/")[2]
     with pytest.raises(ServerUnreachable):
         ZenohBus("ada", connect=f"tcp/{address}")
@@ -137,17 +134,17 @@ def test_nobody_gets_in_without_a_certificate_of_this_authority(server, certs, t
     }  # fmt: skip
     with pytest.raises(zenoh.ZError):
         close_session(open_session(config("client", **tries, **bare)))
-    new(tmp_path, "ada")  # of another authority
+    create(tmp_path, "ada")  # of another authority
     with pytest.raises(ServerUnreachable):
         bus("ada", server, tmp_path)
 
 
 def test_a_certificate_the_server_does_not_know_opens_nothing(server, certs):
-    new(certs, "late")
+    create(certs, "late")
     try:
         with (
             bus("late", server, certs) as late,
-            pytest.raises(Refused, match=r"late\.pem, and it reads them when it starts"),
+            pytest.raises(JoinRejected, match=r"late\.pem, and it reads them when it starts"),
         ):
             late.join(hello("late"))
     finally:
@@ -160,7 +157,7 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
     with bus("ada", server, certs) as ada, bus("bob", server, certs) as bob, bus("guest", server, certs) as guest:
         for each in (ada, bob, guest):
             each.join(hello(each.name))
-        assert server._agreement.plan("vineyard") == Plan("vsp", "D1")
+        assert server._admission.scene_of("vineyard") == SceneId("vsp", "D1")
         wait(
             lambda: all(each.alive() == {"ada", "bob", "guest"} for each in (ada, bob, guest)), "all to see each other"
         )
@@ -168,7 +165,7 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
         alone = ada.publisher("c/0/0/ada")
         for each in (bob, guest):
             each.subscribe("a/*")
-            each.subscribe("own/0/0/*", EVERY)
+            each.subscribe("own/0/0/*", KEEP_ALL)
         wait(lambda: pose.matching and event.matching, "their subscriptions")
         assert not alone.matching
         heard: dict[str, set] = {"bob": set(), "guest": set()}
@@ -178,29 +175,29 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
             event.put(b"event")
             time.sleep(0.01)
             for each in (bob, guest):
-                heard[each.name].update(each.drain())
+                heard[each.name].update(each.poll())
             return all(found == {("a/ada", b"pose"), ("own/0/0/ada", b"event")} for found in heard.values())
 
         wait(both_heard_both, "both samples")
-        fact = Fact(thing(Kind.BOX, 1), 1, 0, "ada")
+        fact = RetainedRecord(object_id(ObjectKind.BOX, 1), 1, 0, "ada")
         says = ada.publisher("fact/0/0/ada", reliable=True)
         wait(lambda: says.matching, "the server's ear")
-        says.put(messages.encode_facts([fact]))
-        wait(lambda: server.archive.count() == 1, "the fact to be kept")
-        ada.serve("hello/ada", lambda _: hello("ada"))
-        guest.serve("hello/guest", lambda _: hello("guest"))
+        says.put(messages.encode_records([fact]))
+        wait(lambda: server.store.count() == 1, "the fact to be kept")
+        ada.declare_queryable("hello/ada", lambda _: hello("ada"))
+        guest.declare_queryable("hello/guest", lambda _: hello("guest"))
         answers: dict = {}
 
         def all_answered():
             for key in ("hello/ada", "clock", "snap/0/0"):
-                guest.ask(key, messages.encode_time(1.0))
-            ada.ask("hello/guest")
+                guest.query(key, messages.encode_time(1.0))
+            ada.query("hello/guest")
             time.sleep(0.02)
-            answers.update({answer.key: answer.payload for answer in [*guest.answers(), *ada.answers()]})
+            answers.update({answer.key: answer.payload for answer in [*guest.replies(), *ada.replies()]})
             return len(answers) == 4
 
         wait(all_answered, "four answers")
-        assert messages.decode_facts(answers["snap/0/0"]) == [fact]
+        assert messages.decode_records(answers["snap/0/0"]) == [fact]
         assert messages.decode_hello(answers["hello/guest"]).name == "guest"
 
 
@@ -212,10 +209,10 @@ def test_nobody_says_that_another_is_there_or_answers_for_him(server, certs):
         own = ada.liveliness().declare_token("vs/1/vineyard/live/ada/1")
         wait(lambda: "ada" in bob.alive(), "ada herself")
         assert "carl" not in bob.alive()
-        bob.ask("hello/carl")
-        bob.ask("clock", messages.encode_time(1.0))
+        bob.query("hello/carl")
+        bob.query("clock", messages.encode_time(1.0))
         answers: list = []
-        wait(lambda: answers.extend(bob.answers()) or answers, "the clock")
+        wait(lambda: answers.extend(bob.replies()) or answers, "the clock")
         assert [answer.key for answer in answers] == ["clock"]
         assert messages.decode_time(answers[0].payload)[0] == 1.0
         for each in (served, clock, forged, own):
@@ -240,7 +237,7 @@ def test_over_quic_poses_are_datagrams_and_events_a_stream(server, certs):
         def arrived():
             pose.put(b"pose")
             time.sleep(0.01)
-            heard.extend(bob.drain())
+            heard.extend(bob.poll())
             return heard
 
         wait(arrived, "a pose")
@@ -263,19 +260,19 @@ def test_linked_servers_know_each_other_and_each_its_own_actors(certs, protocol)
         def let_in():
             try:
                 ada.join(hello("ada"))
-            except Refused:  # not yet linked well enough to ask
+            except JoinRejected:  # not yet linked well enough to ask
                 return False
             return True
 
         wait(let_in, "the server that keeps to answer over the one that carries")
-        bob.subscribe("own/0/0/*", EVERY)
+        bob.subscribe("own/0/0/*", KEEP_ALL)
         event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: event.matching, "bob's ear")
         thief.put("vs/1/vineyard/own/0/0/bob", b"stolen", congestion_control=zenoh.CongestionControl.BLOCK)
         list(thief.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
         event.put(b"event")
         heard: list = []
-        wait(lambda: heard.extend(bob.drain()) or heard, "the event")
+        wait(lambda: heard.extend(bob.poll()) or heard, "the event")
         assert heard == [("own/0/0/ada", b"event")]
 
 
@@ -283,16 +280,16 @@ def test_linked_servers_know_each_other_and_each_its_own_actors(certs, protocol)
 
 
 def test_keys_are_private_and_roles_are_read(tmp_path):
-    written = new(tmp_path / "pki", "guest", Role.SPECTATOR)
+    written = create(tmp_path / "pki", "guest", Role.SPECTATOR)
     assert [path.name for path in written] == [
         "ca.key", "ca.pem", "server.key", "server.pem", "guest.key", "guest.pem",
     ]  # fmt: skip
     for path in written:
         assert stat.S_IMODE(path.stat().st_mode) == (0o600 if path.suffix == ".key" else 0o644), path
-    assert [path.name for path in new(tmp_path / "pki", "ada")] == ["ada.key", "ada.pem"]
+    assert [path.name for path in create(tmp_path / "pki", "ada")] == ["ada.key", "ada.pem"]
     assert roles(tmp_path / "pki") == {"ada": Role.ROBOT, "guest": Role.SPECTATOR, "server": Role.SERVER}
     before = (tmp_path / "pki" / "ca.pem").read_bytes()
-    new(tmp_path / "pki", "server", Role.SERVER, ["vines.example", "192.168.1.5"])
+    create(tmp_path / "pki", "server", Role.SERVER, ["vines.example", "192.168.1.5"])
     assert (tmp_path / "pki" / "ca.pem").read_bytes() == before
 
 
@@ -308,29 +305,29 @@ def test_keys_are_private_and_roles_are_read(tmp_path):
 )
 def test_what_cannot_be_meant_is_refused_and_nothing_is_made(tmp_path, name, role, hosts, words):
     with pytest.raises(ValueError, match=words):
-        new(tmp_path / "pki", name, role, hosts)
+        create(tmp_path / "pki", name, role, hosts)
     assert not (tmp_path / "pki").exists()
 
 
 def test_what_is_wrong_in_the_folder_is_one_line_with_a_remedy(tmp_path, certs):
-    with pytest.raises(NoCertificate, match="vinesim certs new server"):
+    with pytest.raises(CertificateError, match="vinesim certs new server"):
         Server("tls/127.0.0.1:0", certificates=tmp_path)
-    new(tmp_path, "ada")
-    with pytest.raises(NoCertificate, match="there already"):
-        new(tmp_path, "ada")
+    create(tmp_path, "ada")
+    with pytest.raises(CertificateError, match="there already"):
+        create(tmp_path, "ada")
     (tmp_path / "bob.pem").write_bytes((certs / "bob.pem").read_bytes())
-    with pytest.raises(NoCertificate, match=r"bob\.pem: not signed by ca\.pem"):
+    with pytest.raises(CertificateError, match=r"bob\.pem: not signed by ca\.pem"):
         roles(tmp_path)
     (tmp_path / "bob.pem").write_text("junk")
-    with pytest.raises(NoCertificate, match="cannot be read as a certificate"):
+    with pytest.raises(CertificateError, match="cannot be read as a certificate"):
         roles(tmp_path)
     (tmp_path / "bob.pem").write_bytes((tmp_path / "ada.pem").read_bytes())
-    with pytest.raises(NoCertificate, match=r"rename it to ada\.pem"):
+    with pytest.raises(CertificateError, match=r"rename it to ada\.pem"):
         roles(tmp_path)
     (tmp_path / "bob.pem").unlink()
-    new(tmp_path, "server", Role.SERVER, days=-1)
-    with pytest.raises(NoCertificate, match=r"server\.pem: not valid.*vinesim certs new server"):
+    create(tmp_path, "server", Role.SERVER, days=-1)
+    with pytest.raises(CertificateError, match=r"server\.pem: not valid.*vinesim certs new server"):
         roles(tmp_path)
     with pytest.raises(BusError, match=r"no .*eve\.pem.*vinesim certs new eve"):
         ZenohBus("eve", connect="tls/127.0.0.1:1", certificates=tmp_path)
-    assert json.dumps(secured(tmp_path, "ada"))
+    assert json.dumps(tls_config(tmp_path, "ada"))

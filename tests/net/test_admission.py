@@ -9,18 +9,18 @@ from hypothesis import strategies as st
 
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
-from vinesim.net.server.admission import PROVISIONAL, Agreement, Plan
+from vinesim.net.server.admission import PROVISIONAL_TIMEOUT, AdmissionControl, SceneId
 
 
 def ask(agreement, name, digest="D1", *, world="w", session="", scene="vsp", now=0.0):
     session = session or name
-    agreement.came(world, name, session)
+    agreement.on_join(world, name, session)
     hello = messages.encode_hello(Hello(name, scene=scene, digest=digest))
     return agreement.answer(world, name, session, hello, now)
 
 
 def test_the_first_decides_the_scene_and_another_is_refused_by_both_names():
-    agreement = Agreement()
+    agreement = AdmissionControl()
     assert ask(agreement, "ada") == messages.Welcome("", "vsp", "D1")
     why = ask(agreement, "bob", "D2", scene="tendone").refused
     for word in ("'bob'", "'tendone'", "'D2'", "'vsp'", "'D1'", "same scene, seed"):
@@ -31,19 +31,19 @@ def test_the_first_decides_the_scene_and_another_is_refused_by_both_names():
 
 
 def test_a_world_forgets_its_scene_with_the_last_actor_unless_facts_are_kept():
-    agreement = Agreement()
+    agreement = AdmissionControl()
     ask(agreement, "ada")
-    agreement.went("w", "ada", "ada")
-    assert agreement.plan("w") == Plan()
+    agreement.on_leave("w", "ada", "ada")
+    assert agreement.scene_of("w") == SceneId()
     assert not ask(agreement, "bob", "D2").refused
-    agreement.keep("w", Plan("vsp", "D2"))
-    agreement.went("w", "bob", "bob")
-    assert agreement.plan("w") == Plan("vsp", "D2")
+    agreement.pin_scene("w", SceneId("vsp", "D2"))
+    agreement.on_leave("w", "bob", "bob")
+    assert agreement.scene_of("w") == SceneId("vsp", "D2")
     assert "--state-dir" in ask(agreement, "ada", "D1").refused
 
 
 def test_a_server_with_a_scene_lets_in_no_other():
-    agreement = Agreement(Plan("vsp", "D1"))
+    agreement = AdmissionControl(SceneId("vsp", "D1"))
     why = ask(agreement, "ada", "D2", scene="tendone").refused
     assert "'D1'" in why
     assert "'D2'" in why
@@ -53,63 +53,63 @@ def test_a_server_with_a_scene_lets_in_no_other():
 def test_another_protocol_is_refused_by_both_numbers():
     hello = bytearray(messages.encode_hello(Hello("ada")))
     hello[2] = 9
-    why = Agreement().answer("w", "ada", "s", bytes(hello), 0.0).refused
+    why = AdmissionControl().answer("w", "ada", "s", bytes(hello), 0.0).refused
     assert "version 9" in why
     assert f"version {messages.PROTOCOL}" in why
     inner = messages.encode_hello(msgspec.structs.replace(Hello("ada"), protocol=7))
-    assert "version 7" in Agreement().answer("w", "ada", "s", inner, 0.0).refused
+    assert "version 7" in AdmissionControl().answer("w", "ada", "s", inner, 0.0).refused
 
 
 @pytest.mark.parametrize(
     "greeting", [b"", b"VS", b"nonsense", messages.encode_hello(Hello("ada"))[:-3], bytes(1 << 21)]
 )
 def test_what_is_no_greeting_is_refused_in_words(greeting):
-    assert "cannot be read" in Agreement().answer("w", "ada", "s", greeting, 0.0).refused
+    assert "cannot be read" in AdmissionControl().answer("w", "ada", "s", greeting, 0.0).refused
 
 
 def test_nobody_comes_under_another_name():
     hello = messages.encode_hello(Hello("bob"))
-    assert "introduces itself as 'bob'" in Agreement().answer("w", "ada", "s", hello, 0.0).refused
+    assert "introduces itself as 'bob'" in AdmissionControl().answer("w", "ada", "s", hello, 0.0).refused
 
 
 def test_a_name_has_one_bearer_and_asking_twice_is_no_harm():
-    agreement = Agreement()
+    agreement = AdmissionControl()
     assert not ask(agreement, "ada", session="one").refused
     assert not ask(agreement, "ada", session="one").refused
     assert "already live" in ask(agreement, "ada", session="two").refused
-    agreement.went("w", "ada", "two")
-    agreement.went("w", "ada", "one")
+    agreement.on_leave("w", "ada", "two")
+    agreement.on_leave("w", "ada", "one")
     assert not ask(agreement, "ada", session="two").refused
     assert agreement.joined == 2
 
 
 def test_there_is_room_for_so_many():
-    agreement = Agreement(most=2)
+    agreement = AdmissionControl(most=2)
     assert not ask(agreement, "ada").refused
     assert not ask(agreement, "bob", world="another").refused
     assert "room for 2" in ask(agreement, "eve").refused
     assert not ask(agreement, "ada").refused
-    agreement.went("another", "bob", "bob")
+    agreement.on_leave("another", "bob", "bob")
     assert not ask(agreement, "eve").refused
 
 
 def test_who_was_let_in_and_never_came_holds_no_place():
-    agreement = Agreement(most=1)
+    agreement = AdmissionControl(most=1)
     hello = messages.encode_hello(Hello("ghost"))
     assert not agreement.answer("w", "ghost", "g", hello, 0.0).refused
     assert ask(agreement, "ada", now=1.0).refused
-    assert not ask(agreement, "ada", now=PROVISIONAL + 1.0).refused
+    assert not ask(agreement, "ada", now=PROVISIONAL_TIMEOUT + 1.0).refused
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["D1", "D2"]), st.booleans()), max_size=40))
 def test_all_who_are_in_share_one_vineyard_whoever_comes_and_goes(events):
-    agreement, inside = Agreement(most=2), {}
+    agreement, inside = AdmissionControl(most=2), {}
     for name, digest, leaves in events:
         if leaves:
-            agreement.went("w", name, name)
+            agreement.on_leave("w", name, name)
             inside.pop(name, None)
         elif not ask(agreement, name, digest).refused:
             inside[name] = digest
         assert len(set(inside.values())) <= 1
         assert len(inside) <= 2
-        assert agreement.plan("w").digest == next(iter(inside.values()), "")
+        assert agreement.scene_of("w").digest == next(iter(inside.values()), "")

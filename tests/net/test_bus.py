@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.net.transport.bus import EVERY, NEWEST, RECENT, MemoryHub, NameTaken, Store, matches
+from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, KEEP_LAST_64, MemoryHub, NameTaken, SampleStore, matches
 
 
 @pytest.mark.parametrize(
@@ -26,24 +26,26 @@ def test_patterns(pattern, key, covers):
     assert matches(pattern, key) is covers
 
 
-@given(st.lists(st.tuples(st.sampled_from([("a", NEWEST), ("b", 3), ("e", EVERY)]), st.integers()), max_size=60))
+@given(
+    st.lists(st.tuples(st.sampled_from([("a", KEEP_LAST_1), ("b", 3), ("e", KEEP_ALL)]), st.integers()), max_size=60)
+)
 def test_a_store_keeps_the_newest_of_each_key_in_order(samples):
-    store = Store()
+    store = SampleStore()
     for number, ((key, depth), _) in enumerate(samples):
         store.put(depth, key, number)
     taken = store.take()
     assert [number for _, number in taken] == sorted(number for _, number in taken)
-    for wanted, depth in (("a", NEWEST), ("b", 3), ("e", EVERY)):
+    for wanted, depth in (("a", KEEP_LAST_1), ("b", 3), ("e", KEEP_ALL)):
         numbers = [n for n, ((key, _), _) in enumerate(samples) if key == wanted]
         assert [number for key, number in taken if key == wanted] == numbers[-depth:]
     assert store.take() == []
 
 
 def test_a_flood_is_bounded_and_counted():
-    store = Store()
-    for number in range(EVERY + 5):
-        store.put(EVERY, "e", number)
-    assert len(store.take()) == EVERY
+    store = SampleStore()
+    for number in range(KEEP_ALL + 5):
+        store.put(KEEP_ALL, "e", number)
+    assert len(store.take()) == KEEP_ALL
     assert store.overflowed == 5
 
 
@@ -57,7 +59,7 @@ def test_without_a_listener_nothing_leaves_and_nothing_is_counted():
     subscription = bob.subscribe("c/0/0/*")
     assert publisher.put(b"12345")
     hub.advance(0.0)
-    assert bob.drain() == [("c/0/0/ada", b"12345")]
+    assert bob.poll() == [("c/0/0/ada", b"12345")]
     assert (ada.bytes_out, bob.bytes_in, ada.bytes_in) == (5, 5, 0)
     subscription.close()
     assert not publisher.put(b"12345")
@@ -72,15 +74,15 @@ def test_a_publisher_needs_an_exact_key():
 def test_reliable_samples_arrive_all_and_in_order_whatever_the_network():
     hub = MemoryHub(delay=0.05, jitter=0.05, loss=0.5, seed=3)
     ada, bob = hub.bus("ada"), hub.bus("bob")
-    bob.subscribe("own/**", EVERY)
-    bob.subscribe("c/**", RECENT)
+    bob.subscribe("own/**", KEEP_ALL)
+    bob.subscribe("c/**", KEEP_LAST_64)
     events, stream = ada.publisher("own/x", reliable=True), ada.publisher("c/x")
     for number in range(60):
         events.put(bytes([number]))
         stream.put(bytes([number]))
         hub.advance(0.001)
     hub.advance(1.0)
-    heard = bob.drain()
+    heard = bob.poll()
     assert [p[0] for k, p in heard if k == "own/x"] == list(range(60))
     unreliable = [p[0] for k, p in heard if k == "c/x"]
     assert 15 < len(unreliable) < 45
@@ -91,12 +93,12 @@ def test_the_same_seed_is_the_same_network():
     def run() -> list:
         hub = MemoryHub(delay=0.02, jitter=0.02, loss=0.3, seed=11)
         ada, bob = hub.bus("ada"), hub.bus("bob")
-        bob.subscribe("**", EVERY)
+        bob.subscribe("**", KEEP_ALL)
         publisher, heard = ada.publisher("x"), []
         for number in range(100):
             publisher.put(bytes([number]))
             hub.advance(0.004)
-            heard.append(bob.drain())
+            heard.append(bob.poll())
         return heard
 
     assert run() == run()
@@ -108,21 +110,21 @@ def test_nothing_arrives_before_its_time():
     bob.subscribe("x")
     ada.publisher("x").put(b"1")
     hub.advance(0.049)
-    assert bob.drain() == []
+    assert bob.poll() == []
     hub.advance(0.002)
-    assert bob.drain() == [("x", b"1")]
+    assert bob.poll() == [("x", b"1")]
 
 
 def test_questions_are_answered_with_their_age():
     hub = MemoryHub(delay=0.01)
     ada, bob = hub.bus("ada"), hub.bus("bob")
-    bob.serve("hello/bob", lambda question: question + b"!")
-    ada.ask("hello/*", b"hi")
-    ada.ask("nobody", b"hi")
+    bob.declare_queryable("hello/bob", lambda question: question + b"!")
+    ada.query("hello/*", b"hi")
+    ada.query("nobody", b"hi")
     hub.advance(0.015)
-    assert ada.answers() == []
+    assert ada.replies() == []
     hub.advance(0.035)
-    (answer,) = ada.answers()
+    (answer,) = ada.replies()
     assert answer[:2] == ("hello/bob", b"hi!")
     assert answer.age == pytest.approx(0.03)
 
@@ -151,12 +153,12 @@ def test_a_hub_that_is_down_says_so_and_comes_back():
     hub.down = True
     assert not publisher.put(b"1")
     assert ada.alive() == {"ada"}
-    assert "down" in ada.trouble
+    assert "down" in ada.status_message
     hub.down = False
     assert publisher.put(b"2")
     hub.advance(0.0)
-    assert bob.drain() == [("x", b"2")]
-    assert ada.trouble == ""
+    assert bob.poll() == [("x", b"2")]
+    assert ada.status_message == ""
 
 
 def test_impossible_networks_are_refused():

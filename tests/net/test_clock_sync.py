@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim.net.replication import clock_sync
-from vinesim.net.replication.clock_sync import Clock, Ping
+from vinesim.net.replication.clock_sync import ClockEstimate, Ping
 
 delays = st.floats(0.001, 0.2)
 
@@ -21,35 +21,35 @@ def test_the_estimate_is_wrong_by_at_most_half_the_shortest_round_trip(offset, j
 
 
 def test_the_first_pings_are_believed_at_once_and_later_ones_slewed():
-    state = Clock()
+    state = ClockEstimate()
     for k in range(8):
-        state = state.heard(Ping(k, k + 100.0 + 0.01, k + 0.02))
+        state = state.with_ping(Ping(k, k + 100.0 + 0.01, k + 0.02))
     assert abs(state.offset - 100.0) < 1e-9
     better = state
     for k in range(8, 16):
-        better = better.heard(Ping(k, k + 100.2, k))
+        better = better.with_ping(Ping(k, k + 100.2, k))
     assert better.offset == state.offset
-    assert abs(better.after(1.0).offset - (state.offset + 0.01)) < 1e-9
-    assert abs(better.after(100.0).offset - 100.2) < 1e-9
+    assert abs(better.advanced(1.0).offset - (state.offset + 0.01)) < 1e-9
+    assert abs(better.advanced(100.0).offset - 100.2) < 1e-9
 
 
 def test_another_server_is_taken_at_once():
-    assert clock_sync.slewed(0.0, 1e9, 0.01) == 1e9
-    assert clock_sync.slewed(0.0, 0.4, 0.01) == 1e-4
+    assert clock_sync.slew(0.0, 1e9, 0.01) == 1e9
+    assert clock_sync.slew(0.0, 0.4, 0.01) == 1e-4
 
 
 @given(st.integers(0, 2**31))
 def test_network_time_never_runs_backwards_while_it_is_slewed(seed):
     rng = random.Random(seed)
-    state = Clock()
+    state = ClockEstimate()
     for k in range(8):
-        state = state.heard(Ping(k, k + 5.0 + rng.uniform(0, 0.02), k + 0.02))
+        state = state.with_ping(Ping(k, k + 5.0 + rng.uniform(0, 0.02), k + 0.02))
     last, now = -1.0, 8.0
     for _ in range(200):
         if rng.random() < 0.1:
             there, back = rng.uniform(0, 0.1), rng.uniform(0, 0.1)
-            state = state.heard(Ping(now, now + there + 5.0 + rng.uniform(-0.05, 0.05), now + there + back))
-        state = state.after(0.01)
+            state = state.with_ping(Ping(now, now + there + 5.0 + rng.uniform(-0.05, 0.05), now + there + back))
+        state = state.advanced(0.01)
         now += 0.01
         assert now + state.offset > last
         last = now + state.offset
@@ -57,4 +57,4 @@ def test_network_time_never_runs_backwards_while_it_is_slewed(seed):
 
 def test_without_pings_the_own_clock_is_the_clock():
     assert clock_sync.estimate(()) is None
-    assert Clock().after(5.0) == Clock()
+    assert ClockEstimate().advanced(5.0) == ClockEstimate()

@@ -17,21 +17,21 @@ vectors = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
 def test_spin_is_the_derivative_of_turning(turn, omega):
     q, h = frames.exp(turn), 1e-5
     after, before = (frames.multiply(frames.exp(s * h * omega), q) for s in (1.0, -1.0))
-    np.testing.assert_allclose(dead_reckoning.spin(q, omega), (after - before) / (2 * h), atol=1e-8)
+    np.testing.assert_allclose(dead_reckoning.quaternion_rate(q, omega), (after - before) / (2 * h), atol=1e-8)
 
 
 @given(vectors, vectors, st.floats(0, 0.15))
 def test_ahead_turns_almost_exactly(turn, omega, dt):
     q = frames.exp(turn)
     exact = frames.multiply(frames.exp(omega * dt), q)
-    found = dead_reckoning.ahead(q, dead_reckoning.spin(q, omega), dt)
+    found = dead_reckoning.extrapolate(q, dead_reckoning.quaternion_rate(q, omega), dt)
     assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-12)
     assert dead_reckoning.angle_between(found, exact) <= np.radians(0.4)
 
 
 def test_ahead_takes_an_age_for_each():
     q = np.tile(frames.IDENTITY, (2, 1))
-    found = dead_reckoning.ahead(q, dead_reckoning.spin(q, np.ones((2, 3))), np.array([[0.0], [0.1]]))
+    found = dead_reckoning.extrapolate(q, dead_reckoning.quaternion_rate(q, np.ones((2, 3))), np.array([[0.0], [0.1]]))
     np.testing.assert_array_equal(found[0], frames.IDENTITY)
     assert found[1, 0] > 0.04
 
@@ -50,19 +50,19 @@ def test_single_precision_states_are_not_apart_by_rounding():
 
 
 def test_extrapolation_stops_at_150_ms_and_never_runs_back():
-    np.testing.assert_allclose(dead_reckoning.horizon(np.array([-1.0, 0.0, 0.1, 0.15, 9.0])), [0, 0, 0.1, 0.15, 0.15])
+    np.testing.assert_allclose(dead_reckoning.clamp_age(np.array([-1.0, 0.0, 0.1, 0.15, 9.0])), [0, 0, 0.1, 0.15, 0.15])
 
 
 def test_due_by_distance_by_angle_and_by_silence():
     quiet = np.zeros(1)
-    assert not dead_reckoning.due(np.array([0.0049]), np.radians([0.99]), np.array([0.99]))[0]
-    assert dead_reckoning.due(np.array([0.0051]), quiet, quiet)[0]
-    assert dead_reckoning.due(quiet, np.radians([1.01]), quiet)[0]
-    assert dead_reckoning.due(quiet, quiet, np.array([1.0]))[0]
+    assert not dead_reckoning.needs_update(np.array([0.0049]), np.radians([0.99]), np.array([0.99]))[0]
+    assert dead_reckoning.needs_update(np.array([0.0051]), quiet, quiet)[0]
+    assert dead_reckoning.needs_update(quiet, np.radians([1.01]), quiet)[0]
+    assert dead_reckoning.needs_update(quiet, quiet, np.array([1.0]))[0]
 
 
 def test_a_correction_fades_within_100_ms_however_often_the_fading_starts_anew():
-    assert dead_reckoning.remaining(0.0) == dead_reckoning.remaining(-1.0) == 1.0
-    assert dead_reckoning.remaining(0.1) == pytest.approx(0.05, abs=1e-3)
-    assert dead_reckoning.remaining(1.0) < 1e-12
-    assert dead_reckoning.remaining(1 / 60) ** 6 == pytest.approx(dead_reckoning.remaining(0.1))
+    assert dead_reckoning.blend_weight(0.0) == dead_reckoning.blend_weight(-1.0) == 1.0
+    assert dead_reckoning.blend_weight(0.1) == pytest.approx(0.05, abs=1e-3)
+    assert dead_reckoning.blend_weight(1.0) < 1e-12
+    assert dead_reckoning.blend_weight(1 / 60) ** 6 == pytest.approx(dead_reckoning.blend_weight(0.1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vinesim.net.transport.endpoints import Endpoint, chosen, everywhere, parse, ways
+from vinesim.net.transport.endpoints import Endpoint, client_links, default_listen, parse, resolve_ports
 
 
 @pytest.mark.parametrize(
@@ -53,18 +53,18 @@ def test_an_endpoint_is_taken_apart_and_put_together():
     ],
 )
 def test_datagrams_where_they_pay_or_are_asked_for(connect, secured, bulk, live):
-    way = ways(connect, secured=secured)
+    way = client_links(connect, secured=secured)
     assert (str(way.bulk), str(way.live)) == (bulk, live)
 
 
 def test_port_0_is_one_free_number_for_both_ways():
-    stream, datagrams = chosen(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
+    stream, datagrams = resolve_ports(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
     assert stream.port == datagrams.port > 1023
-    assert chosen(["tcp/127.0.0.1:7"]) == (Endpoint("tcp", "127.0.0.1", 7),)
+    assert resolve_ports(["tcp/127.0.0.1:7"]) == (Endpoint("tcp", "127.0.0.1", 7),)
     with pytest.raises(ValueError, match="listens nowhere"):
-        chosen([])
+        resolve_ports([])
 
 
 def test_a_server_listens_both_ways_unless_told_otherwise():
-    assert [str(one) for one in chosen(everywhere())] == ["tcp/0.0.0.0:7447", "udp/0.0.0.0:7447"]
-    assert [one.protocol for one in chosen(everywhere(secured=True), secured=True)] == ["tls", "quic"]
+    assert [str(one) for one in resolve_ports(default_listen())] == ["tcp/0.0.0.0:7447", "udp/0.0.0.0:7447"]
+    assert [one.protocol for one in resolve_ports(default_listen(secured=True), secured=True)] == ["tls", "quic"]

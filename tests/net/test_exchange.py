@@ -15,7 +15,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.exchange import Exchange, Inbox, Mismatch
+from vinesim.net.replication.exchange import Inbox, Replicator, WorldMismatch
 from vinesim.net.transport.bus import MemoryBus, MemoryHub
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
@@ -44,7 +44,7 @@ class Client:
         self.hub, self.name = hub, name
         self.model = vineyard()
         self.bus: MemoryBus = hub.bus(name)
-        self.exchange = Exchange(self.bus, Hello(name, scene="rows", digest=digest, joints=2, **hello), self.model)
+        self.exchange = Replicator(self.bus, Hello(name, scene="rows", digest=digest, joints=2, **hello), self.model)
         self.state = State.at_rest(self.model)
         self.robot = RobotUpdate(
             name, 0.0, frames.pose(np.array([x, 0.0, 0.0])), np.zeros(6), np.array([0.1, -0.2]), np.zeros(2)
@@ -112,8 +112,8 @@ def test_actors_meet_see_each_other_and_part():
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0, urdf="<robot/>", index=4)
     run(hub, [ada, bob], 0.5)
     assert (ada.joined, bob.joined) == (["bob"], ["ada"])
-    assert ada.exchange.actors["bob"].urdf == "<robot/>"
-    assert ada.exchange.actors["bob"].index == 4
+    assert ada.exchange.peers["bob"].urdf == "<robot/>"
+    assert ada.exchange.peers["bob"].index == 4
     seen = ada.inbox.robots["bob"]
     np.testing.assert_allclose(seen.base_q, bob.robot.base_q, atol=1e-4)
     np.testing.assert_allclose(seen.position, [0.1, -0.2], atol=1e-4)
@@ -155,7 +155,7 @@ def test_a_driving_robot_is_seen_where_it_is_now_not_where_it_was():
     where = []
     for _ in range(60):
         hub.advance(TICK)
-        where.append(ada.exchange._actors.known["bob"].at(hub.time, hub.time))
+        where.append(ada.exchange._actors.known["bob"].sample(hub.time, hub.time))
     assert where[-1].base_q[0] == pytest.approx(where[-20].base_q[0], abs=1e-9)
     assert not where[-1].base_qd.any()
     assert not where[-1].velocity.any()
@@ -187,7 +187,7 @@ def test_a_newcomer_of_another_vineyard_or_protocol_is_refused_with_both_values(
     cy = Client(hub, "cy", 2.0, **({"digest": "other"} if change == "digest" else {"protocol": 7}))
     expected = "'same'.*'other'|'other'.*'same'" if change == "digest" else "version"
     if change == "digest":
-        with pytest.raises(Mismatch, match=expected):
+        with pytest.raises(WorldMismatch, match=expected):
             run(hub, [cy], 0.2)
     run(hub, [ada], 0.2)
     assert ada.joined == []
@@ -197,9 +197,11 @@ def test_a_newcomer_of_another_vineyard_or_protocol_is_refused_with_both_values(
 def test_the_protocols_of_both_are_named():
     hub = MemoryHub()
     old = hub.bus("old")
-    old.serve("hello/old", lambda _: messages._pack(messages.HELLO, Hello("old", digest="same", protocol=7)))
+    old.declare_queryable(
+        "hello/old", lambda _: messages._pack(messages.HELLO, Hello("old", digest="same", protocol=7))
+    )
     new = Client(hub, "new", 1.0)
-    with pytest.raises(Mismatch, match=r"'old' speaks protocol version 7, 'new' version 1"):
+    with pytest.raises(WorldMismatch, match=r"'old' speaks protocol version 7, 'new' version 1"):
         run(hub, [new], 0.2)
 
 
@@ -229,7 +231,7 @@ def test_in_the_same_window_of_cells_but_not_near_not_one_byte_leaves():
     run(hub, [ada, bob], 1.0)
     ada.touched = {0}
     run(hub, [ada, bob], 1.0)
-    assert ada.exchange._spoken_cells[(0, 0)][0].matching
+    assert ada.exchange._cell_publishers[(0, 0)][0].matching
     assert ada.environment_bytes() == 0
 
 
@@ -280,9 +282,9 @@ def test_a_steady_touch_costs_a_heartbeat_and_a_moving_one_what_extrapolation_mi
         ada.bend(0, 0.2 + 0.1 * np.sin(3 * t), 0.3 * np.cos(3 * t))
         run(hub, [ada, bob], TICK)
         if k > 20:
-            late = ada.exchange._trees
-            silence = dead_reckoning.horizon(hub.time - ada.exchange._own[0].said_at)
-            said = dead_reckoning.ahead(late._said_q[bodies], late._said_rate[bodies], silence)
+            late = ada.exchange._tree_stream
+            silence = dead_reckoning.clamp_age(hub.time - ada.exchange._ownership[0].said_at)
+            said = dead_reckoning.extrapolate(late._said_q[bodies], late._said_rate[bodies], silence)
             worst = max(worst, dead_reckoning.angle_between(ada.state.joint_q[bodies].astype(float), said).max())
     moved = ada.exchange.counters.environment.messages_out - before - 10
     assert 20 < moved < 200
@@ -544,7 +546,7 @@ def test_a_stranger_another_tree_and_a_replay_change_nothing():
     eve = hub.bus("eve")
     eve.subscribe("c/**", 100)
     run(hub, [ada, bob], 0.1)
-    (_, recorded), *_ = eve.drain()
+    (_, recorded), *_ = eve.poll()
     bob.bend(0, -0.3)
     run(hub, [ada, bob], 0.1)
     held, heard = ada.state.joint_q.copy(), len(ada.heard)
@@ -567,8 +569,10 @@ def test_a_pose_with_another_number_of_joints_is_malformed():
 def test_the_clock_of_the_server_is_found():
     hub = MemoryHub(delay=0.02, jitter=0.01)
     server = hub.bus("server")
-    server.serve("hello/server", lambda _: messages.encode_hello(Hello("server", "spectator", digest="same")))
-    server.serve("clock", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
+    server.declare_queryable(
+        "hello/server", lambda _: messages.encode_hello(Hello("server", "spectator", digest="same"))
+    )
+    server.declare_queryable("clock", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 1.5)
     assert ada.exchange.offset == pytest.approx(1000.0, abs=0.012)
@@ -577,9 +581,9 @@ def test_the_clock_of_the_server_is_found():
 def test_one_actor_has_one_name_and_near_has_a_bound():
     hub = MemoryHub()
     with pytest.raises(ValueError, match="one actor has one name"):
-        Exchange(hub.bus("ada"), Hello("bob"), vineyard())
+        Replicator(hub.bus("ada"), Hello("bob"), vineyard())
     with pytest.raises(ValueError, match=r"near = 9\.0 m"):
-        Exchange(hub.bus("bob"), Hello("bob"), vineyard(), near=9.0)
+        Replicator(hub.bus("bob"), Hello("bob"), vineyard(), near=9.0)
 
 
 def test_a_run_is_the_same_twice():

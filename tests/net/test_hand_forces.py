@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim.net.replication.hand_forces import STALE, Forces
+from vinesim.net.replication.hand_forces import MAX_AGE, WrenchSync
 from vinesim.net.transport.bus import MemoryBus, MemoryHub
 
 PUSH = np.array([10.0, 0.0, -5.0, 0.1, 0.2, 0.3])
@@ -18,17 +18,17 @@ class Pair:
     def __init__(self, delay: float = 0.02) -> None:
         self.hub = MemoryHub(delay=delay)
         self.person_bus, self.robot_bus = self.hub.bus("eva"), self.hub.bus("anna")
-        self.person, self.robot = Forces(self.person_bus, "eva"), Forces(self.robot_bus, "anna")
+        self.person, self.robot = WrenchSync(self.person_bus, "eva"), WrenchSync(self.robot_bus, "anna")
         self.left: list[bytes] = []
 
     def tick(self, wrenches: dict | None = None) -> dict[str, np.ndarray]:
         now = self.hub.time
-        for key, payload in self.robot_bus.drain():
+        for key, payload in self.robot_bus.poll():
             assert key == "force/anna/eva"
-            self.robot.hear(payload, "eva", now)
-        self.left += self.person.say({"anna": wrenches} if wrenches else {}, now, now)
+            self.robot.receive(payload, "eva", now)
+        self.left += self.person.publish({"anna": wrenches} if wrenches else {}, now, now)
         self.hub.advance(TICK)
-        return self.robot.on_me(now)
+        return self.robot.net_wrenches(now)
 
 
 def test_a_touch_is_told_sixty_times_a_second_and_its_end_once():
@@ -72,23 +72,23 @@ def test_who_falls_silent_pushes_no_more():
     stale = 0
     for _ in range(30):
         now = pair.hub.time
-        for _, payload in pair.robot_bus.drain():
-            pair.robot.hear(payload, "eva", now)
+        for _, payload in pair.robot_bus.poll():
+            pair.robot.receive(payload, "eva", now)
         pair.hub.advance(TICK)
-        stale += bool(pair.robot.on_me(now))
-    assert stale * TICK <= STALE + 0.04
+        stale += bool(pair.robot.net_wrenches(now))
+    assert stale * TICK <= MAX_AGE + 0.04
 
 
 def test_two_people_add_up_and_an_old_message_counts_for_nothing():
     pair = Pair()
-    other = Forces(pair.hub.bus("ida"), "ida")
-    first = other.say({"anna": {"arm": PUSH, "base": PUSH}}, 0.0, 5.0)
+    other = WrenchSync(pair.hub.bus("ida"), "ida")
+    first = other.publish({"anna": {"arm": PUSH, "base": PUSH}}, 0.0, 5.0)
     assert first, "somebody listens"
-    pair.robot.hear(first[0], "ida", 0.0)
-    pair.robot.hear(first[0], "eva", 0.0)
-    assert not pair.robot.hear(first[0], "eva", 0.0)
-    felt = pair.robot.on_me(0.0)
+    pair.robot.receive(first[0], "ida", 0.0)
+    pair.robot.receive(first[0], "eva", 0.0)
+    assert not pair.robot.receive(first[0], "eva", 0.0)
+    felt = pair.robot.net_wrenches(0.0)
     np.testing.assert_allclose(felt["arm"], 2.0 * PUSH, rtol=1e-6)
     assert set(felt) == {"arm", "base"}
-    pair.robot.forget("ida")
-    np.testing.assert_allclose(pair.robot.on_me(0.0)["base"], PUSH, rtol=1e-6)
+    pair.robot.remove_peer("ida")
+    np.testing.assert_allclose(pair.robot.net_wrenches(0.0)["base"], PUSH, rtol=1e-6)

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import (
-    Push,
+    WrenchMessage,
     decode_human,
     decode_pose,
-    decode_push,
+    decode_wrenches,
     encode_human,
     encode_pose,
-    encode_push,
-    quantised,
+    encode_wrenches,
+    quantise_pose,
 )  # fmt: skip
 from vinesim.net.codec.messages import MessageError
 from vinesim.physics.rigid.human_posture import standing_pose
@@ -67,8 +67,8 @@ def test_a_person_is_root_three_inputs_hips_and_feet_in_161_bytes():
 @given(st.integers(0, 1 << 32))
 @settings(max_examples=30, deadline=None)
 def test_what_copies_hold_is_what_they_would_be_told_again(seed):
-    once = quantised(somebody(seed).pose)
-    assert quantised(once).points.tobytes() == once.points.tobytes()
+    once = quantise_pose(somebody(seed).pose)
+    assert quantise_pose(once).points.tobytes() == once.points.tobytes()
 
 
 def test_robots_go_the_same_way():
@@ -90,20 +90,20 @@ def test_a_pose_that_cannot_be_does_not_leave(point, wrong):
 
 
 def test_pushes_arrive_as_they_left():
-    push = Push(3.0, {"arm_left_3_link": np.array([1.0, -2.5, 30.0, 0.5, 0.0, -0.25]), "chassis": np.zeros(6)})
-    payload = encode_push(push)
+    push = WrenchMessage(3.0, {"arm_left_3_link": np.array([1.0, -2.5, 30.0, 0.5, 0.0, -0.25]), "chassis": np.zeros(6)})
+    payload = encode_wrenches(push)
     assert len(payload) == 14 + 25 + 15 + 25 + 7
-    heard = decode_push(payload)
+    heard = decode_wrenches(payload)
     assert heard.time == 3.0
     assert heard.wrenches.keys() == push.wrenches.keys()
     for link, wrench in push.wrenches.items():
         np.testing.assert_array_equal(heard.wrenches[link], wrench)
-    assert decode_push(encode_push(Push(4.0, {}))).wrenches == {}
+    assert decode_wrenches(encode_wrenches(WrenchMessage(4.0, {}))).wrenches == {}
     with pytest.raises(MessageError, match="too strong"):
-        encode_push(Push(0.0, {"arm": np.full(6, 1e4)}))
+        encode_wrenches(WrenchMessage(0.0, {"arm": np.full(6, 1e4)}))
 
 
-MESSAGES = [encode_human(somebody()), encode_push(Push(1.0, {"arm": np.ones(6), "hand": np.ones(6)}))]
+MESSAGES = [encode_human(somebody()), encode_wrenches(WrenchMessage(1.0, {"arm": np.ones(6), "hand": np.ones(6)}))]
 
 
 @pytest.mark.parametrize("payload", MESSAGES)
@@ -115,7 +115,7 @@ def test_whatever_arrives_is_read_or_refused_in_words(payload, data):
     for _ in range(data.draw(st.integers(0, 4))):
         if damaged:
             damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
-    for decode in (lambda raw: decode_human(raw, "eva"), decode_push, lambda raw: decode_pose(raw, "eva")):
+    for decode in (lambda raw: decode_human(raw, "eva"), decode_wrenches, lambda raw: decode_pose(raw, "eva")):
         try:
             heard = decode(bytes(damaged))
         except MessageError:
@@ -124,13 +124,13 @@ def test_whatever_arrives_is_read_or_refused_in_words(payload, data):
             assert np.isfinite(heard.pose.points).all()
             np.testing.assert_allclose(np.linalg.norm(heard.pose.points[:, 3:], axis=1), 1.0, atol=1e-9)
             assert np.isfinite(heard.velocity).all()
-        elif isinstance(heard, Push):
+        elif isinstance(heard, WrenchMessage):
             assert all(np.isfinite(wrench).all() for wrench in heard.wrenches.values())
 
 
 @pytest.mark.parametrize("payload", MESSAGES)
 def test_a_message_that_is_cut_off_is_refused(payload):
-    read = decode_push if messages.kind_of(payload) == messages.FORCE else lambda raw: decode_human(raw, "eva")
+    read = decode_wrenches if messages.kind_of(payload) == messages.FORCE else lambda raw: decode_human(raw, "eva")
     for length in range(len(payload)):
         with pytest.raises(MessageError):
             read(payload[:length])

@@ -14,53 +14,53 @@ points = st.tuples(metres, metres)
 
 
 def test_cells_have_a_name_on_both_sides_of_the_origin():
-    assert interest.cell(np.array([0.0, 0.0, 5.0])) == (0, 0)
-    assert interest.cell(np.array([-0.1, 8.0])) == (-1, 1)
+    assert interest.cell_of(np.array([0.0, 0.0, 5.0])) == (0, 0)
+    assert interest.cell_of(np.array([-0.1, 8.0])) == (-1, 1)
     many = np.array([[0.0, 0.0, 5.0], [-0.1, 8.0, 0.0]])
-    assert [tuple(cell) for cell in interest.cells(many).tolist()] == [(0, 0), (-1, 1)]
+    assert [tuple(cell) for cell in interest.cells_of(many).tolist()] == [(0, 0), (-1, 1)]
 
 
 @given(st.lists(points, min_size=1, max_size=30), points)
 def test_wherever_one_walks_the_window_covers_the_reach(walk, direction):
     middle = None
     for here in walk:
-        middle = interest.moved(middle, np.array(here))
-        away = np.array(direction) / max(np.hypot(*direction), 1e-9) * (interest.REACH - 1e-6)
-        assert interest.cell(np.array(here) + away) in interest.window(middle)
+        middle = interest.move_window(middle, np.array(here))
+        away = np.array(direction) / max(np.hypot(*direction), 1e-9) * (interest.MAX_INTEREST_RADIUS - 1e-6)
+        assert interest.cell_of(np.array(here) + away) in interest.cell_window(middle)
 
 
 def test_the_window_does_not_flicker_at_an_edge():
-    middle = interest.moved(None, np.array([5.9, 4.0]))
+    middle = interest.move_window(None, np.array([5.9, 4.0]))
     seen = {middle}
     for k in range(100):
-        middle = interest.moved(middle, np.array([6.0 + 0.9 * (-1) ** k, 4.0]))
+        middle = interest.move_window(middle, np.array([6.0 + 0.9 * (-1) ** k, 4.0]))
         seen.add(middle)
     assert seen == {(0, 0)}
-    assert interest.moved(middle, np.array([7.1, 4.0])) == (1, 0)
+    assert interest.move_window(middle, np.array([7.1, 4.0])) == (1, 0)
 
 
 def test_a_window_is_nine_cells():
-    assert len(interest.window((2, -3))) == 9
-    assert {(1, -4), (3, -2), (2, -3)} <= interest.window((2, -3))
+    assert len(interest.cell_window((2, -3))) == 9
+    assert {(1, -4), (3, -2), (2, -3)} <= interest.cell_window((2, -3))
 
 
 @given(st.lists(points, max_size=6), st.lists(points, max_size=6), st.floats(0.1, 5.0))
 def test_listeners_are_counted_by_the_exact_distance(trees, actors, near):
     tree, actor = (np.array([(*p, 1.0) for p in ps]).reshape(-1, 3) for ps in (trees, actors))
     expected = [sum((t[0] - a[0]) ** 2 + (t[1] - a[1]) ** 2 <= near * near for a in actor) for t in tree]
-    assert interest.listeners(tree, actor, near).tolist() == expected
+    assert interest.count_listeners(tree, actor, near).tolist() == expected
 
 
 def test_height_does_not_count():
-    assert interest.listeners(np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 4.9, -30.0]]), 5.0).tolist() == [1]
+    assert interest.count_listeners(np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 4.9, -30.0]]), 5.0).tolist() == [1]
 
 
 @pytest.mark.parametrize("near", [0.0, -1.0, 5.01, float("nan")])
 def test_a_near_that_cells_cannot_cover_is_refused(near):
     with pytest.raises(ValueError, match=r"at most 5\.0 m"):
-        interest.checked(near)
+        interest.check_radius(near)
 
 
 def test_full_rate_has_hysteresis():
-    assert [interest.full_rate(d, False) for d in (9.9, 10.1, 12.1)] == [True, False, False]
-    assert [interest.full_rate(d, True) for d in (9.9, 10.1, 12.1)] == [True, True, False]
+    assert [interest.is_full_rate(d, False) for d in (9.9, 10.1, 12.1)] == [True, False, False]
+    assert [interest.is_full_rate(d, True) for d in (9.9, 10.1, 12.1)] == [True, True, False]

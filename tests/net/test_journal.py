@@ -10,33 +10,35 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Fact
-from vinesim.net.replication.retained import Facts
+from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.replication.retained import RetainedState
 from vinesim.net.server import journal as keep
-from vinesim.net.server.admission import Plan
-from vinesim.net.server.journal import Journal, NotKept, load_all
-from vinesim.scene.ids import Kind, thing
+from vinesim.net.server.admission import SceneId
+from vinesim.net.server.journal import Journal, JournalError, load_all
+from vinesim.scene.ids import ObjectKind, object_id
 
-PLAN = Plan("vsp", "D1")
+PLAN = SceneId("vsp", "D1")
 
 
 def fact(index=0, ownership=1, x=0.0, **more):
-    return Fact(thing(Kind.BOX, index), ownership, 0, "ada", (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), **more)
+    return RetainedRecord(
+        object_id(ObjectKind.BOX, index), ownership, 0, "ada", (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), **more
+    )
 
 
 def add(journal, cell, fact):
     """As the archive does it."""
-    if news := journal.facts.add(cell, fact):
+    if news := journal.state.merge(cell, fact):
         journal.append(cell, fact)
     return news
 
 
 def held(journal):
-    return list(journal.facts)
+    return list(journal.state)
 
 
 def fresh(folder, world="w"):
-    return Journal(folder / f"{world}.facts", world, PLAN, Facts())
+    return Journal(folder / f"{world}.facts", world, PLAN, RetainedState())
 
 
 def test_what_was_added_is_there_again_with_its_scene(tmp_path):
@@ -47,7 +49,7 @@ def test_what_was_added_is_there_again_with_its_scene(tmp_path):
         assert not add(journal, (0, 1), fact(1))
         expected = held(journal)
     again = load_all(tmp_path)["w"]
-    assert again.plan == PLAN
+    assert again.scene_id == PLAN
     assert held(again) == expected == [((0, 1), fact(0, x=1.5)), ((-3, 2), fact(1, ownership=2))]
 
 
@@ -96,15 +98,15 @@ def test_whatever_is_in_the_file_nothing_of_it_is_lost(tmp_path_factory, data):
         content[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
     journal.path.write_bytes(content)
     again = None
-    with contextlib.suppress(NotKept):
+    with contextlib.suppress(JournalError):
         again = Journal.load(journal.path)
     if again is None:
         assert journal.path.read_bytes() == content
         return
     again.close()
     asides = [aside.read_bytes() for aside in folder.glob("*.torn-*")]
-    assert asides == [bytes(content)] or (asides == [] and len(again.facts) == 3)
-    assert held(again) == [((index, 0), fact(index)) for index in range(len(again.facts))]
+    assert asides == [bytes(content)] or (asides == [] and len(again.state) == 3)
+    assert held(again) == [((index, 0), fact(index)) for index in range(len(again.state))]
 
 
 def test_a_flipped_bit_ends_what_is_believed_in_one_line(tmp_path, caplog):
@@ -131,12 +133,12 @@ def test_a_flipped_bit_ends_what_is_believed_in_one_line(tmp_path, caplog):
         (b"vsfacts\x09rest", "version 09"),
         (b"vsfacts\x01", "head is torn"),
         (b"vsfacts\x01" + keep._packed(b"nonsense"), "whose facts"),
-        (b"vsfacts\x01" + keep._packed(keep._encoder.encode(keep._Head("w", "s", "d", 9))), "protocol version 9"),
+        (b"vsfacts\x01" + keep._packed(keep._encoder.encode(keep._Header("w", "s", "d", 9))), "protocol version 9"),
     ],
 )
 def test_a_foreign_file_is_refused_and_left_as_it_is(tmp_path, content, word):
     (tmp_path / "w.facts").write_bytes(content)
-    with pytest.raises(NotKept, match=word) as caught:
+    with pytest.raises(JournalError, match=word) as caught:
         load_all(tmp_path)
     assert "w.facts" in str(caught.value)
     assert "--state-dir" in str(caught.value)
@@ -146,23 +148,23 @@ def test_a_foreign_file_is_refused_and_left_as_it_is(tmp_path, content, word):
 def test_a_file_of_another_world_is_refused(tmp_path):
     fresh(tmp_path, "w").close()
     (tmp_path / "w.facts").rename(tmp_path / "v.facts")
-    with pytest.raises(NotKept, match=r"rename it to w\.facts"):
+    with pytest.raises(JournalError, match=r"rename it to w\.facts"):
         load_all(tmp_path)
 
 
 def test_an_unwritable_folder_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(NotKept, match="cannot be written"):
+    with pytest.raises(JournalError, match="cannot be written"):
         load_all(tmp_path / "file")
 
 
 def test_what_holds_no_more_is_left_out_in_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(keep, "SLACK", 10)
+    monkeypatch.setattr(keep, "MAX_OBSOLETE_RECORDS", 10)
     with fresh(tmp_path) as journal:
         for ownership in range(1, 200):
             add(journal, (0, 0), fact(0, ownership))
-            journal.settle()
-        assert journal.path.stat().st_size < 30 * len(messages.encode_facts([fact(0, 199)]))
+            journal.sync()
+        assert journal.path.stat().st_size < 30 * len(messages.encode_records([fact(0, 199)]))
         add(journal, (0, 0), fact(0, 200))
     assert held(Journal.load(journal.path)) == [((0, 0), fact(0, 200))]
 

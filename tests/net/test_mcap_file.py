@@ -17,17 +17,18 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
+from tests.support.waiting import TIMEOUT
 from vinesim.net.codec import messages
-from vinesim.net.codec.human import Push, encode_human, encode_push
+from vinesim.net.codec.human import WrenchMessage, encode_human, encode_wrenches
 from vinesim.net.recording import mcap_file
-from vinesim.net.recording.mcap_file import NotARecording, Recording, RecordingStopped, free_path, read
+from vinesim.net.recording.mcap_file import InvalidRecording, RecordingStopped, RecordingWriter, free_path, read
 from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.scene.ids import Kind, thing
+from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 
 
 def write(path: pathlib.Path, entries: list[tuple[int, str, bytes]], **about: str) -> pathlib.Path:
-    with Recording(path, about) as file:
+    with RecordingWriter(path, about) as file:
         for entry in entries:
             file.put(*entry)
     return path
@@ -42,15 +43,15 @@ def test_whatever_was_put_in_comes_out_to_the_bit(tmp_path_factory, entries):
     path = write(tmp_path_factory.mktemp("r") / "run.mcap", entries, scene="x")
     tape = read(path)
     expected = sorted(entries, key=lambda entry: entry[0] * 1e-9)
-    assert [(e.key, e.payload) for e in tape.entries] == [(key, payload) for _, key, payload in expected]
-    assert [e.time for e in tape.entries] == pytest.approx([at * 1e-9 for at, _, _ in expected])
-    assert tape.about["scene"] == "x"
+    assert [(e.key, e.payload) for e in tape.messages] == [(key, payload) for _, key, payload in expected]
+    assert [e.time for e in tape.messages] == pytest.approx([at * 1e-9 for at, _, _ in expected])
+    assert tape.metadata["scene"] == "x"
     assert tape.damage == ""
 
 
 def until(condition) -> None:
     """Wait for the thread that writes."""
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -59,13 +60,13 @@ def until(condition) -> None:
 def test_what_a_message_says():
     """Every kind in words and numbers that can be read without us, and the bytes beside them."""
     pose = np.array([13.0, -3.5, 0.2, 0.0, 0.0, 0.6, 0.8])
-    box = thing(Kind.BOX, 2)
-    things = messages.Things(
+    box = object_id(ObjectKind.BOX, 2)
+    things = messages.ObjectStates(
         1e9 + 0.5, np.array([box]), np.array([3]), np.array([4]), np.array([messages.TOUCHED]), pose[None],
         np.array([[0.5, 0.0, 0.0, 0.0, 0.0, 1.0]]),
     )  # fmt: skip
-    (payload,), heard = messages.encode_things(things, (2, -1))
-    said = mcap_file.said("c/2/-1/ada", payload)
+    (payload,), heard = messages.encode_objects(things, (2, -1))
+    said = mcap_file.describe_message("c/2/-1/ada", payload)
     assert base64.b64decode(said["raw"]) == payload
     assert said["actor"] == "ada"
     assert said["timestamp"] == {"sec": 10**9, "nsec": 500_000_000}
@@ -74,39 +75,41 @@ def test_what_a_message_says():
     assert list(one["pose"]["position"].values()) == pytest.approx(pose[:3], abs=2e-4)
     assert list(one["pose"]["orientation"].values()) == pytest.approx(pose[3:], abs=2e-3)
     assert one["velocity"] == heard.velocity[0].tolist()
-    assert messages.time_of(messages.restamped(payload, 2.0)) == 1e9 + 2.5
-    assert messages.restamped(payload, 2.0)[14:] == payload[14:]
+    assert messages.time_of(messages.shift_time(payload, 2.0)) == 1e9 + 2.5
+    assert messages.shift_time(payload, 2.0)[14:] == payload[14:]
 
-    fact = messages.Fact(box, 1, 2, "ada", pose=tuple(pose.tolist()), parent="bob/arm", moving=True)
-    (told,) = mcap_file.said("fact/2/-1/ada", messages.encode_facts([fact]))["facts"]
+    fact = messages.RetainedRecord(box, 1, 2, "ada", pose=tuple(pose.tolist()), parent="bob/arm", moving=True)
+    (told,) = mcap_file.describe_message("fact/2/-1/ada", messages.encode_records([fact]))["facts"]
     assert (told["kind"], told["index"], told["parent"], told["moving"]) == ("box", 2, "bob/arm", True)
     assert told["pose"]["position"]["x"] == 13.0
-    assert messages.time_of(messages.encode_facts([fact])) is None
+    assert messages.time_of(messages.encode_records([fact])) is None
 
     person = standing_pose(pose, 1.8)
-    said = mcap_file.said("a/eva", encode_human(HumanUpdate("eva", 5.0, person, np.zeros((7, 6)))))
+    said = mcap_file.describe_message("a/eva", encode_human(HumanUpdate("eva", 5.0, person, np.zeros((7, 6)))))
     assert said["points"].keys() == set(POINT_NAMES)
     assert list(said["points"]["head"]["position"].values()) == pytest.approx(person.head[:3], abs=2e-4)
     assert said["pose"] == said["points"]["hips"]
-    pushed = encode_push(Push(6.0, {"hand": np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.5])}))
-    assert mcap_file.said("force/bob/eva", pushed)["links"] == [{"link": "hand", "wrench": [1, 2, 3, 0, 0, 0.5]}]
-    assert messages.time_of(messages.restamped(pushed, 1.5)) == 7.5
+    pushed = encode_wrenches(WrenchMessage(6.0, {"hand": np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.5])}))
+    assert mcap_file.describe_message("force/bob/eva", pushed)["links"] == [
+        {"link": "hand", "wrench": [1, 2, 3, 0, 0, 0.5]}
+    ]
+    assert messages.time_of(messages.shift_time(pushed, 1.5)) == 7.5
 
-    assert mcap_file.said("live/ada", b"\x01")["live"] is True
-    assert mcap_file.said("live/ada", b"")["live"] is False
-    assert "error" in mcap_file.said("c/nowhere/ada", payload)
-    assert "cut off" in mcap_file.said("a/ada", b"VS")["error"]
+    assert mcap_file.describe_message("live/ada", b"\x01")["live"] is True
+    assert mcap_file.describe_message("live/ada", b"")["live"] is False
+    assert "error" in mcap_file.describe_message("c/nowhere/ada", payload)
+    assert "cut off" in mcap_file.describe_message("a/ada", b"VS")["error"]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> bytes:
     """A file of five chunks of twenty messages, a second apart."""
     path = tmp_path_factory.mktemp("whole") / "run.mcap"
-    with Recording(path) as file:
+    with RecordingWriter(path) as file:
         for second in range(5):
             for number in range(20):
                 file.put(int(1e9 * (second + number / 20)), "live/ada", bytes([1, second, number]))
-            until(lambda count=20 * (second + 1): file.size and len(read(path).entries) == count)
+            until(lambda count=20 * (second + 1): file.size and len(read(path).messages) == count)
     return path.read_bytes()
 
 
@@ -114,19 +117,19 @@ def test_cut_off_anywhere_what_lies_before_can_be_read(whole, tmp_path):
     """Only what follows the cut is lost, never a message is wrong, and it is said in one line."""
     path = tmp_path / "cut.mcap"
     everything = read_bytes(path, whole)
-    assert len(everything.entries) == 100
+    assert len(everything.messages) == 100
     lengths = []
     for size in range(400, len(whole), 97):
         tape = read_bytes(path, whole[:size])
-        assert [e.payload for e in tape.entries] == [e.payload for e in everything.entries[: len(tape.entries)]]
+        assert [e.payload for e in tape.messages] == [e.payload for e in everything.messages[: len(tape.messages)]]
         assert tape.damage.startswith(str(path))
         assert "\n" not in tape.damage
-        lengths.append(len(tape.entries))
+        lengths.append(len(tape.messages))
     assert lengths == sorted(lengths)
     assert len({0, 20, 40, 60, 80, 100} & set(lengths)) >= 5  # in steps of a chunk
 
 
-def read_bytes(path: pathlib.Path, data: bytes) -> mcap_file.Tape:
+def read_bytes(path: pathlib.Path, data: bytes) -> mcap_file.Recording:
     path.write_bytes(data)
     return read(path)
 
@@ -138,8 +141,8 @@ def test_the_official_reader_reads_a_cut_file_as_far(whole, tmp_path):
     with path.open("rb") as file, contextlib.suppress(EndOfFile):
         for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             theirs.append((channel.topic, json.loads(message.data)["raw"]))
-    assert 0 < len(ours.entries) < 100
-    assert len(theirs) == len(ours.entries)
+    assert 0 < len(ours.messages) < 100
+    assert len(theirs) == len(ours.messages)
 
 
 @settings(max_examples=60, deadline=None)
@@ -151,35 +154,35 @@ def test_damaged_bytes_never_pass_for_messages(whole, tmp_path_factory, data):
         broken[data.draw(st.integers(8, len(whole) - 1))] ^= data.draw(st.integers(1, 255))
     try:
         tape = read_bytes(path, bytes(broken))
-    except NotARecording:
+    except InvalidRecording:
         return
-    good = {e.payload for e in read_bytes(path, whole).entries}
-    assert {e.payload for e in tape.entries if e.key == "live/ada"} <= good
+    good = {e.payload for e in read_bytes(path, whole).messages}
+    assert {e.payload for e in tape.messages if e.key == "live/ada"} <= good
 
 
 @pytest.mark.parametrize("content", [b"", b"abc", b"\x89PNG\r\n\x1a\n" + bytes(100), b"name = 'demo'\n" * 20])
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "file.mcap"
-    with pytest.raises(NotARecording, match=r"file\.mcap"):
+    with pytest.raises(InvalidRecording, match=r"file\.mcap"):
         read_bytes(path, content)
 
 
 def test_missing_files_folders_and_mcaps_of_others_are_refused(tmp_path):
-    with pytest.raises(NotARecording, match=r"nowhere\.mcap.*No such file"):
+    with pytest.raises(InvalidRecording, match=r"nowhere\.mcap.*No such file"):
         read(tmp_path / "nowhere.mcap")
-    with pytest.raises(NotARecording, match="cannot read"):
+    with pytest.raises(InvalidRecording, match="cannot read"):
         read(tmp_path)
     with (tmp_path / "other.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
         writer.finish()
-    with pytest.raises(NotARecording, match="another program"):
+    with pytest.raises(InvalidRecording, match="another program"):
         read(tmp_path / "other.mcap")
 
 
 def test_another_protocol_is_refused_by_its_number(tmp_path):
     path = write(tmp_path / "old.mcap", [(1, "live/ada", b"\x01")], protocol="0", release="0.0.9")
-    with pytest.raises(NotARecording, match=rf"version 0.*version {messages.PROTOCOL}.*0\.0\.9"):
+    with pytest.raises(InvalidRecording, match=rf"version 0.*version {messages.PROTOCOL}.*0\.0\.9"):
         read(path)
 
 
@@ -192,10 +195,10 @@ def test_nothing_is_overwritten(tmp_path):
     assert free_path(path) == tmp_path / "run-3.mcap"
     before = path.read_bytes()
     with pytest.raises(RecordingStopped, match="File exists"):
-        Recording(path)
+        RecordingWriter(path)
     assert path.read_bytes() == before
     with pytest.raises(RecordingStopped, match="choose another"):
-        Recording(tmp_path / "no" / "such" / "folder.mcap")
+        RecordingWriter(tmp_path / "no" / "such" / "folder.mcap")
 
 
 class Full:
@@ -216,7 +219,7 @@ class Full:
 
 def test_a_full_disk_ends_the_recording_and_what_was_written_stays(tmp_path):
     path = tmp_path / "run.mcap"
-    file = Recording(path)
+    file = RecordingWriter(path)
     file._writer._Writer__stream = Full(file._file, 3000)
     stopped = None
     for number in range(100_000):
@@ -234,15 +237,15 @@ def test_a_full_disk_ends_the_recording_and_what_was_written_stays(tmp_path):
         file.close()
     assert path.stat().st_size == file.size <= 3000
     tape = read(path)
-    assert [int.from_bytes(e.payload, "little") for e in tape.entries] == list(range(len(tape.entries)))
+    assert [int.from_bytes(e.payload, "little") for e in tape.messages] == list(range(len(tape.messages)))
 
 
 def test_what_was_recorded_is_readable_while_the_recorder_runs(tmp_path):
     """Within a second of being put, a message can be read by another program."""
     path = tmp_path / "run.mcap"
-    with Recording(path) as file:
+    with RecordingWriter(path) as file:
         file.put(1, "live/ada", b"\x01")
-        until(lambda: file.size and len(read(path).entries) == 1)
+        until(lambda: file.size and len(read(path).messages) == 1)
         with path.open("rb") as half, pytest.raises(Exception):  # noqa: B017 PT011 - its index comes at the end
             make_reader(half).get_summary()
     with path.open("rb") as full:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from vinesim import frames
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello, MessageError, Trees, WrongVersion
+from vinesim.net.codec.messages import Hello, MessageError, TreeStates, WrongVersion
 from vinesim.net.replication.authority import Claim
 from vinesim.scene import ids
 from vinesim.scene.values import RobotUpdate
@@ -24,29 +24,29 @@ def robot(rng: np.random.Generator, joints: int = 14) -> RobotUpdate:
     return RobotUpdate("tiago", 12.5, base, rng.uniform(-2, 2, 6), rng.uniform(-3, 3, joints), velocity)
 
 
-def trees(rng: np.random.Generator, sizes: list[int], rate: float = 5.0) -> Trees:
+def trees(rng: np.random.Generator, sizes: list[int], rate: float = 5.0) -> TreeStates:
     count, bodies = len(sizes), sum(sizes)
     q = frames.exp(rng.uniform(-1.7, 1.7, (bodies, 3)))
     ids = np.sort(rng.choice(1000, count, replace=False))
     sequences = rng.integers(0, 65536, (2, count))
     qd = rng.uniform(-rate, rate, (bodies, 3))
-    return Trees(3.25, ids, *sequences, rng.integers(0, 4, count), np.array(sizes), q, qd)
+    return TreeStates(3.25, ids, *sequences, rng.integers(0, 4, count), np.array(sizes), q, qd)
 
 
-def cut(batch: Trees, roots: list[int], rng: np.random.Generator) -> Trees:
+def cut(batch: TreeStates, roots: list[int], rng: np.random.Generator) -> TreeStates:
     """The same trees with some bodies cut off each."""
     where = [np.sort(rng.choice(size, k, replace=False)) for size, k in zip(batch.bodies, roots, strict=True)]
     x, xd = rng.uniform(-50, 50, (sum(roots), 3)), rng.uniform(-5, 5, (sum(roots), 3))
     return dataclasses.replace(batch, roots=np.array(roots), root=np.concatenate(where), root_x=x, root_xd=xd)
 
 
-def things(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0) -> messages.Things:
-    kinds = rng.choice([ids.Kind.BUNCH, ids.Kind.BOX], count) * ids.THING_STRIDE
+def things(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0) -> messages.ObjectStates:
+    kinds = rng.choice([ids.ObjectKind.BUNCH, ids.ObjectKind.BOX], count) * ids.OBJECT_STRIDE
     numbers = np.sort(kinds + rng.choice(10000, count, replace=False))
     at = rng.uniform([0.0, 0.0, -0.5], [6.0, 6.0, 5.5], (count, 3)) + 6.0 * np.array([*cell, 0.0])
     pose = np.concatenate([at, frames.normalize(rng.standard_normal((count, 4)))], -1)
     sequences = rng.integers(0, 65536, (2, count))
-    return messages.Things(
+    return messages.ObjectStates(
         7.5, numbers, *sequences, rng.integers(0, 2, count), pose, rng.uniform(-speed, speed, (count, 6))
     )
 
@@ -55,7 +55,7 @@ def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(frames.log(frames.multiply(a, frames.conjugate(b))), axis=-1)
 
 
-def one_message(batch: Trees) -> bytes:
+def one_message(batch: TreeStates) -> bytes:
     (payload,), _ = messages.encode_trees(batch)
     return payload
 
@@ -113,14 +113,14 @@ def test_owner_and_copies_agree_to_the_bit_in_messages_of_a_datagram(seed, sizes
     sent = trees(np.random.default_rng(seed), sizes)
     payloads, foretold = messages.encode_trees(sent)
     parts = [messages.decode_trees(payload) for payload in payloads]
-    assert all(len(payload) <= messages.SAMPLE for payload in payloads)
+    assert all(len(payload) <= messages.MAX_DATAGRAM for payload in payloads)
     for field in ("tree", "ownership", "authority", "flags", "bodies"):
         np.testing.assert_array_equal(np.concatenate([getattr(part, field) for part in parts]), getattr(sent, field))
     for field in ("joint_q", "joint_qd"):
         heard = np.concatenate([getattr(part, field) for part in parts])
         assert heard.tobytes() == getattr(foretold, field).tobytes()
     first = slice(0, sizes[0])
-    q, qd = messages.quantised(sent.joint_q[first], sent.joint_qd[first])
+    q, qd = messages.quantise_tree(sent.joint_q[first], sent.joint_qd[first])
     assert q.tobytes() == foretold.joint_q[first].tobytes()
     assert qd.tobytes() == foretold.joint_qd[first].tobytes()
 
@@ -194,7 +194,7 @@ def test_other_versions_kinds_and_programs_are_named():
     with pytest.raises(MessageError, match="kind 1 where trees"):
         messages.decode_trees(payload)
     with pytest.raises(MessageError, match="at most"):
-        messages.kind_of(bytes(messages.LARGEST + 1))
+        messages.kind_of(bytes(messages.MAX_MESSAGE + 1))
 
 
 def test_records_are_held_against_the_vineyard():
@@ -228,7 +228,7 @@ def test_greeting_comes_back_and_strangers_are_refused():
     with pytest.raises(WrongVersion, match="version 2"):
         messages.decode_hello(messages.encode_hello(Hello("a", protocol=2)))
     with pytest.raises(MessageError, match="too long"):
-        messages.encode_hello(Hello("a", urdf="x" * messages.LARGEST))
+        messages.encode_hello(Hello("a", urdf="x" * messages.MAX_MESSAGE))
 
 
 def test_claims_come_back_and_impossible_ones_are_refused():
@@ -256,8 +256,8 @@ DECODERS = (
     messages.decode_trees,
     messages.decode_hello,
     lambda payload: messages.decode_claims(payload, (5, 0, 0)),
-    lambda payload: messages.decode_things(payload, (0, 0)),
-    lambda payload: messages.decode_facts(payload, (5, 3, 2)),
+    lambda payload: messages.decode_objects(payload, (0, 0)),
+    lambda payload: messages.decode_records(payload, (5, 3, 2)),
     messages.decode_time,
     messages.kind_of,
 )
@@ -284,8 +284,8 @@ def test_damaged_messages_raise_nothing_else(data):
         messages.encode_robot(robot(rng, 3)),
         one_message(trees(rng, [3, 4])),
         one_message(cut(trees(rng, [3, 4]), [1, 2], rng)),
-        messages.encode_things(things(rng, 3), (0, 0))[0][0],
-        messages.encode_facts([fact(), fact(thing=3)]),
+        messages.encode_objects(things(rng, 3), (0, 0))[0][0],
+        messages.encode_records([fact(), fact(object=3)]),
         messages.encode_hello(Hello("a", urdf="<robot/>")),
         messages.encode_claims([(1, Claim(1, 2, "a"), True)]),
         messages.encode_time(1.0, 2.0),
@@ -300,11 +300,11 @@ def test_damaged_messages_raise_nothing_else(data):
 @settings(max_examples=100, deadline=None)
 def test_things_come_back_within_quantisation(seed, count, where, speed):
     sent, cell = things(np.random.default_rng(seed), count, (where, -where), speed), (where, -where)
-    payloads, heard = messages.encode_things(sent, cell)
-    assert max(len(payload) for payload in payloads) <= messages.SAMPLE
+    payloads, heard = messages.encode_objects(sent, cell)
+    assert max(len(payload) for payload in payloads) <= messages.MAX_DATAGRAM
     assert sum(len(payload) - 14 for payload in payloads) == 26 * count
-    parts = [messages.decode_things(payload, cell) for payload in payloads]
-    for field in dataclasses.fields(messages.Things)[1:]:
+    parts = [messages.decode_objects(payload, cell) for payload in payloads]
+    for field in dataclasses.fields(messages.ObjectStates)[1:]:
         decoded = np.concatenate([getattr(part, field.name) for part in parts])
         assert decoded.tobytes() == getattr(heard, field.name).tobytes(), "owner and copies hold the same bits"
         if field.name not in ("pose", "velocity"):
@@ -317,14 +317,14 @@ def test_things_come_back_within_quantisation(seed, count, where, speed):
         assert (np.abs(heard.velocity - sent.velocity)[:, part].max(1) <= np.maximum(fastest / 126.0, least)).all()
 
 
-@pytest.mark.parametrize("number", [5, 3 * ids.THING_STRIDE])
+@pytest.mark.parametrize("number", [5, 3 * ids.OBJECT_STRIDE])
 def test_a_thing_that_is_none_is_refused(number):
     batch = things(np.random.default_rng(0), 1)
-    (payload,), _ = messages.encode_things(dataclasses.replace(batch, thing=np.array([number])), (0, 0))
+    (payload,), _ = messages.encode_objects(dataclasses.replace(batch, object=np.array([number])), (0, 0))
     with pytest.raises(MessageError, match="of no kind"):
-        messages.decode_things(payload, (0, 0))
+        messages.decode_objects(payload, (0, 0))
     with pytest.raises(MessageError, match="bunch 17, this vineyard has 17"):
-        messages.check_thing(ids.thing(ids.Kind.BUNCH, 17), (100, 17, 2))
+        messages.check_object_id(ids.object_id(ids.ObjectKind.BUNCH, 17), (100, 17, 2))
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.tuples(st.integers(1, 20), st.integers(0, 4)), min_size=1, max_size=40))
@@ -344,25 +344,27 @@ def test_trees_come_back_with_what_was_cut_off_them(seed, shapes):
         np.testing.assert_allclose(update.root_xd, sent.root_xd[end - count : end], atol=0.51e-3)
 
 
-def fact(**change) -> messages.Fact:
-    usual = {"thing": ids.thing(ids.Kind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
-    return messages.Fact(**{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change})
+def fact(**change) -> messages.RetainedRecord:
+    usual = {"object": ids.object_id(ids.ObjectKind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
+    return messages.RetainedRecord(
+        **{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change}
+    )
 
 
 def test_facts_come_back_as_they_were_said():
-    told = [fact(), fact(thing=ids.thing(ids.Kind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
-    heard = messages.decode_facts(messages.encode_facts(told))
+    told = [fact(), fact(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
+    heard = messages.decode_records(messages.encode_records(told))
     assert heard == told
     assert heard[0].claim == Claim(3, 65535, "picker")
-    assert ids.unthing(heard[0].thing) == (ids.Kind.BUNCH, 17)
-    assert messages.kind_of(messages.encode_facts(told)) == messages.FACTS
+    assert ids.split_object_id(heard[0].object) == (ids.ObjectKind.BUNCH, 17)
+    assert messages.kind_of(messages.encode_records(told)) == messages.FACTS
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"thing": 3 * ids.THING_STRIDE}, "of no kind"),
-        ({"thing": -1}, "of no kind"),
+        ({"object": 3 * ids.OBJECT_STRIDE}, "of no kind"),
+        ({"object": -1}, "of no kind"),
         ({"authority": 65536}, "with claim"),
         ({"author": "a/b"}, "fact by 'a/b'"),
         ({"pose": (np.nan, 0, 0, 0, 0, 0, 1.0)}, "not finite"),
@@ -374,9 +376,9 @@ def test_facts_come_back_as_they_were_said():
 )
 def test_a_fact_that_cannot_be_is_refused_in_words(change, words):
     with pytest.raises(MessageError, match=words):
-        messages.decode_facts(messages.encode_facts([fact(**change)]))
+        messages.decode_records(messages.encode_records([fact(**change)]))
 
 
 def test_too_many_facts_are_refused():
     with pytest.raises(MessageError, match="at most 4096"):
-        messages.decode_facts(messages.encode_facts([fact()] * 4097))
+        messages.decode_records(messages.encode_records([fact()] * 4097))

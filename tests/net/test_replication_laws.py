@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.shared_vineyard import Server
-from vinesim.bench.support.fake_client import Puppet, row
+from vinesim.bench.support.fake_client import FakeClient, row
 from vinesim.net.codec import messages
 from vinesim.net.replication import interest
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.scene.ids import Kind, thing
+from vinesim.scene.ids import ObjectKind, object_id
 
 TICK = 0.01
 PLACES = {"ada": 1.0, "bob": 2.0, "cleo": 3.0, "dan": 2.5}
-BUNCHES = [thing(Kind.BUNCH, index) for index in range(3)]
-BOXES = [thing(Kind.BOX, index) for index in range(3)]
+BUNCHES = [object_id(ObjectKind.BUNCH, index) for index in range(3)]
+BOXES = [object_id(ObjectKind.BOX, index) for index in range(3)]
 
 
 class Keeper(Server):
@@ -25,7 +25,9 @@ class Keeper(Server):
 
     def open(self) -> None:
         super().open()
-        self.bus.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.hub.time))
+        self.bus.declare_queryable(
+            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.hub.time)
+        )
 
 
 class World:
@@ -35,12 +37,12 @@ class World:
         self.hub = MemoryHub(**network)  # type: ignore[arg-type]
         self.keeper = Keeper(self.hub)
         self.model = row(6)
-        self.cast: dict[str, Puppet] = {}
+        self.cast: dict[str, FakeClient] = {}
         for name in names:
             self.come(name)
 
     def come(self, name: str) -> None:
-        self.cast[name] = Puppet(self.hub.bus(name), self.model, (PLACES[name], 0.0), joints=2)
+        self.cast[name] = FakeClient(self.hub.bus(name), self.model, (PLACES[name], 0.0), joints=2)
 
     def go(self, name: str) -> None:
         self.cast.pop(name).bus.close()
@@ -87,7 +89,7 @@ def play(world: World, name: str, act: str, number: int, picked: set[int]) -> No
         puppet.grabbing.add(number)
     elif act == "pick":
         # somebody who has not heard of it may pick what another has picked: both believe it, one owns it
-        first = puppet.exchange.fact(number) is None and number not in puppet.carrying
+        first = puppet.exchange.record(number) is None and number not in puppet.carrying
         (puppet.picking if first else puppet.grabbing).add(number)
         puppet.carrying.add(number)
         picked.add(number)
@@ -124,8 +126,8 @@ def test_after_any_story_all_agree_and_nothing_picked_hangs_again(story, seed, l
         world.come(newcomer)
         world.run(1.5)
     for number in picked:
-        known = [puppet.exchange.fact(number) is not None for puppet in world.cast.values()]
-        kept = world.keeper.facts.of(number) is not None
+        known = [puppet.exchange.record(number) is not None for puppet in world.cast.values()]
+        kept = world.keeper.facts.get(number) is not None
         # who picked it alone and left before anybody could hear of it took the story along
         assert all(known) == any(known) == kept
 
@@ -162,7 +164,7 @@ def test_bytes_leave_exactly_when_somebody_is_near(where, tree, near):
     hub = MemoryHub()
     model = row(6, apart=3.0)
     cast = [
-        Puppet(hub.bus(name), model, (x, 0.0), joints=2, near=near)
+        FakeClient(hub.bus(name), model, (x, 0.0), joints=2, near=near)
         for name, x in zip(("ada", "bob", "cleo"), where, strict=True)
     ]
 
@@ -175,7 +177,7 @@ def test_bytes_leave_exactly_when_somebody_is_near(where, tree, near):
     run(60)
     cast[0].touching.add(tree)
     run(60)
-    middle = cast[0].exchange._trees.middle[tree]
+    middle = cast[0].exchange._tree_stream.middle[tree]
     away = [float(np.hypot(*(puppet.place[:2] - middle[:2]))) for puppet in cast]
     sent = cast[0].exchange.counters.environment.bytes_out
     if any(abs(one - near) < 0.01 for one in away):
@@ -194,7 +196,7 @@ def test_any_two_clocks_agree_as_far_as_jitter_allows(seed, delay, uneven, skew_
     jitter = uneven * delay
     hub = MemoryHub(delay=delay, jitter=jitter, loss=0.2, seed=seed)
     Keeper(hub)
-    ada, bob = (Puppet(hub.bus(name), row(1), (x, 0.0), joints=2) for name, x in (("ada", 1.0), ("bob", 2.0)))
+    ada, bob = (FakeClient(hub.bus(name), row(1), (x, 0.0), joints=2) for name, x in (("ada", 1.0), ("bob", 2.0)))
     for _ in range(200):
         hub.advance(TICK)
         ada.tick(hub.time + skew_a)

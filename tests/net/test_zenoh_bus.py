@@ -14,29 +14,20 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from tests.support.waiting import TIMEOUT, wait
 from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import Exchange
+from vinesim.net.replication.exchange import Replicator
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus
-from vinesim.net.transport.bus import EVERY, NameTaken
-from vinesim.net.transport.certificates import new
-from vinesim.net.transport.endpoints import chosen
+from vinesim.net.transport.bus import KEEP_ALL, NameTaken
+from vinesim.net.transport.certificates import create
+from vinesim.net.transport.endpoints import resolve_ports
 from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate
-
-PATIENCE = 10.0
-
-
-def wait(condition: Callable[[], object], what: str) -> None:
-    """Until it holds; fails in words after ten seconds."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f"waited {PATIENCE} s in vain for: {what}"
-        time.sleep(0.002)
 
 
 @pytest.fixture
@@ -85,14 +76,14 @@ class Wire:
 def test_samples_cross_and_depths_hold(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
         bob.subscribe("c/0/0/*")
-        bob.subscribe("own/0/0/*", EVERY)
+        bob.subscribe("own/0/0/*", KEEP_ALL)
         pose, event = ada.publisher("c/0/0/ada"), ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: pose.matching and event.matching, "bob's subscriptions")
         for number in range(100):
             assert pose.put(bytes([number]))
             assert event.put(bytes([number]))
         wait(lambda: bob.bytes_in == 200, "all samples")
-        heard = bob.drain()
+        heard = bob.poll()
         assert [payload[0] for key, payload in heard if key == "own/0/0/ada"] == list(range(100))
         assert [payload[0] for key, payload in heard if key == "c/0/0/ada"] == [99]
         assert (ada.bytes_out, bob.bytes_in) == (200, 200)
@@ -135,7 +126,7 @@ def test_payload_bytes_are_what_crosses_the_wire(server):
         ZenohBus("ada", connect=wire.endpoint) as ada,
         ZenohBus("bob", connect=server.endpoint) as bob,
     ):
-        bob.subscribe("c/0/0/*", EVERY)
+        bob.subscribe("c/0/0/*", KEEP_ALL)
         publisher = ada.publisher("c/0/0/ada")
         wait(lambda: publisher.matching, "bob's subscription")
         before = wire.up
@@ -203,31 +194,31 @@ def test_a_name_that_is_no_key_is_refused(name):
 
 def test_questions_find_their_answers(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
-        bob.serve("hello/bob", lambda question: question + b"!")
+        bob.declare_queryable("hello/bob", lambda question: question + b"!")
         answers: list = []
 
         def asked() -> bool:
-            ada.ask("hello/bob", b"hi")
+            ada.query("hello/bob", b"hi")
             time.sleep(0.02)
-            answers.extend(ada.answers())
+            answers.extend(ada.replies())
             return bool(answers)
 
         wait(asked, "bob's answer")
         assert answers[0][:2] == ("hello/bob", b"hi!")
-        assert 0.0 <= answers[0].age < PATIENCE
+        assert 0.0 <= answers[0].age < TIMEOUT
 
 
 def test_a_huge_sample_is_not_kept(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
-        bob.subscribe("own/0/0/*", EVERY)
+        bob.subscribe("own/0/0/*", KEEP_ALL)
         event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: event.matching, "bob's subscription")
-        event.put(bytes(messages.LARGEST + 1))
-        event.put(bytes(5 * messages.LARGEST))  # the router does not even put this together
+        event.put(bytes(messages.MAX_MESSAGE + 1))
+        event.put(bytes(5 * messages.MAX_MESSAGE))  # the router does not even put this together
         event.put(b"small")
-        wait(lambda: bob.bytes_in == messages.LARGEST + 6, "both samples")
-        assert bob.drain() == [("own/0/0/ada", b"small")]
-        assert bob.lost == 1
+        wait(lambda: bob.bytes_in == messages.MAX_MESSAGE + 6, "both samples")
+        assert bob.poll() == [("own/0/0/ada", b"small")]
+        assert bob.dropped == 1
 
 
 def test_a_session_left_open_does_not_hang_at_exit(server):
@@ -250,7 +241,7 @@ class Client:
             trees.append(tree)
         self.model = assemble(trees)
         self.state = State.at_rest(self.model)
-        self.exchange = Exchange(bus, Hello(bus.name, digest=self.model.digest(), joints=1), self.model)
+        self.exchange = Replicator(bus, Hello(bus.name, digest=self.model.digest(), joints=1), self.model)
         self.robot = RobotUpdate(bus.name, 0.0, frames.pose(np.array([x, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
         self.touched: set[int] = set()
         self.robots: dict[str, RobotUpdate] = {}
@@ -334,13 +325,13 @@ def test_a_router_that_is_killed_and_restarted_resumes():
             wait(ticking(lambda: bob.exchange.owner(1) == "ada"), "the first touch")
             router.kill()
             router.wait()
-            wait(ticking(lambda: a.trouble and b.trouble), "both to notice that the server is gone")
-            assert endpoint in a.trouble
+            wait(ticking(lambda: a.status_message and b.status_message), "both to notice that the server is gone")
+            assert endpoint in a.status_message
             wait(ticking(lambda: a.alive() == {"ada"} and not bob.robots), "each to be alone")
             assert ada.exchange.owner(1) == "ada"
             router = start()
             wait(ticking(lambda: bob.exchange.owner(1) == "ada" and "ada" in bob.robots), "the stream again")
-            assert a.trouble == b.trouble == ""
+            assert a.status_message == b.status_message == ""
     finally:
         router.kill()
         router.wait()
@@ -354,21 +345,21 @@ class Pump:
 
     def __init__(self, sender: ZenohBus, receiver: ZenohBus) -> None:
         receiver.subscribe(f"a/{sender.name}")
-        receiver.subscribe(f"own/0/0/{sender.name}", EVERY)
+        receiver.subscribe(f"own/0/0/{sender.name}", KEEP_ALL)
         self._pose = sender.publisher(f"a/{sender.name}")
         self._event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
         self._receiver = receiver
         self._heard: set[str] = set()
 
     def again(self) -> None:
-        self._receiver.drain()
+        self._receiver.poll()
         self._heard.clear()
 
     def __call__(self) -> bool:
         self._pose.put(bytes(1000))
         self._event.put(b"event")
         time.sleep(0.002)
-        self._heard.update(key for key, _ in self._receiver.drain())
+        self._heard.update(key for key, _ in self._receiver.poll())
         return len(self._heard) == 2
 
 
@@ -383,8 +374,8 @@ def test_poses_are_datagrams_beside_the_stream_of_events(server):
         ):
             assert [link.partition(" ")[2] for link in ada.links] == ["reliable", "best effort", "reliable"]
             assert len(bob.links) == 1
-            bob.subscribe("a/ada", EVERY)
-            bob.subscribe("own/0/0/ada", EVERY)
+            bob.subscribe("a/ada", KEEP_ALL)
+            bob.subscribe("own/0/0/ada", KEEP_ALL)
             pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
             wait(lambda: pose.matching and event.matching, "bob's subscriptions")
             before = wire.up
@@ -393,7 +384,7 @@ def test_poses_are_datagrams_beside_the_stream_of_events(server):
             for _ in range(20):
                 event.put(bytes(1000))
             heard: list = []
-            wait(lambda: heard.extend(bob.drain()) or sum(k[0] == "o" for k, _ in heard) == 20, "all events")
+            wait(lambda: heard.extend(bob.poll()) or sum(k[0] == "o" for k, _ in heard) == 20, "all events")
             assert wire.up - before > 20_000
 
 
@@ -437,7 +428,7 @@ class DatagramWire:
 
 
 def test_when_datagrams_pass_no_more_poses_take_the_stream(caplog, monkeypatch):
-    monkeypatch.setattr(zenoh_bus, "SILENT", 1.0)
+    monkeypatch.setattr(zenoh_bus, "SILENCE_TIMEOUT", 1.0)
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, Wire(server.endpoint) as wire:
         port = int(wire.endpoint.rpartition(":")[2])
         datagrams = DatagramWire(port, server.endpoints[1].port)
@@ -446,11 +437,11 @@ def test_when_datagrams_pass_no_more_poses_take_the_stream(caplog, monkeypatch):
             there, back = Pump(ada, bob), Pump(bob, ada)
             wait(lambda: there() and back(), "poses each way")
             datagrams.close()
-            wait(lambda: "udp/" in ada.trouble, "ada to miss the datagrams")
+            wait(lambda: "udp/" in ada.status_message, "ada to miss the datagrams")
             there.again()
             back.again()
             wait(lambda: there() and back(), "poses over the stream")
-            assert ada.trouble == ""
+            assert ada.status_message == ""
             assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
             assert len([line for line in caplog.messages if "no datagrams pass" in line and "any more" in line]) == 1
 
@@ -486,8 +477,8 @@ def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
     stream, datagrams = protocols.split()
     secure = stream == "tls"
     for name in ("ada", "bob") if secure else ():
-        new(tmp_path, name)
-    wanted = chosen([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
+        create(tmp_path, name)
+    wanted = resolve_ports([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
     code = (
         "import pathlib, sys\nfrom vinesim.net.server.server import Server\n"
         f"with Server(sys.argv[1:], certificates={f'pathlib.Path({str(tmp_path)!r})' if secure else None}) as server:\n"
@@ -512,11 +503,11 @@ def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
             wait(both, "a pose and an event")
             router.kill()
             router.wait()
-            wait(lambda: ada.trouble and bob.trouble, "both to notice")
+            wait(lambda: ada.status_message and bob.status_message, "both to notice")
             router = start()
             both.again()
             wait(both, "both streams again")
-            wait(lambda: not ada.trouble and not bob.trouble and len(ada.links) == 3, "both to be well")
+            wait(lambda: not ada.status_message and not bob.status_message and len(ada.links) == 3, "both to be well")
     finally:
         router.kill()
         router.wait()

@@ -11,7 +11,7 @@ from tests.support.shared_vineyard import BOX, BUNCH, World, apart, heard, pose_
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.scene.ids import Kind, Organ, thing_named
+from vinesim.scene.ids import ObjectKind, Organ, parse_object_name
 from vinesim.scene.values import HumanPose
 
 
@@ -32,7 +32,7 @@ def near_worlds(*others: tuple[float, float]) -> tuple[World, Client, Client]:
 
 
 def at_rest(world: World) -> bool:
-    return not any(client.objects.moving or client.replicator.mine for client in world.clients.values())
+    return not any(client.objects.moving or client.replicator.owned for client in world.clients.values())
 
 
 def fill(client: Client, box: int = 0) -> None:
@@ -159,7 +159,7 @@ def test_a_box_that_rides_on_a_robot_costs_nothing_and_is_where_the_robot_is():
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)
     np.testing.assert_allclose(pose_of(ada, BOX(1))[:3], beside[:3], atol=0.01)
-    assert world.server.facts.of(BOX(1)).author == "ada"
+    assert world.server.facts.get(BOX(1)).author == "ada"
     assert apart(ada, bob, BOX(1)) < 1e-3
 
 
@@ -205,7 +205,7 @@ def test_two_cut_one_bunch_in_the_same_tick_and_it_is_one_bunch_of_one_owner():
     world.run(0.2)
     assert apart(ada, bob, BUNCH(0)) < 1e-3
     assert [client.physics.rigid.free_bunches for client in (ada, bob)] == [(0,), (0,)]
-    assert len([fact for _, fact in world.server.facts if fact.thing == BUNCH(0)]) == 1
+    assert len([fact for _, fact in world.server.facts if fact.object == BUNCH(0)]) == 1
 
 
 def test_a_cut_cane_falls_for_everybody_near_and_lies_the_same():
@@ -224,7 +224,7 @@ def test_a_cut_cane_falls_for_everybody_near_and_lies_the_same():
         client.physics.update_kinematics()
     here = ada.model.bodies_of(1)
     assert np.abs(ada.physics.state.body_q[here] - bob.physics.state.body_q[here])[:, :3].max() < 5e-3
-    fact = world.server.facts.of(1)
+    fact = world.server.facts.get(1)
     assert fact is not None
     assert fact.cut == (body,)
     assert not fact.moving
@@ -236,13 +236,16 @@ def test_every_kind_of_thing_that_moves_has_a_channel():
     ada.physics.pick(1)
     world.run(0.2)
     view = ada.physics.snapshot()
-    named = {link.organ: thing_named(link.name) for link in view.visuals}
+    named = {link.organ: parse_object_name(link.name) for link in view.visuals}
     assert {organ for organ, number in named.items() if number is not None} == {Organ.BOX, Organ.BUNCH}
     assert {organ for organ, number in named.items() if number is None} <= {Organ.ROBOT, Organ.HUMAN}
-    assert {link.name.partition("/")[0] for link in view.visuals if thing_named(link.name) is None} == {"ada", "bob"}
-    assert bob.replicator.actors.keys() == {"ada"}
-    assert {Kind(number >> 24) for number in ada.replicator.mine} == {Kind.BUNCH, Kind.TREE}
-    assert set(Kind) == {Kind.TREE, Kind.BUNCH, Kind.BOX}
+    assert {link.name.partition("/")[0] for link in view.visuals if parse_object_name(link.name) is None} == {
+        "ada",
+        "bob",
+    }
+    assert bob.replicator.peers.keys() == {"ada"}
+    assert {ObjectKind(number >> 24) for number in ada.replicator.owned} == {ObjectKind.BUNCH, ObjectKind.TREE}
+    assert set(ObjectKind) == {ObjectKind.TREE, ObjectKind.BUNCH, ObjectKind.BOX}
 
 
 def test_a_story_is_the_same_twice():
@@ -296,7 +299,7 @@ def test_a_restarted_server_is_told_again():
     world.until(lambda: at_rest(world), 5.0)
     world.run(0.2)
     known = list(world.server.facts)
-    assert [fact.thing for _, fact in known] == [0, BUNCH(0)]
+    assert [fact.object for _, fact in known] == [0, BUNCH(0)]
     world.hub.down = True
     world.run(0.3)
     world.server.facts = type(world.server.facts)()
@@ -325,7 +328,7 @@ def test_while_the_server_is_away_everybody_works_on_and_all_agree_afterwards():
     world.run(0.3)
     for number in (BUNCH(0), BUNCH(1)):
         assert apart(ada, bob, number) < 5e-3
-        assert ada.replicator.fact(number) == bob.replicator.fact(number) == world.server.facts.of(number)
+        assert ada.replicator.record(number) == bob.replicator.record(number) == world.server.facts.get(number)
 
 
 def test_a_robot_that_leaves_leaves_behind_what_rode_on_it():
@@ -335,14 +338,14 @@ def test_a_robot_that_leaves_leaves_behind_what_rode_on_it():
     world.run(0.2)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.2)
-    assert world.server.facts.of(BOX(1)).parent == "ada/base_footprint"
+    assert world.server.facts.get(BOX(1)).parent == "ada/base_footprint"
     ada.leave()
     world.leave("ada")
     world.until(lambda: "ada" not in bob.remote_actors, 0.2)
     world.until(lambda: bob.replicator.owner(BOX(1)) == "bob", 1.0)
     world.until(lambda: at_rest(world), 3.0)
     world.run(0.1)
-    fact = world.server.facts.of(BOX(1))
+    fact = world.server.facts.get(BOX(1))
     assert (fact.author, fact.parent, fact.moving) == ("bob", "", False)
     assert fact.pose[2] < 0.05
     np.testing.assert_allclose(fact.pose[:2], deck[:2], atol=0.1)

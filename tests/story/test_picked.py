@@ -14,7 +14,7 @@ from vinesim.net.transport.bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.ids import Kind, thing
+from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.spec import with_seed
 
@@ -28,7 +28,7 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     scene = with_seed(load_scene("harvest"), 7)
     model, vinebot, hub = generate(scene), load_description("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
     task = next(pick_planning.plan_picks(model, start_poses.spawn_pose(scene, 0)[:2]))
-    box = thing(Kind.BOX, task.box)
+    box = object_id(ObjectKind.BOX, task.box)
     beside = model.box_pose[task.box, :2] + [0.0, 1.6]
     worker, visitor = (
         Client(scene, model, vinebot, hub.bus(name), name=name, pose=pose, clock=lambda: now[0])
@@ -48,7 +48,7 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     empty = float(model.box_mass[task.box]) * GRAVITY
     pick = PickBunch(worker.physics, worker.robot, task)
     worker.pre_step.append(pick.control)
-    bunch, worst = thing(Kind.BUNCH, task.bunch), []
+    bunch, worst = object_id(ObjectKind.BUNCH, task.bunch), []
     while not pick.is_done:
         run()
         cut = not worker.physics.state.bunch_attached[task.bunch]
@@ -74,7 +74,7 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     weighed = np.mean([(run(), pressed_on_ground(visitor.physics, task.box))[1] for _ in range(50)]) - empty
     assert weighed == pytest.approx(float(model.body_mass[model.bunch_body[task.bunch]]) * GRAVITY, rel=0.03)
     counters = worker.replicator.counters
-    told = counters.environment, counters.event, counters.fact
+    told = counters.environment, counters.event, counters.retained
     assert sum(family.bytes_out for family in told) < 100e3
     assert max(worst) < 0.03
     sent = [family.bytes_out for family in told]

@@ -119,7 +119,7 @@ def message() -> str:
     return _hash(
         robot if isinstance(robot, bytes) else b"".join(robot),
         *messages.encode_trees(trees)[0],
-        *messages.encode_things(things, (0, 0))[0],
+        *messages.encode_objects(things, (0, 0))[0],
     )
 
 

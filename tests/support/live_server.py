@@ -5,23 +5,12 @@ from __future__ import annotations
 import functools
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 
 import pytest
 
+from tests.support.waiting import wait as wait
 from vinesim.bench.support import network_emulator
-
-PATIENCE = 15.0
-
-
-def wait(condition: Callable[[], object], what: str, patience: float = PATIENCE) -> float:
-    """Until it holds; fails in words. Returns how long it took [s]."""
-    start = time.monotonic()
-    while not condition():
-        assert time.monotonic() < start + patience, f"waited {patience} s in vain for: {what}"
-        time.sleep(0.01)
-    return time.monotonic() - start
 
 
 @functools.cache

@@ -8,7 +8,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import Exchange, Inbox
+from vinesim.net.replication.exchange import Inbox, Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
@@ -35,7 +35,7 @@ class Light:
     def __init__(self, bus: Bus, x: float, **hello) -> None:
         self.model, self.bus, self.name = vineyard(), bus, bus.name
         hello = {"scene": "rows", "digest": self.model.digest(), "joints": 2, "seed": 5} | hello
-        self.exchange = Exchange(bus, Hello(bus.name, **hello), self.model)
+        self.exchange = Replicator(bus, Hello(bus.name, **hello), self.model)
         self.state = State.at_rest(self.model)
         joints = np.array([0.1, -0.2][: hello["joints"]])
         self.robot = RobotUpdate(bus.name, 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), joints, np.zeros(len(joints)))

@@ -13,12 +13,12 @@ from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.net.codec import messages
-from vinesim.net.replication.retained import Facts
-from vinesim.net.transport.bus import EVERY, MemoryBus, MemoryHub
+from vinesim.net.replication.retained import RetainedState
+from vinesim.net.transport.bus import KEEP_ALL, MemoryBus, MemoryHub
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
-from vinesim.scene.ids import Kind, thing
+from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
 
@@ -101,23 +101,23 @@ class Server:
     def __init__(self, hub: MemoryHub) -> None:
         self.hub = hub
         self.open()
-        self.facts = Facts()
+        self.facts = RetainedState()
 
     def open(self) -> None:
         self.bus: MemoryBus = self.hub.bus("server")
-        self.bus.subscribe("fact/**", EVERY)
+        self.bus.subscribe("fact/**", KEEP_ALL)
         for x in self.CELLS:
             for y in self.CELLS:
-                self.bus.serve(f"snap/{x}/{y}", functools.partial(self.tell, (x, y)))
+                self.bus.declare_queryable(f"snap/{x}/{y}", functools.partial(self.tell, (x, y)))
 
     def tell(self, cell: tuple[int, int], _: bytes) -> bytes:
-        return messages.encode_facts(self.facts.cell(cell))
+        return messages.encode_records(self.facts.in_cell(cell))
 
     def tick(self) -> None:
-        for key, payload in self.bus.drain():
+        for key, payload in self.bus.poll():
             _, x, y, _ = key.split("/")
-            for fact in messages.decode_facts(payload):
-                self.facts.add((int(x), int(y)), fact)
+            for fact in messages.decode_records(payload):
+                self.facts.merge((int(x), int(y)), fact)
 
 
 class World:
@@ -158,7 +158,7 @@ class World:
         pytest.fail(f"did not come true within {limit} s of simulated time")
 
 
-BUNCH, BOX = functools.partial(thing, Kind.BUNCH), functools.partial(thing, Kind.BOX)
+BUNCH, BOX = functools.partial(object_id, ObjectKind.BUNCH), functools.partial(object_id, ObjectKind.BOX)
 
 
 def pose_of(client: Client, number: int) -> np.ndarray:
@@ -173,9 +173,9 @@ def apart(a: Client, b: Client, number: int) -> float:
 def sent(client: Client) -> int:
     """Bytes that left about trees, boxes and bunches: streams, claims and facts."""
     counters = client.replicator.counters
-    return sum(family.bytes_out for family in (counters.environment, counters.event, counters.fact))
+    return sum(family.bytes_out for family in (counters.environment, counters.event, counters.retained))
 
 
 def heard(client: Client) -> int:
     counters = client.replicator.counters
-    return sum(family.bytes_in for family in (counters.environment, counters.event, counters.fact))
+    return sum(family.bytes_in for family in (counters.environment, counters.event, counters.retained))

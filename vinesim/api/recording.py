@@ -1,7 +1,9 @@
 """MCAP recordings of a world, read message by message.
 
-for message in Recording("harvest.mcap"):
-    print(message.time, message.actor, message.key, message.data)
+    for message in Recording("harvest.mcap"):
+        print(message.time, message.actor, message.key, message.data)
+
+``vinesim record`` writes them.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ class Recording:
     @property
     def info(self) -> dict[str, str]:
         """What the recorder knew: release, protocol, world, scene, seed, digest."""
-        return dict(self._tape.about)
+        return dict(self._tape.metadata)
 
     @property
     def actors(self) -> list[str]:
@@ -48,7 +50,7 @@ class Recording:
     @property
     def duration(self) -> float:
         """[s] from the first message to the last."""
-        return self._tape.length if self._tape.entries else 0.0
+        return self._tape.length if self._tape.messages else 0.0
 
     @property
     def damage(self) -> str:
@@ -57,10 +59,10 @@ class Recording:
 
     def __len__(self) -> int:
         """Number of messages."""
-        return len(self._tape.entries)
+        return len(self._tape.messages)
 
     def __iter__(self) -> Iterator[RecordedMessage]:
         """All messages in the order of time."""
-        for entry in self._tape.entries:
-            data = mcap_file.said(entry.key, entry.payload)
+        for entry in self._tape.messages:
+            data = mcap_file.describe_message(entry.key, entry.payload)
             yield RecordedMessage(entry.time - self._tape.start, mcap_file.sender_of(entry.key), entry.key, data)

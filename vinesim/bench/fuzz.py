@@ -14,14 +14,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from vinesim import frames
-from vinesim.bench.support.fake_client import Puppet, row, swung
+from vinesim.bench.support.fake_client import FakeClient, row, swung
 from vinesim.net.codec import messages
-from vinesim.net.codec.human import Push, encode_pose, encode_push
-from vinesim.net.codec.messages import Fact, Hello
+from vinesim.net.codec.human import WrenchMessage, encode_pose, encode_wrenches
+from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.transport.bus import MemoryHub
-from vinesim.scene.ids import Kind, thing
+from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
 from vinesim.scene.values import Measurement
 
@@ -36,7 +36,7 @@ _EXTREMES = (
 )  # fmt: skip
 
 
-def sound(model: Model, actor: Puppet, now: float, chance: random.Random) -> tuple[str, bytes]:
+def sound(model: Model, actor: FakeClient, now: float, chance: random.Random) -> tuple[str, bytes]:
     """A family of keys and a message as ``actor`` might send it."""
     kind = chance.choice(("a", "c", "things", "own", "fact", "force", "hello"))
     tree = chance.randrange(len(model.tree_first))
@@ -44,28 +44,28 @@ def sound(model: Model, actor: Puppet, now: float, chance: random.Random) -> tup
     if kind == "a":
         return kind, encode_pose(actor.pose(now))
     if kind == "force":
-        return kind, encode_push(Push(now, {"base_link": np.array([chance.uniform(-50.0, 50.0)] * 6)}))
+        return kind, encode_wrenches(WrenchMessage(now, {"base_link": np.array([chance.uniform(-50.0, 50.0)] * 6)}))
     if kind == "c":
         q, qd = swung(model, tree, now)
         flags = np.array([chance.choice((0, messages.TOUCHED, messages.RESTING))])
-        record = messages.Trees(
+        record = messages.TreeStates(
             now, np.array([tree]), np.array([claim.ownership]), np.array([claim.authority]), flags,
             np.array([len(q)]), q, qd,
         )  # fmt: skip
         return kind, messages.encode_trees(record)[0][0]
     if kind == "things":
-        number = np.array([thing(Kind.BOX, tree)])
+        number = np.array([object_id(ObjectKind.BOX, tree)])
         flags = np.array([messages.TOUCHED])
-        record = messages.Things(
+        record = messages.ObjectStates(
             now, number, np.array([claim.ownership]), np.array([claim.authority]), flags,
             frames.pose(np.array([[0.5, 0.5, 1.0]])), np.zeros((1, 6)),
         )  # fmt: skip
-        return "c", messages.encode_things(record, (0, 0))[0][0]
+        return "c", messages.encode_objects(record, (0, 0))[0][0]
     if kind == "own":
         return kind, messages.encode_claims([(tree, claim, chance.random() < 0.5)])
     if kind == "fact":
-        fact = Fact(thing(Kind.BUNCH, tree), claim.ownership, claim.authority, EVIL)
-        return kind, messages.encode_facts([fact])
+        fact = RetainedRecord(object_id(ObjectKind.BUNCH, tree), claim.ownership, claim.authority, EVIL)
+        return kind, messages.encode_records([fact])
     return "own", messages.encode_hello(Hello(EVIL, scene="puppets", digest="puppets"))
 
 
@@ -92,14 +92,14 @@ def broken(payload: bytes, other: bytes, chance: random.Random) -> bytes:
     elif how == 6:
         data = bytearray(chance.randbytes(chance.randint(0, 200)))
     elif how == 7 and chance.random() < 0.002:
-        data = bytearray(b"VS\x01\x02") + bytes(messages.LARGEST + 1)
+        data = bytearray(b"VS\x01\x02") + bytes(messages.MAX_MESSAGE + 1)
     return bytes(data)
 
 
-def storm(model: Model, actor: Puppet, seed: int, now: float = 0.0) -> Iterator[tuple[str, bytes]]:
+def storm(model: Model, actor: FakeClient, seed: int, now: float = 0.0) -> Iterator[tuple[str, bytes]]:
     """Broken messages without end, each with the key it is sent under."""
     chance = random.Random(seed)
-    cells = sorted({interest.cell(pose[:3]) for pose in model.tree_pose.astype(float)})
+    cells = sorted({interest.cell_of(pose[:3]) for pose in model.tree_pose.astype(float)})
     earlier = [encode_pose(actor.pose(now))]
     while True:
         family, payload = sound(model, actor, now, chance)
@@ -119,13 +119,15 @@ def storm(model: Model, actor: Puppet, seed: int, now: float = 0.0) -> Iterator[
         yield key, bad
 
 
-def play(count: int, seed: int = 0) -> tuple[Puppet, Puppet, np.ndarray, int]:
+def play(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.ndarray, int]:
     """A storm against two honest puppets: both, the time of each tick of the first [s], and how many reached it."""
     hub = MemoryHub(delay=0.005, seed=seed)
     server = hub.bus("server")
-    server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+    server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
     model = row()
-    ada, bob, evil = (Puppet(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0), (EVIL, 3.0)))
+    ada, bob, evil = (
+        FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0), (EVIL, 3.0))
+    )
     cast = (ada, bob, evil)
     for _ in range(100):
         hub.advance(0.01)
@@ -154,7 +156,7 @@ def play(count: int, seed: int = 0) -> tuple[Puppet, Puppet, np.ndarray, int]:
     return ada, bob, np.array(spent), heard(ada) - before
 
 
-def heard(puppet: Puppet) -> int:
+def heard(puppet: FakeClient) -> int:
     """Messages that arrived."""
     counters = puppet.exchange.counters
     return counters.actor.messages_in + counters.environment.messages_in + counters.event.messages_in

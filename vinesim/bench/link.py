@@ -15,8 +15,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim.bench.support.fake_client import Stage
-from vinesim.bench.support.network_emulator import Emulator, Line, Way
+from vinesim.bench.support.fake_client import FakeClientProcess
+from vinesim.bench.support.network_emulator import Link, LinkProfile, NetworkEmulator
 from vinesim.client.recording.trace import Rows, remote_error
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose
 from vinesim.scene.generation.vineyard import generate
@@ -24,9 +24,9 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
 LINES = {
-    "LAN, 0.2 ms one way": Line(Way(0.0002)),
-    "20 +- 4 ms one way, 1 % lost": Line(Way(0.010, 0.002, 0.005)),
-    "50 +- 10 ms one way, 1 % lost": Line(Way(0.025, 0.005, 0.005)),
+    "LAN, 0.2 ms one way": Link(LinkProfile(0.0002)),
+    "20 +- 4 ms one way, 1 % lost": Link(LinkProfile(0.010, 0.002, 0.005)),
+    "50 +- 10 ms one way, 1 % lost": Link(LinkProfile(0.025, 0.005, 0.005)),
 }
 """Of each client to the server: from client to client it is twice that."""
 
@@ -68,13 +68,13 @@ def moves(rows: Rows, since: float) -> float:
     return float(rows.clock[first + int(np.argmax(away > SEEN))] - since) if (away > SEEN).any() else np.inf
 
 
-def watched(line: Line) -> tuple[Rows, Rows]:
+def watched(line: Link) -> tuple[Rows, Rows]:
     """What the picker and the visitor saw of the same bunch."""
     scene = load_scene("demo")
     bunch = str(find_reachable_bunch(generate(scene), spawn_pose(scene, 0)))
     client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
     roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
-    with tempfile.TemporaryDirectory() as folder, Emulator(dict.fromkeys(roles, line)) as net:
+    with tempfile.TemporaryDirectory() as folder, NetworkEmulator(dict.fromkeys(roles, line)) as net:
         server = net.start(
             "hub", [sys.executable, "-m", "vinesim.cli", "server", "--status", "none"],
             stdout=subprocess.PIPE, text=True,
@@ -93,12 +93,12 @@ def watched(line: Line) -> tuple[Rows, Rows]:
     return picker, visitor
 
 
-def told(line: Line, touches: int = TOUCHES) -> list[float]:
+def told(line: Link, touches: int = TOUCHES) -> list[float]:
     """From the tick of a touch to the tick in which another client is told of it [s]: light clients, see :mod:`puppet`.
 
     Their ticks are kept even on a busy machine, so this is the network's share, and the waiting for two ticks.
     """
-    with Emulator({"ada": line, "bob": line}) as net:
+    with NetworkEmulator({"ada": line, "bob": line}) as net:
         server = net.start(
             "hub", [sys.executable, "-m", "vinesim.cli", "server", "--status", "none"],
             stdout=subprocess.PIPE, text=True,
@@ -106,9 +106,9 @@ def told(line: Line, touches: int = TOUCHES) -> list[float]:
         assert server.stdout is not None
         server.stdout.readline()
 
-        def stage(name: str, x: float) -> Stage:
+        def stage(name: str, x: float) -> FakeClientProcess:
             cast = [{"name": name, "place": [x, 0.0]}]
-            return Stage(f"tcp/{net.hub(name)}:7447", cast, start=lambda *a, **k: net.start(name, *a, **k))
+            return FakeClientProcess(f"tcp/{net.hub(name)}:7447", cast, start=lambda *a, **k: net.start(name, *a, **k))
 
         with stage("ada", 1.0) as ada, stage("bob", 2.0) as bob:
             end = time.monotonic() + START

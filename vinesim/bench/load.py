@@ -21,7 +21,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.bench.support.fake_client import ROBOT_JOINTS as JOINTS
-from vinesim.bench.support.fake_client import Stage
+from vinesim.bench.support.fake_client import FakeClientProcess
 from vinesim.net.codec.human import encode_pose
 from vinesim.scene.values import Measurement, RobotUpdate
 
@@ -113,7 +113,7 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
     groups = [puppets[i : i + PER_PROCESS] for i in range(0, count, PER_PROCESS)]
     with contextlib.ExitStack() as stack:
         stages = [
-            stack.enter_context(Stage(ends[i % len(ends)][0], group, trees=1, tick=1.0 / 60.0))
+            stack.enter_context(FakeClientProcess(ends[i % len(ends)][0], group, trees=1, tick=1.0 / 60.0))
             for i, group in enumerate(groups)
         ]
         start = time.monotonic()

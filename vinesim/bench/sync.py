@@ -25,9 +25,9 @@ from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.exchange import Inbox
-from vinesim.net.replication.jitter_buffer import Buffer
+from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.peers import ACTOR_PERIOD
-from vinesim.net.transport.bus import EVERY, MemoryHub
+from vinesim.net.transport.bus import KEEP_ALL, MemoryHub
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description as load_robot
@@ -74,7 +74,7 @@ class Pair:
         self.now = 100.0
         self.hub = MemoryHub(delay=delay, jitter=jitter * delay, loss=loss if delay else 0.0, seed=seed)
         server = self.hub.bus("server")
-        server.serve("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now))
+        server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now))
         start = spawn_pose(self.scene, 0)
         self.bunch = find_reachable_bunch(self.model, start)
         self.tree = int(self.model.body_tree[self.model.bunch_body[self.bunch]])
@@ -156,7 +156,7 @@ class Authority:
         self.pair = pair
         self._bus, self._screen = pair.hub.bus("authority"), pair.hub.bus("screen")
         self._bus.subscribe("authority/pose")
-        self._screen.subscribe("authority/trees", EVERY)
+        self._screen.subscribe("authority/trees", KEEP_ALL)
         self._say = self._screen.publisher("authority/pose")
         self._answer = self._bus.publisher("authority/trees")
         self.physics = Physics(pair.model, detachment=False)
@@ -169,7 +169,7 @@ class Authority:
         pair, physics = self.pair, self.physics
         robot = pair.first.robot
         self._say.put(messages.encode_robot(robot.update(pair.now)))
-        for _, payload in self._bus.drain():
+        for _, payload in self._bus.poll():
             update = messages.decode_robot(payload, "first")
             if self._copy is None:
                 self._copy = RemoteRobot(physics.rigid, robot.description, "first", 1, update.base_q)
@@ -179,13 +179,13 @@ class Authority:
         if len(awake):
             bodies = np.concatenate([np.arange(b.start, b.stop) for b in map(pair.model.bodies_of, awake.tolist())])
             zeros = np.zeros(len(awake), int)
-            said = messages.Trees(
+            said = messages.TreeStates(
                 pair.now, awake, zeros, zeros, zeros, pair.model.tree_size[awake].astype(int),
                 physics.state.joint_q[bodies].astype(float), physics.state.joint_qd[bodies].astype(float),
             )  # fmt: skip
             for message in messages.encode_trees(said)[0]:
                 self._answer.put(message)
-        for _, payload in self._screen.drain():
+        for _, payload in self._screen.poll():
             for update in messages.decode_trees(payload).updates("authority"):
                 if update.tree == pair.tree:
                     self.joint_q = update.joint_q
@@ -305,7 +305,7 @@ def extrapolation(rows: Rows, ahead: float) -> tuple[tuple[float, float], tuple[
     shift = round(ahead / DT)
     tree = rows.tree[:, 0]
     later = tree[shift:]
-    told = dead_reckoning.ahead(tree, dead_reckoning.spin(tree, rows.rate), ahead)[:-shift]
+    told = dead_reckoning.extrapolate(tree, dead_reckoning.quaternion_rate(tree, rows.rate), ahead)[:-shift]
     errors = [dead_reckoning.angle_between(later, guess).max(-1) for guess in (told, tree[:-shift])]
     moves = np.abs(rows.rate).max((1, 2))[:-shift] > 0.02
     own, speed = rows.joints[:, 0], rows.speed
@@ -360,14 +360,14 @@ def buffered(rows: Rows, delay: float, jitter: float, wait: float, seed: int = 5
     arrives = DT * tick + delay + chance.uniform(-jitter, jitter, len(sent))
     arrives[chance.random(len(sent)) < LOSS] = np.inf
     post = sorted(zip(arrives.tolist(), tick.tolist(), strict=True))
-    buffer, now_errors, path_errors = Buffer(wait), [], []
+    buffer, now_errors, path_errors = JitterBuffer(wait), [], []
     for k in range(len(own)):
         while post and post[0][0] <= DT * k:
             _, when = post.pop(0)
-            buffer = buffer.heard(DT * when, own[when], speed[when])
+            buffer = buffer.insert(DT * when, own[when], speed[when])
         if DT * k < 1.0:
             continue
-        shown = buffer.shown(DT * k)
+        shown = buffer.sample(DT * k)
         now_errors.append(np.abs(shown - own[k]).max())
         path_errors.append(np.abs(shown - own[k - round(wait / DT)]).max())
     return tuple(1e3 * float(np.sqrt(np.mean(np.square(e)))) for e in (now_errors, path_errors))  # type: ignore[return-value]

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim.bench.support.fake_client import Puppet
+from vinesim.bench.support.fake_client import FakeClient
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.transport.bus import MemoryHub
@@ -48,7 +48,7 @@ def places(model: Model, share: float, seed: int = 3) -> np.ndarray:
     return low + share * (high - low) * np.random.default_rng(seed).uniform(size=(ROBOTS + PEOPLE, 2))
 
 
-def cast(hub: MemoryHub, model: Model, where: np.ndarray) -> list[Puppet]:
+def cast(hub: MemoryHub, model: Model, where: np.ndarray) -> list[FakeClient]:
     """Robots and people, each with its hands on the nearest trees: those with bunches first."""
     laden = np.zeros(len(model.tree_first), bool)
     laden[model.body_tree[model.bunch_body]] = True
@@ -58,7 +58,7 @@ def cast(hub: MemoryHub, model: Model, where: np.ndarray) -> list[Puppet]:
     for number, place in enumerate(where):
         person = number >= ROBOTS
         name = f"{'person' if person else 'robot'}{number}"
-        puppet = Puppet(
+        puppet = FakeClient(
             hub.bus(name), model, (float(place[0]), float(place[1])), kind="human" if person else "robot"
         )  # fmt: skip
         near = np.argsort(np.linalg.norm(roots - place, axis=1), kind="stable").tolist()
@@ -70,7 +70,7 @@ def cast(hub: MemoryHub, model: Model, where: np.ndarray) -> list[Puppet]:
     return puppets
 
 
-def broadcast(model: Model, puppets: list[Puppet]) -> float:
+def broadcast(model: Model, puppets: list[FakeClient]) -> float:
     """Bytes a second that a client hears if everybody is sent everything at 60 Hz."""
     poses = sum(len(encode_pose(puppet.pose(0.0))) for puppet in puppets[1:])
     return HZ * (poses + RIGID * len(model.bunch_body))
@@ -82,7 +82,9 @@ def traffic() -> Iterator[Measurement]:
     for case, share in (("all over the block", 1.0), ("in a quarter of it", 0.5)):
         hub = MemoryHub(delay=LAN, seed=1)
         server = hub.bus("server")
-        server.serve("clock", lambda asked, hub=hub: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+        server.declare_queryable(
+            "clock", lambda asked, hub=hub: messages.encode_time(messages.decode_time(asked)[0], hub.time)
+        )
         puppets = cast(hub, model, places(model, share))
         for _ in range(round(SETTLE * 100)):
             _tick(hub, puppets)
@@ -113,12 +115,12 @@ def traffic() -> Iterator[Measurement]:
             puppet.bus.close()
 
 
-def _tick(hub: MemoryHub, puppets: list[Puppet]) -> None:
+def _tick(hub: MemoryHub, puppets: list[FakeClient]) -> None:
     hub.advance(0.01)
     for puppet in puppets:
         puppet.tick(hub.time)
 
 
-def _messages(puppet: Puppet) -> int:
+def _messages(puppet: FakeClient) -> int:
     counters = puppet.exchange.counters
     return counters.actor.messages_in + counters.environment.messages_in + counters.event.messages_in

@@ -98,7 +98,7 @@ RAISED = {
     "torso_lift_joint": 0.45,
     **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
 }
-"""Where vinebot's hands are among the vines [m, rad]."""
+"""Joint positions that put vinebot's hands among the vines [m, rad]."""
 
 BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "plants": _plants,
@@ -118,13 +118,13 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
 
 
 class NoSuchBench(ValueError):
-    """The text says which there are."""
+    """There is no benchmark of that name; the text lists all."""
 
 
 def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None) -> int:
-    """Run the named benches in order and print their measurements as they come.
+    """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
-    ``plot``: where those draw that draw; sync a file, sensors several into a folder.
+    ``plot``: the file that sync draws, or the folder for the plots of sensors.
     """
     for name in names:
         if name not in BENCHES:

@@ -6,11 +6,11 @@ import pathlib
 
 from vinesim.errors import UsageError
 from vinesim.net.transport.access_control import SERVER, Role
-from vinesim.net.transport.certificates import new as new_certificate
+from vinesim.net.transport.certificates import create as new_certificate
 
 
 def new(actor: str, folder: pathlib.Path, role: str, hosts: list[str]) -> int:
-    """Make certificates and say which files they are."""
+    """Make certificates and print the names of their files; the exit code."""
     possible = [each.value for each in Role if each != Role.SERVER]
     if role not in possible:
         raise UsageError(f"--role {role!r}: give {', '.join(possible)}")

@@ -1,4 +1,4 @@
-"""``vinesim dataset``: many random pictures with their truth, by several processes; killed, it goes on where it was."""
+"""``vinesim dataset``: many random pictures with their ground truth, rendered by several processes, resumable."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import multiprocessing
 import os
 import pathlib
 import signal
+from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -18,7 +21,8 @@ from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.raster import renderers
 
-Share = tuple[multiprocessing.process.BaseProcess, Connection]
+Worker = tuple[BaseProcess, Any]
+"""A process and the end of the pipe on which it reports."""
 
 
 def run(
@@ -33,43 +37,43 @@ def run(
     actors: float,
     renderer: str,
 ) -> int:
-    """Draw what is not there yet, then gather the annotations of all images."""
+    """Render the missing images, then gather the annotations of all images; the exit code."""
     if seed < 0:
         raise UsageError(f"--seed is {seed}: give 0 or more")
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
-    life = SceneRandomizer(actors) if actors > 0.0 else None
+    randomizer = SceneRandomizer(actors) if actors > 0.0 else None
     plan = DatasetPlan(
         load_scene(scene),
         seed,
         camera,
         None if size is None else parse_size(size),
-        life,
+        randomizer,
         renderers.check_renderer(renderer),
     )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    crew: list[Share] = []
+    running: list[Worker] = []
     try:
         dataset.prepare_folder(plan, out)
         wanted = dataset.missing_images(out, images)
         shares = _shares(wanted, workers or max((os.cpu_count() or 2) // 2, 1))
-        crew += [_start(plan, out, share) for share in shares]
+        running += [_start_worker(plan, out, share) for share in shares]
         with Progress(*columns) as progress:
             task = progress.add_task("images", total=images, completed=images - len(wanted))
-            _follow(crew, lambda: progress.advance(task))
+            _wait_for(running, lambda: progress.advance(task))
     except KeyboardInterrupt:
-        _end(crew, out)
+        _stop_workers(running, out)
         done = images - len(dataset.missing_images(out, images))
         print(f"stopped with {done} of {images} images in {out}; the same command goes on")
         return 130
     finally:
-        _end(crew, out)
+        _stop_workers(running, out)
     print(f"{dataset.finish(out, images)}: {images} images, {len(wanted)} of them new")
     return 0
 
 
 def _shares(wanted: list[int], workers: int) -> list[list[int]]:
-    """Whole vineyards for each worker, as even as it goes: growing one costs more than a picture of it."""
+    """Images for each worker, whole vineyards where possible: generating one costs more than rendering it."""
     vineyards: dict[int, list[int]] = {}
     for image in wanted:
         vineyards.setdefault(image // dataset.IMAGES_PER_VINEYARD, []).append(image)
@@ -79,56 +83,56 @@ def _shares(wanted: list[int], workers: int) -> list[list[int]]:
     return [share for share in shares if share]
 
 
-def _start(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> Share:
+def _start_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> Worker:
     context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(plan, out, share, there), daemon=True)
+    parent_end, worker_end = context.Pipe(duplex=False)
+    process = context.Process(target=_run_worker, args=(plan, out, share, worker_end), daemon=True)
     process.start()
-    there.close()
-    return process, here
+    worker_end.close()
+    return process, parent_end
 
 
-def _work(plan: DatasetPlan, out: pathlib.Path, share: list[int], tell: Connection) -> None:
-    """In a process of its own: draw, and say so; nobody listens any more: stop."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its crew
+def _run_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int], pipe: Connection) -> None:
+    """In a process of its own: render images and report each; ends when the parent process has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         for image in dataset.render_images(plan, out, share):
-            tell.send(image)
+            pipe.send(image)
     except BrokenPipeError:
         return
     except DatasetError as bad:
-        tell.send(str(bad))
+        pipe.send(str(bad))
 
 
-def _follow(crew: list[Share], advance) -> None:
-    """Until all are done; what stopped one is raised."""
-    working = {tell: process for process, tell in crew}
+def _wait_for(workers: list[Worker], advance: Callable[[], None]) -> None:
+    """Call ``advance`` for each image until all workers are done; :class:`DatasetError` if one of them failed."""
+    working = {pipe: process for process, pipe in workers}
     while working:
-        for tell in wait(list(working)):
-            assert isinstance(tell, Connection)
+        for pipe in wait(list(working)):
+            assert isinstance(pipe, Connection)
             try:
-                said = tell.recv()
+                message = pipe.recv()
             except EOFError:
-                process = working.pop(tell)
+                process = working.pop(pipe)
                 process.join()
                 if process.exitcode:
                     raise DatasetError(
                         f"a worker ended with code {process.exitcode}; what is done is kept, the same command goes on"
                     ) from None
                 continue
-            if isinstance(said, str):
-                raise DatasetError(said)
+            if isinstance(message, str):
+                raise DatasetError(message)
             advance()
 
 
-def _end(crew: list[Share], out: pathlib.Path) -> None:
-    """Stop whoever still works, and take away what that leaves half-written."""
-    for process, _ in crew:
+def _stop_workers(workers: list[Worker], out: pathlib.Path) -> None:
+    """Stop workers that still run, and delete files that they leave half-written."""
+    for process, _ in workers:
         process.terminate()
-    for process, tell in crew:
+    for process, pipe in workers:
         process.join()
-        tell.close()
-    if crew:
+        pipe.close()
+    if workers:
         dataset.remove_partial_files(out)
-    crew.clear()
+    workers.clear()

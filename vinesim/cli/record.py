@@ -11,9 +11,9 @@ import sys
 import threading
 import time
 
-from vinesim.client.recording.recorder import FAMILIES, Recorder, Stand, grid
+from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, grid
 from vinesim.errors import UsageError
-from vinesim.net.recording.mcap_file import Recording, free_path
+from vinesim.net.recording.mcap_file import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 POLL = 0.004
@@ -41,13 +41,13 @@ def run(
         name = name or f"recorder-{os.getpid()}"
         bus = stack.enter_context(ZenohBus(name, connect=connect, world=world, certificates=tls, live=False))
         path = free_path(file)
-        recording = stack.enter_context(Recording(path, about))
+        recording = stack.enter_context(RecordingWriter(path, about))
         recorder = Recorder(
             bus, recording, only=families, everything=area is not None, digest=about.get("digest", "")
         )  # fmt: skip
         other = f" ({file} is there already and stays as it is)" if path != file else ""
         print(f"recording world {world} at {connect} into {path}{other}", file=sys.stderr, flush=True)
-        standing: list[Stand] = []
+        standing: list[Observer] = []
         begun = said = time.monotonic()
         while not stop.wait(POLL):
             now = time.monotonic()
@@ -57,8 +57,8 @@ def run(
                 own = f"{name}-{len(standing) + 1}"
                 recorder.own.add(own)
                 there = stack.enter_context(ZenohBus(own, connect=connect, world=world, certificates=tls))
-                scene_name = recording.about.get("scene", "")
-                standing.append(Stand(there, stands[len(standing)], scene_name, recorder.digest, now))
+                scene_name = recording.metadata.get("scene", "")
+                standing.append(Observer(there, stands[len(standing)], scene_name, recorder.digest, now))
             recorder.step()
             for stand in standing:
                 stand.step(now)
@@ -89,7 +89,7 @@ def _progress(recorder: Recorder, elapsed: float, alone: bool) -> None:
     """One line that is written over, on a terminal; nothing into a file."""
     if not sys.stderr.isatty():
         return
-    trouble = recorder.bus.trouble
+    trouble = recorder.bus.status_message
     company = ", ".join(sorted(recorder.actors)) or "nobody"
     hint = "  (with fewer than two actors nothing is sent; --area asks for it)" if alone else ""
     line = f"{elapsed:7.1f} s  {recorder.recording.count} messages  {recorder.recording.size / 1e6:.2f} MB  {company}"

@@ -1,4 +1,4 @@
-"""``vinesim render``: one picture of a scene from one place, and all that is true of it."""
+"""``vinesim render``: one picture of a scene with its ground truth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(
     hour: float | None = None,
     renderer: str = "warp",
 ) -> int:
-    """Draw it and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
+    """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
     from vinesim.scene.camera_geometry import depth_millimetres
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
@@ -93,7 +93,7 @@ def run(
 
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:
-    """Who is in the picture, from what ``--robot``, ``--person`` and ``--crate`` say."""
+    """The actors and crates of ``--robot``, ``--person`` and ``--crate``; :class:`UsageError` if one is wrong."""
     from vinesim.client.composition.composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
     from vinesim.robot.description.loader import load_description
     from vinesim.scene import appearance
@@ -103,7 +103,7 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
         name, mark, where = text.rpartition("@")
         if not (mark and name):
             raise UsageError(f"--robot is {text!r}; give NAME@X,Y,YAW, such as vinebot@1.5,0.8,3.14")
-        load_description(name)  # says what is wrong with it
+        load_description(name)  # raises DescriptionError
         placed_robots.append(RobotPlacement(name, *_parse_place("--robot", where, 3)))
     for text in people:
         parts = text.split(",")

@@ -15,7 +15,7 @@ import numpy as np
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
-from vinesim.net.recording.mcap_file import NotARecording, Tape, read, sender_of
+from vinesim.net.recording.mcap_file import InvalidRecording, Recording, read, sender_of
 
 POLL = 0.004
 """Between two looks at what is due [s]."""
@@ -32,22 +32,22 @@ def run(
     tape = read(file)
     if tape.damage:
         print(tape.damage, file=sys.stderr, flush=True)
-    if not tape.entries:
-        raise NotARecording(f"{file} holds no message: nothing can be replayed")
+    if not tape.messages:
+        raise InvalidRecording(f"{file} holds no message: nothing can be replayed")
     if start >= tape.length or (end is not None and end <= start):
         raise UsageError(f"--from {start:g}{'' if end is None else f' --to {end:g}'}: {file} lasts {tape.length:.1f} s")
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     who = ", ".join(tape.actors) or "nobody"
-    print(f"{file}: {len(tape.entries)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
+    print(f"{file}: {len(tape.messages)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
     if out is not None:
         return _look(tape, stop, out, pose, scene, seed, speed, start, end)
     return _tell(tape, stop, connect, listen, world, speed, start, end)
 
 
 def _tell(
-    tape: Tape, stop: threading.Event, connect: str | None, listen: str | None, world: str, speed: float,
+    tape: Recording, stop: threading.Event, connect: str | None, listen: str | None, world: str, speed: float,
     start: float, end: float | None,
 ) -> int:  # fmt: skip
     """Play to a network."""
@@ -78,7 +78,7 @@ def _tell(
 
 
 def _look(
-    tape: Tape, stop: threading.Event, out: pathlib.Path, pose: tuple[float, float, float] | None,
+    tape: Recording, stop: threading.Event, out: pathlib.Path, pose: tuple[float, float, float] | None,
     scene: str | None, seed: int | None, speed: float, start: float, end: float | None,
 ) -> int:  # fmt: skip
     """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
@@ -87,19 +87,19 @@ def _look(
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import SceneError, load_scene, with_seed
 
-    if scene is None and "scene" not in tape.about:
+    if scene is None and "scene" not in tape.metadata:
         raise UsageError(f"{tape.path} does not say which scene it is of: give --scene")
-    if seed is None and "seed" in tape.about:
-        seed = int(tape.about["seed"])
+    if seed is None and "seed" in tape.metadata:
+        seed = int(tape.metadata["seed"])
     try:
-        plan = with_seed(load_scene(scene or tape.about["scene"]), seed)
+        plan = with_seed(load_scene(scene or tape.metadata["scene"]), seed)
     except SceneError as error:
         raise SceneError(f"the scene of {tape.path}: {error}; give --scene FILE") from error
     model = generate(plan)
-    digest = tape.about.get("digest", model.digest())
+    digest = tape.metadata.get("digest", model.digest())
     if digest != model.digest():
-        raise NotARecording(
-            f"{tape.path} is of scene {tape.about.get('scene', '?')!r} with digest {digest}, "
+        raise InvalidRecording(
+            f"{tape.path} is of scene {tape.metadata.get('scene', '?')!r} with digest {digest}, "
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
     eyes = standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
@@ -117,15 +117,15 @@ def _look(
     return 0
 
 
-def _first_pose(tape: Tape) -> np.ndarray:
+def _first_pose(tape: Recording) -> np.ndarray:
     """Where the first robot stood [7] when it was first heard of, or if there is none, the first person."""
     for kind in ("robot", "human"):
         such = {
             sender_of(entry.key)
-            for entry in tape.entries
+            for entry in tape.messages
             if entry.key.startswith("hello/") and messages.decode_hello(entry.payload).kind == kind
         }
-        for entry in tape.entries:
+        for entry in tape.messages:
             if entry.key.startswith("a/") and sender_of(entry.key) in such:
                 return decode_pose(entry.payload, "").base_q
     raise UsageError(f"{tape.path} has no pose of anybody to look at: give --pose X Y YAW")

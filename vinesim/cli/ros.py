@@ -6,7 +6,7 @@ from vinesim.ros import ros_setup
 
 
 def build(quiet: bool) -> int:
-    """Build what has no wheel. Without ROS there is nothing to build, which is an error only if one asks aloud."""
+    """Build the message packages without a wheel; the exit code. ``quiet``: no error if ROS is not installed."""
     reason = ros_setup.unavailable_reason()
     if reason is not None:
         if not quiet:

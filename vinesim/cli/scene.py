@@ -15,7 +15,7 @@ from vinesim.sensors.scene.primitives import rest_snapshot
 
 
 def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
-    """Print a table of the scene and write its picture."""
+    """Print a table of the scene and write its picture; the exit code."""
     scene = with_seed(load_scene(file), seed)
     model = generate(scene)
     console = Console()

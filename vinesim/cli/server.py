@@ -9,10 +9,10 @@ import threading
 from typing import Any
 
 from vinesim.errors import UsageError
-from vinesim.net.server.admission import Plan
+from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import Server
-from vinesim.net.transport.endpoints import everywhere
+from vinesim.net.transport.endpoints import default_listen
 
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
@@ -34,7 +34,7 @@ def run(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with Server(
-        listen or everywhere(secured=tls is not None), connect=connect or (), keep=state_dir, plan=plan,
+        listen or default_listen(secured=tls is not None), connect=connect or (), keep=state_dir, plan=plan,
         most=max_clients, quota=Quota(*quota), certificates=tls,
     ) as server:  # fmt: skip
         if status != "json":
@@ -48,12 +48,12 @@ def run(
     return 0
 
 
-def _plan(scene: str, seed: int | None) -> Plan:
+def _plan(scene: str, seed: int | None) -> SceneId:
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
 
     plan = with_seed(load_scene(scene), seed)
-    return Plan(plan.name, generate(plan).digest())
+    return SceneId(plan.name, generate(plan).digest())
 
 
 def _line(figures: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
-from vinesim.net.replication.exchange import Exchange, Inbox
+from vinesim.net.replication.exchange import Inbox, Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_posture import standing_pose
@@ -66,7 +66,7 @@ class Client:
         pose: np.ndarray,
         source: Callable[[float], HumanPose] | None = None,
         height: float = 1.75,
-        interest_radius: float = interest.NEAR,
+        interest_radius: float = interest.INTEREST_RADIUS,
         jitter_buffer: float = 0.0,
         device: str = "cpu",
         threads: int = 1,
@@ -86,7 +86,7 @@ class Client:
         """All robots that this client moves, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
         """All people that this client moves, by name."""
-        self.replicators: dict[str, Exchange] = {}
+        self.replicators: dict[str, Replicator] = {}
         """The share of each in the world, by name; the first is :attr:`exchange`."""
         self.objects = ObjectSync(self.physics, self.replicators)
         self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
@@ -124,7 +124,7 @@ class Client:
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
             seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
+        exchange = Replicator(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
         self._add_replicator(name, exchange)
@@ -136,15 +136,15 @@ class Client:
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
-        exchange = Exchange(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
+        exchange = Replicator(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
         self.humans[spec.name] = person = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
         self._add_replicator(spec.name, exchange)
         return person
 
-    def _add_replicator(self, name: str, exchange: Exchange) -> None:
+    def _add_replicator(self, name: str, exchange: Replicator) -> None:
         self.replicators[name] = exchange
         for own, share in self.replicators.items():
-            share.kin = self.replicators.keys() - {own}
+            share.local_actors = self.replicators.keys() - {own}
 
     def tick(self) -> None:
         """Ten milliseconds of the vineyard."""
@@ -208,7 +208,7 @@ class Client:
         moving, touching = things.moving, False
         for name, actor in (*self.robots.items(), *self.humans.items()):
             exchange, pose = self.replicators[name], actor.update(now)
-            mine = exchange.mine
+            mine = exchange.owned
             parted = things.detached_by(name, all_others=name == self.name)
             touched = things.touched_by(name, mine)
             touching |= bool(touched)
@@ -220,8 +220,8 @@ class Client:
             for update in settled:
                 # the last word is what all copies hold: hold it too
                 things.blend_tree(update, 1.0)
-            for number in mine - exchange.mine:
-                things.mark_resting(exchange.fact(number))
+            for number in mine - exchange.owned:
+                things.mark_resting(exchange.record(number))
         self.interest_audit.update(self, touching)
 
     def leave(self) -> None:
@@ -247,13 +247,13 @@ class Client:
         """What all exchanges brought: of another actor, what is heard where it is nearest."""
         inboxes = {name: exchange.receive(now) for name, exchange in self.replicators.items()}
         for name in self.robots:
-            self._apply_remote_wrenches(name, inboxes[name].pushes)
+            self._apply_remote_wrenches(name, inboxes[name].wrenches)
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
         here = {name: self.physics.rigid.actor_position(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
-        loose = {update.thing: update for update in inbox.things}
+        loose = {update.object: update for update in inbox.objects}
         nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
         for name, heard in inboxes.items():
             for other, update in (*heard.robots.items(), *heard.people.items()):
@@ -261,14 +261,14 @@ class Client:
                 if other not in nearest or away < nearest[other][0]:
                     nearest[other] = away, update
             trees.update((update.tree, update) for update in heard.trees)
-            loose.update((update.thing, update) for update in heard.things)
+            loose.update((update.object, update) for update in heard.objects)
             if heard is not inbox:
-                inbox.facts += heard.facts
+                inbox.records += heard.records
         shown = [update for _, (_, update) in sorted(nearest.items())]
         inbox.robots = {update.actor: update for update in shown if isinstance(update, RobotUpdate)}
         inbox.people = {update.actor: update for update in shown if isinstance(update, HumanUpdate)}
         inbox.trees = [trees[tree] for tree in sorted(trees)]
-        inbox.things = [loose[number] for number in sorted(loose) if self._is_owned_remotely(number)]
+        inbox.objects = [loose[number] for number in sorted(loose) if self._is_owned_remotely(number)]
         return inbox
 
     def _is_owned_remotely(self, thing: int) -> bool:
@@ -323,7 +323,7 @@ class InterestAudit:
         here = [rigid.actor_position(name)[:2] for name in client.replicators]
         there = [rigid.actor_position(name)[:2] for name in client.remote_actors]
         distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
-        if distance > client.replicator.near + self.MARGIN:
+        if distance > client.replicator.interest_radius + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching
         self._seen = sent

@@ -1,4 +1,4 @@
-"""The spectator role: a client without a robot, that sees what happens near its place and touches nothing."""
+"""The spectator role: a client without a body that receives what happens near its viewpoint and renders it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.client import Client, label_index
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import ONLOOKER, Exchange
+from vinesim.net.replication.exchange import SPECTATOR, Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
@@ -23,22 +23,19 @@ EYE_HEIGHT = 1.6
 """Height of a standing person's eyes above the ground [m]."""
 
 FOLLOW_DISTANCE = 2.6
-"""Whoever is looked at is seen from this far [m], ..."""
+"""Horizontal distance of the eyes from a robot that they follow [m]."""
 
 FOLLOW_YAW = 0.7
-"""... from this far [rad] beside straight behind it, ..."""
-
-MIDDLE = 1.2
-"""... and at this height [m]."""
+"""Angle of the eyes beside the line straight behind that robot [rad]."""
 
 
 def standing_view(x: float, y: float, heading: float) -> np.ndarray:
-    """Pose [7] of the eyes of somebody who stands at (x, y) [m] and looks along ``heading`` [rad]."""
-    return frames.pose([x, y, EYE_HEIGHT], frames.from_yaw(heading))
+    """Pose [7] m, 1 of the eyes of a person who stands at (x, y) [m] and looks along ``heading`` [rad]."""
+    return frames.pose(np.array([x, y, EYE_HEIGHT]), frames.from_yaw(heading))
 
 
 def follow_view(base: np.ndarray) -> np.ndarray:
-    """Pose [7] of the eyes of somebody who looks over the shoulder of a robot whose base is at ``base`` [7]."""
+    """Pose [7] m, 1 of the eyes of a person who looks over the shoulder of a robot with its base at ``base`` [7]."""
     ahead = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
     heading = float(np.arctan2(ahead[1], ahead[0])) + FOLLOW_YAW
     eye = base[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)])
@@ -46,9 +43,9 @@ def follow_view(base: np.ndarray) -> np.ndarray:
 
 
 class Spectator(Client):
-    """A client that only looks. ``pose`` [7] are its eyes: x forward, z up; change :attr:`pose` to walk."""
+    """A client that only watches. :attr:`pose` [7] is that of its eyes: x forward, z up; assign it to move."""
 
-    picking = False  # it is told what parts
+    picking = False  # the owners of plants report what detaches
 
     def _add_own_actor(
         self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
@@ -56,37 +53,37 @@ class Spectator(Client):
     ) -> None:  # fmt: skip
         self.pose = np.asarray(pose, float)
         hello = Hello(
-            name=self.name, kind=ONLOOKER, scene=self.scene.name, digest=self.model.digest(),
+            name=self.name, kind=SPECTATOR, scene=self.scene.name, digest=self.model.digest(),
             index=label_index(self.name), joints=0, seed=self.scene.seed,
         )  # fmt: skip
-        self.replicators[self.name] = Exchange(
+        self.replicators[self.name] = Replicator(
             bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer
         )
 
     def sense(self) -> None:
-        """Show the world to whoever wants to see it."""
+        """Call the callbacks of :attr:`post_step`."""
         for sense in self.post_step:
             sense(self)
 
     def send(self, now: float) -> None:
-        """Say where the eyes are, and no more."""
+        """Publish the pose of the eyes, and nothing else."""
         here = RobotUpdate(self.name, now, self.pose, np.zeros(6), np.zeros(0), np.zeros(0))
         self.objects.collect()
         self.replicator.send(now, here, read=self.objects.read_state)
 
 
 class PictureWriter:
-    """What a spectator sees, as files ``view_SECONDS.png``; the last one also with depth and labels.
+    """Writes what a spectator sees to files ``view_SECONDS.png``; the last one also with depth and labels.
 
-    Drawn in the tick, so each shows exactly the state it names, and a replay draws the same ones every time; a
-    spectator has no robot that would miss the beat.
+    Rendered in the loop, so each shows exactly the state of its time, and a replay renders the same pictures every
+    time; a spectator has no robot that would suffer from late steps.
     """
 
     WIDTH, HEIGHT, ANGLE = 960, 640, 1.2
     """Size [px] and horizontal field of view [rad]."""
 
     def __init__(self, spectator: Spectator, folder: pathlib.Path, period: float = 1.0, renderer: str = "warp") -> None:
-        """One every ``period`` seconds of simulated time, into a folder that exists."""
+        """One picture every ``period`` [s] of simulated time, into a ``folder`` that exists."""
         load_kernels()
         focal = 0.5 * self.WIDTH / np.tan(0.5 * self.ANGLE)
         info = CameraInfo(
@@ -119,7 +116,7 @@ class PictureWriter:
         images.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
 
     def save(self, spectator: Spectator) -> None:
-        """Draw what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
+        """Render what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
         self._draw(spectator)
         assert self.last is not None
         images.save_frame(self.last, self.folder, "")

@@ -26,7 +26,7 @@ class Status:
     ) -> None:
         """``sent`` gives the number of ROS messages sent so far by topic; ``task`` is what the robot does, if anything."""
         self.client, self.rate_loop, self._task = client, rate_loop, task
-        self._sent = sent or dict
+        self._sent: Callable[[], dict[str, int]] = sent or dict
         self._before: dict[str, int] = {}
         self._before_time = 0.0
 

@@ -14,12 +14,12 @@ class Traffic:
     messages_out: int = 0
     bytes_out: int = 0
 
-    def heard(self, payload: bytes) -> None:
+    def count_in(self, payload: bytes) -> None:
         """One message came."""
         self.messages_in += 1
         self.bytes_in += len(payload)
 
-    def said(self, payload: bytes) -> None:
+    def count_out(self, payload: bytes) -> None:
         """One message left."""
         self.messages_out += 1
         self.bytes_out += len(payload)
@@ -35,7 +35,7 @@ class Counters:
     """Moving trees, boxes and loose bunches."""
     event: Traffic = dataclasses.field(default_factory=Traffic)
     """Claims, corrections and rest."""
-    fact: Traffic = dataclasses.field(default_factory=Traffic)
+    retained: Traffic = dataclasses.field(default_factory=Traffic)
     """What was picked or cut and where things lie: these leave even if nobody is near, for the server keeps them."""
     force: Traffic = dataclasses.field(default_factory=Traffic)
     """What hands do to robots of other clients."""

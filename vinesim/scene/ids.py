@@ -27,7 +27,7 @@ class Organ(enum.IntEnum):
     HUMAN = 12
 
 
-class Kind(enum.IntEnum):
+class ObjectKind(enum.IntEnum):
     """What can be owned and moved by somebody, and is known to all clients by the same number."""
 
     TREE = 0
@@ -36,36 +36,36 @@ class Kind(enum.IntEnum):
     BOX = 2
 
 
-THING_STRIDE = 1 << 24
+OBJECT_STRIDE = 1 << 24
 """A thing is numbered ``kind * THING_STRIDE + index``: trees come first, by their own numbers."""
 
 
-def thing(kind: Kind, index: int) -> int:
+def object_id(kind: ObjectKind, index: int) -> int:
     """The number of a tree, a loose bunch or a box among all things; index counts each kind from 0."""
-    return int(kind) * THING_STRIDE + index
+    return int(kind) * OBJECT_STRIDE + index
 
 
-def unthing(value: int) -> tuple[Kind, int]:
+def split_object_id(value: int) -> tuple[ObjectKind, int]:
     """Kind and index of a thing; :class:`ValueError` for a number of no kind."""
-    return Kind(value // THING_STRIDE), value % THING_STRIDE
+    return ObjectKind(value // OBJECT_STRIDE), value % OBJECT_STRIDE
 
 
 def is_tree(value: int) -> bool:
     """Whether a thing is a tree; all others are rigid."""
-    return value < THING_STRIDE
+    return value < OBJECT_STRIDE
 
 
-def thing_name(value: int) -> str:
+def object_name(value: int) -> str:
     """A box or a loose bunch as links are named: ``box/3``."""
-    kind, index = unthing(value)
+    kind, index = split_object_id(value)
     return f"{kind.name.lower()}/{index}"
 
 
-def thing_named(name: str) -> int | None:
+def parse_object_name(name: str) -> int | None:
     """The box or the loose bunch of a name like ``box/3``; None if it is no such name."""
     kind, _, index = name.partition("/")
-    rigid = {"bunch": Kind.BUNCH, "box": Kind.BOX}
-    return thing(rigid[kind], int(index)) if kind in rigid and index.isdecimal() else None
+    rigid = {"bunch": ObjectKind.BUNCH, "box": ObjectKind.BOX}
+    return object_id(rigid[kind], int(index)) if kind in rigid and index.isdecimal() else None
 
 
 LABEL_STRIDE = 1 << 20

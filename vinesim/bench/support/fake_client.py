@@ -24,7 +24,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
-from vinesim.net.replication.exchange import Exchange
+from vinesim.net.replication.exchange import Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import is_tree
@@ -58,7 +58,7 @@ SILENCE = 1.5
 """After this [s] without news of a tree the next ones begin a new touch."""
 
 
-class Puppet:
+class FakeClient:
     """The least client: it stands somewhere and swings its arms, touches trees, and believes what it hears."""
 
     def __init__(
@@ -70,14 +70,14 @@ class Puppet:
         kind: str = "robot",
         joints: int = ROBOT_JOINTS,
         digest: str = "puppets",
-        near: float = interest.NEAR,
+        near: float = interest.INTEREST_RADIUS,
         restless: bool = True,
     ) -> None:
         """Stand at ``place`` [2] m; ``restless`` lets the joints swing, so that no two poses are alike."""
         joints = 0 if kind == "human" else joints
         hello = Hello(bus.name, kind=kind, scene="puppets", digest=digest, joints=joints)
         self.bus, self.model, self.name = bus, model, bus.name
-        self.exchange = Exchange(bus, hello, model, near=near)
+        self.exchange = Replicator(bus, hello, model, near=near)
         self.place = np.array([*place, 0.0])
         self.joints, self.restless = joints, restless
         self.touching: set[int] = set()
@@ -124,11 +124,11 @@ class Puppet:
                 self.first[update.tree] = now
             self.heard[update.tree] = now
             (self._rested.add if update.resting else self._rested.discard)(update.tree)
-        for thing in inbox.things:
-            if thing.thing not in self.moved or not np.array_equal(self.moved[thing.thing], thing.pose):
-                self.moved[thing.thing], self.heard[thing.thing] = thing.pose, now
-        for fact, holds in inbox.facts:
-            self.facts[fact.thing] = {"parent": fact.parent, "moving": fact.moving, "holds": holds, "pose": fact.pose}
+        for thing in inbox.objects:
+            if thing.object not in self.moved or not np.array_equal(self.moved[thing.object], thing.pose):
+                self.moved[thing.object], self.heard[thing.object] = thing.pose, now
+        for fact, holds in inbox.records:
+            self.facts[fact.object] = {"parent": fact.parent, "moving": fact.moving, "holds": holds, "pose": fact.pose}
         self.released += inbox.released
         self.robots = inbox.robots
         grabbed, self.grabbing = self.grabbing, set()
@@ -142,7 +142,7 @@ class Puppet:
 
     def pose(self, now: float) -> RobotUpdate | HumanUpdate:
         """What it would say of itself at ``now``."""
-        if self.exchange.me.kind == "human":
+        if self.exchange.name.kind == "human":
             points = np.tile(frames.pose(self.place), (len(POINT_NAMES), 1))
             points[:, 2] = (0.0, 1.65, 1.1 + 0.2 * np.sin(2.0 * now), 1.1, 0.9, 0.1, 0.1)
             velocity = np.zeros((len(POINT_NAMES), 6))
@@ -179,7 +179,7 @@ class Puppet:
             "reads": self.reads,
             "now": self._now,
             "offset": exchange.offset,
-            "others": sorted(exchange.actors),
+            "others": sorted(exchange.peers),
             "came": self.came,
             "went": self.went,
             "owner": {thing: exchange.owner(thing) for thing in sorted(exchange.known)},
@@ -191,11 +191,11 @@ class Puppet:
             "poses": {name: getattr(one, "position", one.base_q)[:1].tolist() for name, one in self.robots.items()},
             "counters": dataclasses.asdict(exchange.counters),
             "bytes_in": self.bus.bytes_in,
-            "lost": self.bus.lost,
-            "trouble": self.bus.trouble,
+            "lost": self.bus.dropped,
+            "trouble": self.bus.status_message,
         }
 
-    def obey(self, order: dict[str, Any]) -> None:
+    def apply(self, order: dict[str, Any]) -> None:
         """``touch``, ``swing``, ``grab``, ``pick``, ``carry``: things; ``lay``: {thing: parent} of what is let go.
 
         ``place``: [x, y] m; ``sway``: m.
@@ -238,7 +238,7 @@ def swung(model: Model, tree: int, time: float, sway: float = SWAY) -> tuple[np.
 # ---------------------------------------------------------------- in processes of their own
 
 
-class Stage:
+class FakeClientProcess:
     """Puppets in a process of their own, seen from the one that plays with them. A context manager."""
 
     def __init__(
@@ -290,7 +290,7 @@ class Stage:
         self.close()
 
 
-def play(
+def run(
     connect: str, puppets: list[dict[str, Any]], *, trees: int = 12, apart: float = 1.0, tick: float = TICK,
     skew: float = 0.0,
 ) -> None:  # fmt: skip
@@ -299,12 +299,12 @@ def play(
 
     model = row(trees, apart=apart)
     orders: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-    cast: dict[str, Puppet] = {}
+    cast: dict[str, FakeClient] = {}
     late = 0
     try:
         for one in puppets:
             name, place = one.pop("name"), one.pop("place")
-            cast[name] = Puppet(ZenohBus(name, connect=connect), model, place, **one)
+            cast[name] = FakeClient(ZenohBus(name, connect=connect), model, place, **one)
         threading.Thread(target=_listen, args=(orders,), daemon=True).start()
         _say({"ready": True})
         due = time.monotonic()
@@ -322,7 +322,7 @@ def play(
                 if order is None:
                     return
                 name = order.pop("who") or next(iter(cast))
-                cast[name].obey(order)
+                cast[name].apply(order)
                 answering.append(name)  # after its next tick
             due += tick
             late += time.monotonic() - due > tick
@@ -346,4 +346,4 @@ def _listen(orders: queue.SimpleQueue) -> None:
 
 
 if __name__ == "__main__":
-    play(**json.loads(sys.argv[1]))
+    run(**json.loads(sys.argv[1]))

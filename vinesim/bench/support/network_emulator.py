@@ -39,7 +39,7 @@ _LARGEST = 2048
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Way:
+class LinkProfile:
     """How packets travel in one direction: uniformly between ``delay`` - ``jitter`` and ``delay`` + ``jitter`` [s].
 
     They stay in order, as in the queue of a router; ``loss`` is the chance that one vanishes.
@@ -55,13 +55,13 @@ class Way:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Line:
+class Link:
     """One end's connection with the hub; what comes back travels as what goes there, unless said otherwise."""
 
-    there: Way = Way()
-    back: Way | None = None
+    there: LinkProfile = LinkProfile()
+    back: LinkProfile | None = None
 
-    def ways(self) -> tuple[Way, Way]:
+    def ways(self) -> tuple[LinkProfile, LinkProfile]:
         """From the end to the hub, and from the hub to the end."""
         return self.there, self.there if self.back is None else self.back
 
@@ -97,10 +97,10 @@ def unusable() -> str:
     return ""
 
 
-class Emulator:
+class NetworkEmulator:
     """A star of namespaces around :data:`HUB`; see the module. A context manager."""
 
-    def __init__(self, lines: dict[str, Line], *, seed: int = 0) -> None:
+    def __init__(self, lines: dict[str, Link], *, seed: int = 0) -> None:
         if reason := unusable():
             raise RuntimeError(f"links cannot be emulated here: {reason}")
         for end in lines:
@@ -151,13 +151,13 @@ class Emulator:
         self._started.append(process)
         return process
 
-    def shape(self, end: str, line: Line) -> None:
+    def shape(self, end: str, line: Link) -> None:
         """Let the line of ``end`` behave otherwise from now on."""
         self._tell({"shape": end, "line": _plain(line)})
 
-    def cut(self, end: str) -> None:
+    def disconnect(self, end: str) -> None:
         """Nothing passes any more, until :meth:`shape`."""
-        self.shape(end, Line(Way(loss=1.0)))
+        self.shape(end, Link(LinkProfile(loss=1.0)))
 
     def counts(self, end: str) -> tuple[Count, Count]:
         """What ``end`` put on its line so far, and what the hub put on it."""
@@ -188,7 +188,7 @@ class Emulator:
         self.close()
 
 
-def _plain(line: Line) -> list[tuple]:
+def _plain(line: Link) -> list[tuple]:
     return [dataclasses.astuple(way) for way in line.ways()]
 
 
@@ -222,7 +222,7 @@ def _sweep() -> None:
 class _Direction:
     """Packets on their way from one device to another."""
 
-    def __init__(self, source: int, target: int, way: Way) -> None:
+    def __init__(self, source: int, target: int, way: LinkProfile) -> None:
         self.source, self.target, self.way = source, target, way
         self.packets = self.bytes = self.lost = 0
         self.last = 0.0
@@ -258,7 +258,7 @@ def _carry(answers: IO[str]) -> None:
             at_hub, at_end = _addresses(number)
             hub = _device(spaces[HUB], f"vslink{number}h%d", at_hub, at_end)
             leaf = _device(spaces[end], f"vslink{number}e%d", at_end, at_hub)
-            there, back = (Way(*way) for way in shape)
+            there, back = (LinkProfile(*way) for way in shape)
             lines[end] = _Direction(leaf, hub, there), _Direction(hub, leaf, back)
         print(json.dumps(True), file=answers, flush=True)
         _loop(answers, lines, chance)
@@ -315,7 +315,7 @@ def _answer(request: dict[str, Any], lines: dict[str, tuple[_Direction, _Directi
     if "counts" in request:
         return [(way.packets, way.bytes, way.lost) for way in lines[request["counts"]]]
     for direction, way in zip(lines[request["shape"]], request["line"], strict=True):
-        direction.way = Way(*way)
+        direction.way = LinkProfile(*way)
     return True
 
 

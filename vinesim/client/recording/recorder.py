@@ -18,11 +18,11 @@ from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.recording.mcap_file import Recording, sender_of
+from vinesim.net.recording.mcap_file import RecordingWriter, sender_of
 from vinesim.net.replication import interest
-from vinesim.net.replication.clock_sync import WINDOW, Clock, Ping
-from vinesim.net.replication.peers import ASK_PERIOD, FAR_PERIOD, PING_PERIOD, Mismatch
-from vinesim.net.transport.bus import EVERY, Bus, Publisher, Subscription
+from vinesim.net.replication.clock_sync import PING_WINDOW, ClockEstimate, Ping
+from vinesim.net.replication.peers import ASK_PERIOD, FAR_PERIOD, PING_PERIOD, WorldMismatch
+from vinesim.net.transport.bus import KEEP_ALL, Bus, Publisher, Subscription
 from vinesim.scene.values import RobotUpdate
 
 log = logging.getLogger(__name__)
@@ -47,22 +47,22 @@ class AreaTooLarge(ValueError):
     """An area that cannot be asked for; the text says what can."""
 
 
-class Timekeeper:
+class NetworkClock:
     """Network time as a listener keeps it: own clock and the offset to the server's."""
 
     def __init__(self, bus: Bus, now: float) -> None:
-        self.clock = Clock(offset=time.time() - now)
+        self.clock = ClockEstimate(offset=time.time() - now)
         self._bus, self._now = bus, now
         self._asked, self._count = -math.inf, 0
         self._begun = now
 
     def keep(self, now: float) -> None:
         """Note that it is own time ``now`` [s]; ask the server when that is due."""
-        self.clock = self.clock.after(now - self._now)
+        self.clock = self.clock.advanced(now - self._now)
         self._now = now
-        if now - self._asked >= PING_PERIOD[self._count >= 2 * WINDOW]:
+        if now - self._asked >= PING_PERIOD[self._count >= 2 * PING_WINDOW]:
             self._asked, self._count = now, self._count + 1
-            self._bus.ask("clock", messages.encode_time(now))
+            self._bus.query("clock", messages.encode_time(now))
 
     @property
     def time(self) -> float:
@@ -73,7 +73,7 @@ class Timekeeper:
         """Take the clock's answer, which arrived ``age`` seconds ago."""
         asked, server = messages.decode_time(payload)
         if asked <= self._now - age:
-            self.clock = self.clock.heard(Ping(asked, server, self._now - age))
+            self.clock = self.clock.with_ping(Ping(asked, server, self._now - age))
 
     @property
     def settled(self) -> bool:
@@ -87,7 +87,7 @@ class Recorder:
     def __init__(
         self,
         bus: Bus,
-        recording: Recording,
+        recording: RecordingWriter,
         *,
         only: Collection[str] = FAMILIES,
         everything: bool = False,
@@ -107,7 +107,7 @@ class Recorder:
         self.malformed = 0
         """Messages that were recorded, but are none."""
         self._only, self._everything, self._clock = frozenset(only), everything, clock
-        self._keeper = Timekeeper(bus, clock())
+        self._keeper = NetworkClock(bus, clock())
         self._listening = False
         self._live: set[str] = set()
         self._asked: dict[str, float] = {}
@@ -134,7 +134,7 @@ class Recorder:
         if not self._listening:
             self._listen()
         self._roster(now)
-        for key, payload in self.bus.drain():
+        for key, payload in self.bus.poll():
             if sender_of(key) not in self.own:
                 self._hear(key, payload)
         self._follow()
@@ -151,14 +151,14 @@ class Recorder:
     def _listen(self) -> None:
         self._listening = True
         if self._only & {"trees", "things"}:
-            self.bus.subscribe("c/**", EVERY)
+            self.bus.subscribe("c/**", KEEP_ALL)
         if "events" in self._only:
-            self.bus.subscribe("own/**", EVERY)
+            self.bus.subscribe("own/**", KEEP_ALL)
         if "facts" in self._only:
-            self.bus.subscribe("fact/**", EVERY)
-            self.bus.ask("snap/*/*")  # what became true before
+            self.bus.subscribe("fact/**", KEEP_ALL)
+            self.bus.query("snap/*/*")  # what became true before
         if "forces" in self._only:
-            self.bus.subscribe("force/**", EVERY)
+            self.bus.subscribe("force/**", KEEP_ALL)
 
     def _put(self, key: str, payload: bytes) -> None:
         self.recording.put(self._at, key, payload)
@@ -179,10 +179,10 @@ class Recorder:
         for name in sorted(self._live - self.greetings.keys() - self._strangers):
             if now - self._asked.get(name, -math.inf) >= ASK_PERIOD:
                 self._asked[name] = now
-                self.bus.ask(f"hello/{name}")
+                self.bus.query(f"hello/{name}")
 
     def _take_answers(self) -> None:
-        for key, payload, age in self.bus.answers():
+        for key, payload, age in self.bus.replies():
             family, _, name = key.partition("/")
             try:
                 if family == "clock":
@@ -202,20 +202,20 @@ class Recorder:
             self._refuse(name, f"speaks protocol version {error.theirs}, this recorder version {messages.PROTOCOL}")
             return
         if self.digest and hello.digest != self.digest:
-            wanted = f"{self.recording.about.get('scene', '?')!r} with {self.digest!r}"
+            wanted = f"{self.recording.metadata.get('scene', '?')!r} with {self.digest!r}"
             self._refuse(name, f"has scene {hello.scene!r} with digest {hello.digest!r}, this recording {wanted}")
             return
         if not self.digest:
             self.digest = hello.digest
             seed = {"seed": str(hello.seed)} if hello.seed >= 0 else {}
-            self.recording.describe(scene=hello.scene, digest=hello.digest, **seed)
+            self.recording.add_metadata(scene=hello.scene, digest=hello.digest, **seed)
         self.greetings[name] = hello
         self._put(f"hello/{name}", payload)
 
     def _refuse(self, name: str, why: str) -> None:
         text = f"{name!r} {why}: record with the scene, seed and release of vinesim that are used there"
         if not self.greetings:
-            raise Mismatch(text)
+            raise WorldMismatch(text)
         log.warning("ignoring a stranger: %s", text)
         self._strangers.add(name)
 
@@ -241,7 +241,7 @@ class Recorder:
         """Hear of each actor what somebody else hears of it too: for all, its slow poses, near ones, its fast ones."""
         company = self._everything or len(self._live) >= 2
         if company and self._far is None:
-            self._far = self.bus.subscribe("a/*/far", EVERY)
+            self._far = self.bus.subscribe("a/*/far", KEEP_ALL)
         elif not company and self._far is not None:
             self._far.close()
             self._far = None
@@ -256,7 +256,7 @@ class Recorder:
             publisher, subscription = self._near[name]
             wanted = "poses" in self._only and (self._everything or (publisher.matching and self._in_company(name)))
             if wanted and subscription is None:
-                self._near[name] = publisher, self.bus.subscribe(f"a/{name}", EVERY)
+                self._near[name] = publisher, self.bus.subscribe(f"a/{name}", KEEP_ALL)
             elif not wanted and subscription is not None:
                 subscription.close()
                 self._near[name] = publisher, None
@@ -266,7 +266,7 @@ class Recorder:
         if name not in self._place:
             return False
         away = [math.dist(self._place[name][:2], place[:2]) for other, place in self._place.items() if other != name]
-        return min(away, default=math.inf) <= interest.ACTOR_LEAVE + SLACK
+        return min(away, default=math.inf) <= interest.REDUCED_RATE_DISTANCE + SLACK
 
 
 def grid(area: tuple[float, float, float, float]) -> list[tuple[float, float]]:
@@ -287,7 +287,7 @@ def grid(area: tuple[float, float, float, float]) -> list[tuple[float, float]]:
     ]
 
 
-class Stand:
+class Observer:
     """A spectator without a world of its own: it is only there, so that others send what happens around it."""
 
     def __init__(self, bus: Bus, place: tuple[float, float], scene: str, digest: str, now: float) -> None:
@@ -295,16 +295,16 @@ class Stand:
         self.bus = bus
         hello = messages.encode_hello(Hello(bus.name, kind="spectator", scene=scene, digest=digest, joints=0))
         bus.join(hello)
-        bus.serve(f"hello/{bus.name}", lambda _: hello)
+        bus.declare_queryable(f"hello/{bus.name}", lambda _: hello)
         self._place = frames.pose([*place, 1.6])
         self._pose = bus.publisher(f"a/{bus.name}/far")
-        self._keeper = Timekeeper(bus, now)
+        self._keeper = NetworkClock(bus, now)
         self._due = -math.inf
 
     def step(self, now: float) -> None:
         """Say five times a second that one is there."""
         self._keeper.keep(now)
-        for key, payload, age in self.bus.answers():
+        for key, payload, age in self.bus.replies():
             if key == "clock":
                 self._keeper.hear(payload, age)
         if now >= self._due:

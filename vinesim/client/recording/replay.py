@@ -17,12 +17,12 @@ import bisect
 import logging
 from collections.abc import Callable, Iterable
 
-from vinesim.client.recording.recorder import Timekeeper
+from vinesim.client.recording.recorder import NetworkClock
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
-from vinesim.net.recording.mcap_file import Entry, Tape, sender_of
-from vinesim.net.replication.retained import Facts
-from vinesim.net.transport.bus import NEWEST, Answer, Bus, NameTaken, Publisher, Store, matches
+from vinesim.net.recording.mcap_file import RecordedMessage, Recording, sender_of
+from vinesim.net.replication.retained import RetainedState
+from vinesim.net.transport.bus import KEEP_LAST_1, Bus, NameTaken, Publisher, Reply, SampleStore, matches
 
 log = logging.getLogger(__name__)
 
@@ -36,10 +36,10 @@ ENOUGH = 4096
 """So many bytes of facts make an answer [B]."""
 
 
-class Cursor:
+class Playhead:
     """A place on a tape, and who was there and what was true when it was played so far."""
 
-    def __init__(self, tape: Tape, start: float = 0.0, end: float | None = None) -> None:
+    def __init__(self, tape: Recording, start: float = 0.0, end: float | None = None) -> None:
         """From ``start`` to ``end`` [s] after the first message; what was true at ``start`` is known at once."""
         self.tape = tape
         self.time = tape.start + start
@@ -49,14 +49,14 @@ class Cursor:
         """Who is there."""
         self.greetings: dict[str, bytes] = {}
         """How each introduced itself, as a message, even before it did: the recorder had to ask."""
-        self.facts = Facts()
+        self.facts = RetainedState()
         """What stays true."""
-        for entry in reversed(tape.entries):
+        for entry in reversed(tape.messages):
             if entry.key.startswith("hello/"):
                 self.greetings[sender_of(entry.key)] = entry.payload
         self._know_before()
-        self._next = bisect.bisect_left(tape.entries, self.time, key=lambda entry: entry.time)
-        for entry in tape.entries[: bisect.bisect_right(tape.entries, self.time, key=lambda entry: entry.time)]:
+        self._next = bisect.bisect_left(tape.messages, self.time, key=lambda entry: entry.time)
+        for entry in tape.messages[: bisect.bisect_right(tape.messages, self.time, key=lambda entry: entry.time)]:
             self._note(entry)
 
     @property
@@ -64,24 +64,24 @@ class Cursor:
         """Nothing follows."""
         return self.time >= self.end
 
-    def play(self, until: float) -> list[Entry]:
+    def play(self, until: float) -> list[RecordedMessage]:
         """All that is new up to network time ``until`` [s], in order."""
         first = self._next
         self.time = max(self.time, until)
         last = min(self.time, self.end)
-        while self._next < len(self.tape.entries) and self.tape.entries[self._next].time <= last:
-            self._note(self.tape.entries[self._next])
+        while self._next < len(self.tape.messages) and self.tape.messages[self._next].time <= last:
+            self._note(self.tape.messages[self._next])
             self._next += 1
-        return self.tape.entries[first : self._next]
+        return self.tape.messages[first : self._next]
 
     def _know_before(self) -> None:
         """What the server knew when the recording began: what it answered, less what was said only later."""
-        said = {fact for entry in self.tape.entries if entry.key.startswith("fact/") for fact in _facts(entry.payload)}
-        for entry in self.tape.entries:
+        said = {fact for entry in self.tape.messages if entry.key.startswith("fact/") for fact in _facts(entry.payload)}
+        for entry in self.tape.messages:
             if entry.key.startswith("snap/"):
                 self._add(entry.key, (fact for fact in _facts(entry.payload) if fact not in said))
 
-    def _note(self, entry: Entry) -> None:
+    def _note(self, entry: RecordedMessage) -> None:
         family, _, name = entry.key.partition("/")
         if family == "live":
             (self.live.add if entry.payload else self.live.discard)(name)
@@ -90,16 +90,16 @@ class Cursor:
         elif family == "fact":
             self._add(entry.key, _facts(entry.payload))
 
-    def _add(self, key: str, facts: Iterable[messages.Fact]) -> None:
+    def _add(self, key: str, facts: Iterable[messages.RetainedRecord]) -> None:
         cell = _cell(key)
         if cell is not None:
             for fact in facts:
-                self.facts.add(cell, fact)
+                self.facts.merge(cell, fact)
 
 
-def _facts(payload: bytes) -> list[messages.Fact]:
+def _facts(payload: bytes) -> list[messages.RetainedRecord]:
     try:
-        return messages.decode_facts(payload)
+        return messages.decode_records(payload)
     except MessageError:
         return []
 
@@ -120,19 +120,19 @@ class ReplayBus:
     """A member of a world that happened already; see :class:`vinesim.net.transport.bus.Bus`. What it says nobody hears."""
 
     bytes_out = 0
-    trouble = ""
+    status_message = ""
 
-    def __init__(self, tape: Tape, name: str = "viewer", *, start: float = 0.0, end: float | None = None) -> None:
+    def __init__(self, tape: Recording, name: str = "viewer", *, start: float = 0.0, end: float | None = None) -> None:
         """``start``, ``end`` [s] after the first message; :class:`NameTaken` if somebody on the tape has the name."""
         if name in tape.actors:
             raise NameTaken(name, str(tape.path))
         self.name = name
         self.bytes_in = 0
-        self._cursor = Cursor(tape, start, end)
+        self._cursor = Playhead(tape, start, end)
         self._begun, self._played = self._cursor.time, 0.0
-        self._store = Store()
+        self._store = SampleStore()
         self._subscriptions: list[_Subscription] = []
-        self._answers: list[Answer] = []
+        self._answers: list[Reply] = []
 
     @property
     def time(self) -> float:
@@ -156,7 +156,7 @@ class ReplayBus:
     # ------------------------------------------------------------ the bus
 
     @property
-    def lost(self) -> int:
+    def dropped(self) -> int:
         return self._store.overflowed
 
     def join(self, greeting: bytes) -> None:
@@ -165,14 +165,14 @@ class ReplayBus:
     def publisher(self, key: str, reliable: bool = False) -> Publisher:
         return _Unheard()
 
-    def subscribe(self, pattern: str, depth: int = NEWEST) -> _Subscription:
+    def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> _Subscription:
         self._subscriptions.append(_Subscription(self._subscriptions, pattern, depth))
         return self._subscriptions[-1]
 
-    def drain(self) -> list[tuple[str, bytes]]:
+    def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
 
-    def ask(self, key: str, payload: bytes = b"") -> None:
+    def query(self, key: str, payload: bytes = b"") -> None:
         family, _, rest = key.partition("/")
         if family == "clock":
             asked, _ = messages.decode_time(payload)
@@ -184,14 +184,14 @@ class ReplayBus:
             asked = _cell(key)  # of one cell even that there is nothing is an answer
             cells = {cell for cell, _ in facts if matches(key, f"snap/{cell[0]}/{cell[1]}")}
             for x, y in sorted(cells if asked is None else {asked}):
-                for part in _parts(facts.cell((x, y))):
-                    self._reply(f"snap/{x}/{y}", messages.encode_facts(part))
+                for part in _parts(facts.in_cell((x, y))):
+                    self._reply(f"snap/{x}/{y}", messages.encode_records(part))
 
-    def answers(self) -> list[Answer]:
+    def replies(self) -> list[Reply]:
         answers, self._answers = self._answers, []
         return answers
 
-    def serve(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         pass
 
     def alive(self) -> frozenset[str]:
@@ -201,7 +201,7 @@ class ReplayBus:
         self._subscriptions.clear()
 
     def _reply(self, key: str, payload: bytes) -> None:
-        self._answers.append(Answer(key, payload, 0.0))
+        self._answers.append(Reply(key, payload, 0.0))
 
 
 class _Subscription:
@@ -227,9 +227,9 @@ class _Unheard:
         pass
 
 
-def _parts(facts: list[messages.Fact]) -> Iterable[list[messages.Fact]]:
+def _parts(facts: list[messages.RetainedRecord]) -> Iterable[list[messages.RetainedRecord]]:
     """Facts in portions, each small enough to travel, at least one."""
-    part: list[messages.Fact] = []
+    part: list[messages.RetainedRecord] = []
     size = 0
     for fact in facts:
         part.append(fact)
@@ -248,25 +248,25 @@ class Replay:
     """Plays a tape to a network, each recorded actor through a live bus of its own. Call :meth:`step` often."""
 
     def __init__(
-        self, tape: Tape, bus: Bus, live_bus: Callable[[str], Bus], now: float, *,
+        self, tape: Recording, bus: Bus, live_bus: Callable[[str], Bus], now: float, *,
         speed: float = 1.0, start: float = 0.0, end: float | None = None,
     ) -> None:  # fmt: skip
         """``bus`` is not live: it asks for the time and says what no actor says any more; ``live_bus(name)`` opens
         one for an actor; ``now`` is any clock [s], as in :meth:`step`.
         """
-        self.cursor = Cursor(tape, start, end)
+        self.cursor = Playhead(tape, start, end)
         self.sent = 0
         """Messages that somebody heard."""
         self._bus, self._live_bus, self._speed = bus, live_bus, speed
-        self._keeper = Timekeeper(bus, now)
+        self._keeper = NetworkClock(bus, now)
         self._buses: dict[str, Bus] = {}
         self._publishers: dict[str, Publisher] = {}
         self._start = self.cursor.time
         self._begun: float | None = None
         self._begun_at = 0.0
-        self._before = [(_fact_key(cell, fact), messages.encode_facts([fact])) for cell, fact in self.cursor.facts]
+        self._before = [(_fact_key(cell, fact), messages.encode_records([fact])) for cell, fact in self.cursor.facts]
         self._keys: dict[str, list[str]] = {}
-        for key in sorted({entry.key for entry in tape.entries if entry.key.partition("/")[0] not in _ANSWERED}):
+        for key in sorted({entry.key for entry in tape.messages if entry.key.partition("/")[0] not in _ANSWERED}):
             self._keys.setdefault(sender_of(key), []).append(key)
 
     @property
@@ -277,7 +277,7 @@ class Replay:
     def step(self, now: float) -> None:
         """Say all that is due at own time ``now`` [s]."""
         self._keeper.keep(now)
-        for key, payload, age in self._bus.answers():
+        for key, payload, age in self._bus.replies():
             if key == "clock":
                 self._keeper.hear(payload, age)
         if not self._keeper.settled:
@@ -292,7 +292,7 @@ class Replay:
             if entry.key.partition("/")[0] not in _ANSWERED:
                 # as old as it was when the recorder had it
                 due = self._begun_at + (entry.time - self._start) / self._speed
-                self._say(entry.key, messages.restamped(entry.payload, due - entry.time))
+                self._say(entry.key, messages.shift_time(entry.payload, due - entry.time))
 
     def close(self) -> None:
         """Let all actors leave."""
@@ -310,7 +310,7 @@ class Replay:
             if greeting is not None:
                 bus = self._buses[name] = self._live_bus(name)
                 bus.join(greeting)
-                bus.serve(f"hello/{name}", lambda _, greeting=greeting: greeting)
+                bus.declare_queryable(f"hello/{name}", lambda _, greeting=greeting: greeting)
                 for key in self._keys.get(name, ()):
                     self._publishers[key] = bus.publisher(key, key.partition("/")[0] in RELIABLE)
 
@@ -323,5 +323,5 @@ class Replay:
         return heard
 
 
-def _fact_key(cell: tuple[int, int], fact: messages.Fact) -> str:
+def _fact_key(cell: tuple[int, int], fact: messages.RetainedRecord) -> str:
     return f"fact/{cell[0]}/{cell[1]}/{fact.author}"

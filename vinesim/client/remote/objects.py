@@ -11,13 +11,13 @@ from collections.abc import Collection, Container, Iterable
 import numpy as np
 
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Fact
+from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.replication.exchange import Inbox
-from vinesim.net.replication.streams import NO_ROOTS, Roots
+from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.physics.rigid.support_tracking import GROUND
 from vinesim.physics.step import Physics
-from vinesim.scene.ids import Kind, is_tree, thing, thing_named, unthing
-from vinesim.scene.values import Parting, ThingUpdate, TreeUpdate
+from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name, split_object_id
+from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 
 BLEND_PER_STEP = 0.2
 """Share of the way to where its owner says it is by which a copy moves in one tick."""
@@ -31,12 +31,12 @@ class ObjectSync:
     def __init__(self, physics: Physics, ours: Collection[str]) -> None:
         """``ours``: the names of all actors that this client moves."""
         self.physics, self._local_actors = physics, ours
-        self._remote_updates: dict[int, ThingUpdate] = {}
-        self._resting: dict[int, Fact] = {}
+        self._remote_updates: dict[int, ObjectUpdate] = {}
+        self._resting: dict[int, RetainedRecord] = {}
         self._supported: dict[str, set[int]] = {}
         self._changed_trees: set[int] = set()
         self._cut_bodies: dict[int, list[int]] = {}
-        self._detachments: tuple[Parting, ...] = ()
+        self._detachments: tuple[Detachment, ...] = ()
 
     # ------------------------------------------------------------------ what others say
 
@@ -44,42 +44,42 @@ class ObjectSync:
         """Do what others say is so, every tick before the step."""
         riding = self.physics.support_tracker
         self.physics.remotely_posed = self.physics.remotely_posed[:0]
-        self._apply_records(inbox.facts)
-        told = {update.thing: update for update in inbox.things}
-        for update in inbox.things:
-            self._clear_resting(update.thing)
-            self._ensure_body(update.thing, update.pose, update.velocity)
+        self._apply_records(inbox.records)
+        told = {update.object: update for update in inbox.objects}
+        for update in inbox.objects:
+            self._clear_resting(update.object)
+            self._ensure_body(update.object, update.pose, update.velocity)
         if told:
             blend = np.array([BLEND_PER_STEP if number in self._remote_updates else 1.0 for number in told])
-            poses = np.array([update.pose for update in inbox.things])
-            riding.blend_towards(list(told), poses, np.array([update.velocity for update in inbox.things]), blend)
+            poses = np.array([update.pose for update in inbox.objects])
+            riding.blend_towards(list(told), poses, np.array([update.velocity for update in inbox.objects]), blend)
             riding.set_moving(list(told))
         self._remote_updates = told
         self._hold_resting_objects()
         self._activate_dormant_bunches()
 
-    def _apply_records(self, facts: Iterable[tuple[Fact, bool]]) -> None:
+    def _apply_records(self, facts: Iterable[tuple[RetainedRecord, bool]]) -> None:
         """Take facts over, many at once for whoever comes late; where one says that a thing is counts if it holds."""
         lie, trees = [], []
         for fact, holds in facts:
-            if is_tree(fact.thing):
+            if is_tree(fact.object):
                 trees += self._apply_tree_record(fact, holds)
             elif self._apply_object_record(fact, holds):
                 lie.append(fact)
         if trees:
             self.physics.apply_remote_rest([update.tree for update in trees], [update.joint_q for update in trees])
         if lie:
-            bunches = [unthing(fact.thing)[1] for fact in lie]
+            bunches = [split_object_id(fact.object)[1] for fact in lie]
             self._changed_trees.update(self._tree_of(bunch) for bunch in bunches)
             self.physics.dormant_bunches.add(
                 bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie])
             )
 
-    def _apply_object_record(self, fact: Fact, holds: bool) -> bool:
+    def _apply_object_record(self, fact: RetainedRecord, holds: bool) -> bool:
         """Let a box or a bunch be where a fact says; True if it is a bunch that has no body here and needs none yet."""
-        number = fact.thing
-        kind, bunch = unthing(number)
-        bodiless = kind == Kind.BUNCH and number not in self.physics.support_tracker
+        number = fact.object
+        kind, bunch = split_object_id(number)
+        bodiless = kind == ObjectKind.BUNCH and number not in self.physics.support_tracker
         if not (holds or (bodiless and bunch not in self.physics.dormant_bunches)):
             return False
         self._remote_updates.pop(number, None)
@@ -96,14 +96,14 @@ class ObjectSync:
             self._place_on_support([number])
         return bodiless
 
-    def _apply_tree_record(self, fact: Fact, holds: bool) -> list[TreeUpdate]:
+    def _apply_tree_record(self, fact: RetainedRecord, holds: bool) -> list[TreeUpdate]:
         """Cut of a tree what a fact says; the state in which it rests, if the fact says that and ``holds``."""
         for body in fact.cut:
-            if self.physics.model.body_tree[body] == fact.thing and not self.physics.state.body_cut[body]:
+            if self.physics.model.body_tree[body] == fact.object and not self.physics.state.body_cut[body]:
                 self.apply_remote_cut(body)
         if not (holds and fact.trees):
             return []
-        self._changed_trees.add(fact.thing)
+        self._changed_trees.add(fact.object)
         (update,) = messages.decode_trees(fact.trees, self.physics.model.tree_size).updates(fact.author)
         self.blend_tree(update, 1.0)
         return [] if fact.moving else [update]
@@ -118,7 +118,7 @@ class ObjectSync:
             bunches = lying.nearest(np.array(actors), ACTIVATION_BATCH)
             lying.activate(bunches)
             for bunch in bunches:
-                self._place_on_support([thing(Kind.BUNCH, bunch)])
+                self._place_on_support([object_id(ObjectKind.BUNCH, bunch)])
 
     def apply_remote_cut(self, body: int) -> None:
         """Cut a body off because others have."""
@@ -127,10 +127,10 @@ class ObjectSync:
 
     def _ensure_body(self, number: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Of a bunch that hangs here still, or has no body: take it off, give it one."""
-        kind, bunch = unthing(number)
-        if kind == Kind.BUNCH and bunch in self.physics.dormant_bunches:
+        kind, bunch = split_object_id(number)
+        if kind == ObjectKind.BUNCH and bunch in self.physics.dormant_bunches:
             self.physics.dormant_bunches.activate([bunch])
-        elif kind == Kind.BUNCH and self.physics.state.bunch_attached[bunch]:
+        elif kind == ObjectKind.BUNCH and self.physics.state.bunch_attached[bunch]:
             self.physics.apply_remote_pick(bunch, pose, velocity)
             self._changed_trees.add(self._tree_of(bunch))
 
@@ -150,7 +150,7 @@ class ObjectSync:
             if riders and self._is_moved_remotely(parent):
                 self._place_on_support(sorted(riders))
 
-    def _set_resting(self, number: int, fact: Fact) -> None:
+    def _set_resting(self, number: int, fact: RetainedRecord) -> None:
         """From now on a thing lies where a fact says."""
         self._clear_resting(number)
         self._resting[number] = fact
@@ -167,7 +167,7 @@ class ObjectSync:
         """Whether a parent goes where somebody else says."""
         if parent == GROUND:
             return False
-        box = thing_named(parent)
+        box = parse_object_name(parent)
         if box is None:
             return parent.partition("/")[0] not in self._local_actors
         return box in self._remote_updates or (
@@ -214,11 +214,11 @@ class ObjectSync:
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
         """What left its plant in the last tick by the doing of an actor of ours, or by nobody's if ``all_others``."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
-        return [thing(Kind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
+        return [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
 
     def with_trees(self, parted: Iterable[int]) -> list[int]:
         """What was parted and the trees that it was parted from."""
-        trees = [number if is_tree(number) else self._tree_of(unthing(number)[1]) for number in parted]
+        trees = [number if is_tree(number) else self._tree_of(split_object_id(number)[1]) for number in parted]
         return [*parted, *trees]
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
@@ -228,7 +228,7 @@ class ObjectSync:
             number for number in riding.moving if self._supporting_actor(number) == name
         } | riding.objects_moved_by(name)
         for number, actor in (*riding.touched, *self.physics.touched):
-            other = thing_named(actor)
+            other = parse_object_name(actor)
             if other in mine or (actor == name and is_tree(number)):
                 found.add(number)
         for number in found:
@@ -240,7 +240,7 @@ class ObjectSync:
         fact = self._resting.get(number)
         if fact is None or fact.parent == GROUND:
             return ""
-        box = thing_named(fact.parent)
+        box = parse_object_name(fact.parent)
         if box is None:
             return fact.parent.partition("/")[0]
         return (self._supporting_actor(box) or self._resting[box].author) if box in self._resting else ""
@@ -257,7 +257,7 @@ class ObjectSync:
         here, state = self.physics.model.bodies_of(number), self.physics.state
         return state.joint_q[here], state.joint_qd[here]
 
-    def cut_roots(self, tree: int) -> Roots:
+    def cut_roots(self, tree: int) -> DetachedRoots:
         """What was cut off a tree, as :meth:`Exchange.send` wants it."""
         bodies = self._cut_bodies.get(tree)
         if not bodies:
@@ -275,11 +275,11 @@ class ObjectSync:
             number for parent, riders in self._supported.items() if parent.startswith(f"{name}/") for number in riders
         )  # fmt: skip
 
-    def mark_resting(self, fact: Fact | None) -> None:
+    def mark_resting(self, fact: RetainedRecord | None) -> None:
         """We have said that a thing of ours lies still: from now on it does, as for everybody else."""
-        if fact is not None and not fact.moving and not is_tree(fact.thing):
-            self._set_resting(fact.thing, fact)
-            self.physics.support_tracker.set_at_rest(fact.thing, fact.parent, np.array(fact.pose))
+        if fact is not None and not fact.moving and not is_tree(fact.object):
+            self._set_resting(fact.object, fact)
+            self.physics.support_tracker.set_at_rest(fact.object, fact.parent, np.array(fact.pose))
 
     # ------------------------------------------------------------------ inside
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vinesim.client.remote.remote_human import RemoteHuman, human_spec
-from vinesim.net.codec.messages import Hello, valid_name
+from vinesim.net.codec.messages import Hello, is_valid_name
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.world_core import CompiledWorld
 from vinesim.robot.description.description import RobotDescription
@@ -96,7 +96,7 @@ def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDesc
     """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
     if own is not None and hello.urdf == own.urdf:
         return own
-    name = hello.robot if valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
+    name = hello.robot if is_valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
     try:
         known = load_description(name)
         if known.urdf == hello.urdf:

@@ -14,19 +14,19 @@ import struct
 import numpy as np
 
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import FARTHEST, FORCE, HUMAN, TURN, MessageError, quaternion, rotation_vector
+from vinesim.net.codec.messages import FORCE, HUMAN, MAX_COORDINATE, TURN_LSB, MessageError, quaternion, rotation_vector
 from vinesim.scene.values import POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
-STEP = 2e-4
+POSITION_LSB = 2e-4
 """Unit of a point's place from the root [m]; what is farther than 6.5 m is clipped."""
 
-SPEED = 1e-5
+VELOCITY_LSB = 1e-5
 """Unit of a message's scales of velocity [m/s, rad/s]: 83 at most, faster ones are clipped."""
 
-BEND = 255.0
+FINGER_SCALE = 255.0
 """Steps of a finger from straight to bent all the way."""
 
-STRONGEST = 2000.0
+MAX_WRENCH = 2000.0
 """No wrench is greater [N, N m]: it is refused."""
 
 MAX_LINKS = 64
@@ -65,13 +65,13 @@ def encode_human(update: HumanUpdate) -> bytes:
     if not np.allclose(np.linalg.norm(points[:, 3:], axis=1), 1.0, atol=0.05):
         raise MessageError(f"pose of {update.actor!r} has an orientation that is no unit quaternion")
     root = points[0, :3].astype(np.float32)
-    places = _whole((points[1:, :3] - root) / STEP, 32767)
-    turns = _whole(rotation_vector(points[:, 3:]) / TURN, 32767)
+    places = _whole((points[1:, :3] - root) / POSITION_LSB, 32767)
+    turns = _whole(rotation_vector(points[:, 3:]) / TURN_LSB, 32767)
     kinds = velocity.reshape(_POINTS, 2, 3)
-    scales = np.minimum(np.ceil(np.abs(kinds).max(axis=(0, 2)) / (127.0 * SPEED)), 65535.0)
-    speeds = _whole(kinds / np.maximum(scales * SPEED, SPEED)[:, None], 127)
+    scales = np.minimum(np.ceil(np.abs(kinds).max(axis=(0, 2)) / (127.0 * VELOCITY_LSB)), 65535.0)
+    speeds = _whole(kinds / np.maximum(scales * VELOCITY_LSB, VELOCITY_LSB)[:, None], 127)
     flags = sum(bool(getattr(update.pose, name)) << bit for bit, name in enumerate(_FLAGS))
-    bends = (round(BEND * min(max(bend, 0.0), 1.0)) for bend in fingers)
+    bends = (round(FINGER_SCALE * min(max(bend, 0.0), 1.0)) for bend in fingers)
     return messages.head(HUMAN, _POINTS, update.time) + _HUMAN.pack(
         *root.tolist(), *places, *turns, *scales.astype(int).tolist(), *speeds, flags, *bends
     )
@@ -86,18 +86,18 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
         )
     told = _HUMAN.unpack_from(payload, messages.HEAD)
     root, told = np.array(told[:3]), told[3:]
-    if not (np.abs(root) < FARTHEST).all():
+    if not (np.abs(root) < MAX_COORDINATE).all():
         raise MessageError(f"human pose with a root at {root}, not finite or too far away")
     places, turns, scales = told[: 3 * _POINTS - 3], told[3 * _POINTS - 3 : 6 * _POINTS - 3], told[6 * _POINTS - 3 :]
-    turn = np.array(turns, float).reshape(_POINTS, 3) * TURN
-    if (turn * turn).sum(1).max() > (np.pi + 2.0 * TURN) ** 2:
+    turn = np.array(turns, float).reshape(_POINTS, 3) * TURN_LSB
+    if (turn * turn).sum(1).max() > (np.pi + 2.0 * TURN_LSB) ** 2:
         raise MessageError("human pose with a rotation of more than half a turn")
     points = np.empty((_POINTS, 7))
-    points[0, :3], points[1:, :3] = root, root + STEP * np.array(places, float).reshape(-1, 3)
+    points[0, :3], points[1:, :3] = root, root + POSITION_LSB * np.array(places, float).reshape(-1, 3)
     points[:, 3:] = quaternion(turn)
     speeds, rest = np.array(scales[2 : 2 + 6 * _POINTS], float), scales[2 + 6 * _POINTS :]
-    velocity = speeds.reshape(_POINTS, 2, 3) * (SPEED * np.array(scales[:2], float))[:, None]
-    flags, bends = rest[0], [bend / BEND for bend in rest[1:]]
+    velocity = speeds.reshape(_POINTS, 2, 3) * (VELOCITY_LSB * np.array(scales[:2], float))[:, None]
+    flags, bends = rest[0], [bend / FINGER_SCALE for bend in rest[1:]]
     if flags >= 1 << len(_FLAGS):
         raise MessageError("human pose with unknown flags")
     pose = HumanPose(
@@ -107,7 +107,7 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
     return HumanUpdate(actor, time, pose, velocity.reshape(_POINTS, 6))
 
 
-def quantised(pose: HumanPose) -> HumanPose:
+def quantise_pose(pose: HumanPose) -> HumanPose:
     """A pose as every copy will hold it, to the bit: places off by at most 0.1 mm, turns by 0.003 degrees."""
     return decode_human(encode_human(HumanUpdate("", 0.0, pose, np.zeros((_POINTS, 6)))), "").pose
 
@@ -120,7 +120,7 @@ def _whole(values: np.ndarray, most: int) -> list[int]:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Push:
+class WrenchMessage:
     """With what wrenches one person pushes links of one robot, mean of a sixtieth of a second."""
 
     time: float
@@ -129,20 +129,20 @@ class Push:
     """Link: force [N] and moment about its centre of mass [N m], world axes [6]. Empty: the touch is over."""
 
 
-def encode_push(push: Push) -> bytes:
+def encode_wrenches(push: WrenchMessage) -> bytes:
     """A push: 14 bytes, and 25 and its name for each link."""
     if len(push.wrenches) > MAX_LINKS:
         raise MessageError(f"push on {len(push.wrenches)} links, at most {MAX_LINKS}")
     payload = [messages.head(FORCE, len(push.wrenches), push.time)]
     for link, wrench in sorted(push.wrenches.items()):
         name = link.encode()
-        if len(name) > 255 or not (np.abs(wrench) <= STRONGEST).all():
+        if len(name) > 255 or not (np.abs(wrench) <= MAX_WRENCH).all():
             raise MessageError(f"push on {link[:60]!r} with {wrench}: not finite, too strong, or too long a name")
         payload += [bytes((len(name),)), name, _WRENCH.pack(*wrench)]
     return b"".join(payload)
 
 
-def decode_push(payload: bytes) -> Push:
+def decode_wrenches(payload: bytes) -> WrenchMessage:
     """A push, each number checked; which links there are is for the reader to know."""
     count, time = messages.opened(payload, FORCE, "push")
     if count > MAX_LINKS:
@@ -153,8 +153,8 @@ def decode_push(payload: bytes) -> Push:
         if end + _WRENCH.size > len(payload):
             raise MessageError(f"push on {count} links is cut off at {len(payload)} B")
         wrench = np.array(_WRENCH.unpack_from(payload, end))
-        if not (np.abs(wrench) <= STRONGEST).all():
-            raise MessageError(f"push with {wrench}: not finite or stronger than {STRONGEST} N")
+        if not (np.abs(wrench) <= MAX_WRENCH).all():
+            raise MessageError(f"push with {wrench}: not finite or stronger than {MAX_WRENCH} N")
         try:
             wrenches[payload[at + 1 : end].decode()] = wrench
         except UnicodeDecodeError as error:
@@ -162,4 +162,4 @@ def decode_push(payload: bytes) -> Push:
         at = end + _WRENCH.size
     if at != len(payload):
         raise MessageError(f"push of {len(payload)} B, {count} links take {at} B")
-    return Push(time, wrenches)
+    return WrenchMessage(time, wrenches)

@@ -22,9 +22,9 @@ import msgspec
 import numpy as np
 
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.interest import CELL, Cell
-from vinesim.scene.ids import THING_STRIDE, Kind
-from vinesim.scene.values import RobotUpdate, ThingUpdate, TreeUpdate
+from vinesim.net.replication.interest import CELL_SIZE, Cell
+from vinesim.scene.ids import OBJECT_STRIDE, ObjectKind
+from vinesim.scene.values import ObjectUpdate, RobotUpdate, TreeUpdate
 
 PROTOCOL = 1
 """Version of everything in this file. Others are refused."""
@@ -36,46 +36,46 @@ ROBOT, TREES, CLAIMS, FACTS, THINGS, HUMAN, FORCE, HELLO, TIME, WELCOME = 1, 2, 
 TIMED = frozenset((ROBOT, TREES, THINGS, HUMAN, FORCE))
 """Kinds that say in their header at which network time they were true."""
 
-SAMPLE = 1100
+MAX_DATAGRAM = 1100
 """Samples on the live session stay below this [B], one datagram, as far as a single tree allows."""
 
-LARGEST = 1 << 20
+MAX_MESSAGE = 1 << 20
 """No message is larger [B]; it is refused unread."""
 
-TURN = np.pi / 32767.0
+TURN_LSB = np.pi / 32767.0
 """Unit of a quantised rotation vector [rad]."""
 
-RATE = 1e-5
+RATE_LSB = 1e-5
 """Unit of a message's scale of joint rates [rad/s, m/s]."""
 
-JOINT = 2e-4
+JOINT_LSB = 2e-4
 """Unit of a joint's position [rad, m]."""
 
-VELOCITY = 1e-3
+VELOCITY_LSB = 1e-3
 """Unit of a base's velocities [m/s, rad/s]: 32.7 at most, faster ones are clipped."""
 
 TOUCHED, RESTING = 1, 2
 """Flags of a tree or thing: its owner is in contact with it; it lies still and silence follows."""
 
-ROOTS = 4
+ROOT_FLAG_UNIT = 4
 """Flags of a tree count in steps of this how many bodies were cut off it; their places follow all joints."""
 
-MOST_ROOTS = 255 // ROOTS
+MAX_ROOTS = 255 // ROOT_FLAG_UNIT
 
-STEP = 1e-4
+POSITION_LSB = 1e-4
 """Unit of a thing's position in its cell [m]: 3.2 m about :data:`MIDDLE`, farther ones are clipped."""
 
-MIDDLE = np.array([0.5 * CELL, 0.5 * CELL, 2.5])
+CELL_CENTRE = np.array([0.5 * CELL_SIZE, 0.5 * CELL_SIZE, 2.5])
 """From a cell's corner on the ground to the point from which positions count [m]."""
 
-SLOWEST = np.array([2.0**-10, 2.0**-8])
+MIN_VELOCITY_SCALE = np.array([2.0**-10, 2.0**-8])
 """Least units of a thing's velocity [m/s] and rate of turn [rad/s]; each record doubles them as often as it must."""
 
 MAX_JOINTS = 256
 MAX_TREES = 4096
 MAX_BODIES = 1 << 16
-MAX_FACTS = 4096
-FARTHEST = 1e5
+MAX_RECORDS = 4096
+MAX_COORDINATE = 1e5
 """Nothing lies farther from the origin than this [m]."""
 
 _HEAD = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
@@ -87,12 +87,12 @@ _TREE = np.dtype(
 _BODY = np.dtype([("turn", "<i2", 3), ("rate", "i1", 3)])
 _ROOT = np.dtype([("body", "<u2"), ("position", "<f4", 3), ("velocity", "<i2", 3)])
 _THING = np.dtype(
-    [("thing", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
+    [("object", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
      ("position", "<i2", 3), ("turn", "<u4"), ("velocity", "i1", 3), ("spin", "i1", 3)]
 )  # fmt: skip
 _THIRDS = 1023.0 / np.sqrt(2.0)
 """Steps of the three smallest components of a unit quaternion, which lie between +-1/sqrt(2)."""
-_FURTHEST_TURN = (np.pi + 2.0 * TURN) ** 2
+_FURTHEST_TURN = (np.pi + 2.0 * TURN_LSB) ** 2
 
 
 class MessageError(ValueError):
@@ -145,13 +145,13 @@ class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     protocol: int = PROTOCOL
 
 
-class Fact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """What stays true when its author has gone: a bunch or a box lies somewhere, a tree was cut.
 
     Facts travel once, reliably, and the server keeps the greatest of each thing for those who come later.
     """
 
-    thing: int
+    object: int
     """:func:`vinesim.scene.ids.thing`"""
     ownership: int
     authority: int
@@ -175,7 +175,7 @@ class Fact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=T
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Trees:
+class TreeStates:
     """Records of several trees of one owner at one instant, as flat arrays. Tree ids strictly increase."""
 
     time: float
@@ -222,12 +222,12 @@ class Trees:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Things:
+class ObjectStates:
     """Records of several boxes and loose bunches of one owner at one instant. Numbers strictly increase."""
 
     time: float
     """Network time [s]."""
-    thing: np.ndarray
+    object: np.ndarray
     """[k] :func:`vinesim.scene.ids.thing`"""
     ownership: np.ndarray
     """[k] u16 sequences"""
@@ -240,12 +240,12 @@ class Things:
     velocity: np.ndarray
     """[k, 6] m/s and rad/s; of the origin, world axes"""
 
-    def updates(self, owner: str) -> list[ThingUpdate]:
+    def updates(self, owner: str) -> list[ObjectUpdate]:
         """One value per thing; their arrays are views of this batch."""
-        columns = (self.thing, self.ownership, self.authority)
+        columns = (self.object, self.ownership, self.authority)
         rows = zip(*(column.tolist() for column in columns), self.pose, self.velocity, strict=True)
         return [
-            ThingUpdate(thing, owner, ownership, authority, self.time, pose, velocity)
+            ObjectUpdate(thing, owner, ownership, authority, self.time, pose, velocity)
             for thing, ownership, authority, pose, velocity in rows
         ]
 
@@ -283,8 +283,8 @@ def _head(kind: int, count: int, time: float) -> bytes:
 
 def kind_of(payload: bytes) -> int:
     """Kind of a message after checking its size and its first four bytes."""
-    if len(payload) > LARGEST:
-        raise MessageError(f"message of {len(payload)} B, at most {LARGEST} B are read")
+    if len(payload) > MAX_MESSAGE:
+        raise MessageError(f"message of {len(payload)} B, at most {MAX_MESSAGE} B are read")
     if len(payload) < 4:
         raise MessageError(f"message of {len(payload)} B is cut off before its kind")
     if payload[:2] != MAGIC:
@@ -302,7 +302,7 @@ def time_of(payload: bytes) -> float | None:
     return time if math.isfinite(time) else None
 
 
-def restamped(payload: bytes, shift: float) -> bytes:
+def shift_time(payload: bytes, shift: float) -> bytes:
     """The same message as if it had been true ``shift`` seconds later; itself if its kind does not say when it was."""
     time = time_of(payload)
     return (
@@ -343,13 +343,13 @@ _encoder = msgspec.msgpack.Encoder()
 _hello_decoder = msgspec.msgpack.Decoder(Hello)
 _welcome_decoder = msgspec.msgpack.Decoder(Welcome)
 _claims_decoder = msgspec.msgpack.Decoder(list[tuple[int, int, int, str, bool]])
-_facts_decoder = msgspec.msgpack.Decoder(list[Fact])
+_facts_decoder = msgspec.msgpack.Decoder(list[RetainedRecord])
 _time_decoder = msgspec.msgpack.Decoder(tuple[float, float])
 
 # ---------------------------------------------------------------- actors
 
 
-def _steps(values: list[float], unit: float) -> list[int]:
+def _to_lsb(values: list[float], unit: float) -> list[int]:
     """Values in whole units, clipped to i16."""
     return [min(max(round(value / unit), -32767), 32767) for value in values]
 
@@ -375,16 +375,16 @@ def encode_robot(update: RobotUpdate) -> bytes:
     if not 0.95 < math.hypot(sine, w) < 1.05:
         raise MessageError(f"orientation {pose[3:]} of {update.actor!r} is no unit quaternion")
     factor = math.copysign(2.0 * math.atan2(sine, abs(w)) / sine, w) if sine > 1e-12 else 0.0
-    near = [abs(value) < JOINT * 32767.5 for value in position]
-    steps = [round(value / JOINT) if fits else _WIDE for value, fits in zip(position, near, strict=True)]
+    near = [abs(value) < JOINT_LSB * 32767.5 for value in position]
+    steps = [round(value / JOINT_LSB) if fits else _WIDE for value, fits in zip(position, near, strict=True)]
     wide = [value for value, fits in zip(position, near, strict=True) if not fits]
-    scale = min(math.ceil(max(map(abs, velocity), default=0.0) / (127.0 * RATE)), 65535)
-    unit = max(scale, 1) * RATE
+    scale = min(math.ceil(max(map(abs, velocity), default=0.0) / (127.0 * RATE_LSB)), 65535)
+    unit = max(scale, 1) * RATE_LSB
     rates = [min(max(round(value / unit), -127), 127) for value in velocity]
-    turn = _steps([x * factor, y * factor, z * factor], TURN)
+    turn = _to_lsb([x * factor, y * factor, z * factor], TURN_LSB)
     return (
         _head(ROBOT, count, update.time)
-        + _BASE.pack(*pose[:3], *turn, *_steps(twist, VELOCITY), scale)
+        + _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, VELOCITY_LSB), scale)
         + struct.pack(f"<{count}h{count}b{len(wide)}f", *steps, *rates, *wide)
     )
 
@@ -401,14 +401,14 @@ def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     if rest != 4 * np.count_nonzero(apart):
         raise MessageError(f"actor pose with {np.count_nonzero(apart)} wide joints and {rest} B for them")
     base = _BASE.unpack_from(payload, _HEAD.size)
-    position = steps * JOINT
+    position = steps * JOINT_LSB
     position[apart] = np.frombuffer(payload, "<f4", rest // 4, joints + 3 * count)
     if not (all(-1e9 < number < 1e9 for number in base[:3]) and (np.abs(position) < 1e9).all()):
         raise MessageError("actor pose with a number that is not finite or beyond 1e9")
-    turn = _checked_turn(np.array(base[3:6]) * TURN, "actor pose")
-    velocity = np.frombuffer(payload, "i1", count, joints + 2 * count) * (base[12] * RATE)
+    turn = _checked_turn(np.array(base[3:6]) * TURN_LSB, "actor pose")
+    velocity = np.frombuffer(payload, "i1", count, joints + 2 * count) * (base[12] * RATE_LSB)
     return RobotUpdate(
-        actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:12]) * VELOCITY, position, velocity,
+        actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:12]) * VELOCITY_LSB, position, velocity,
     )  # fmt: skip
 
 
@@ -427,27 +427,27 @@ def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> 
     if not (np.isfinite(joint_q).all() and np.isfinite(joint_qd).all()):
         raise MessageError("joint state of a tree is not finite")
     fastest = np.maximum.reduceat(np.abs(joint_qd).ravel(), 3 * (np.cumsum(bodies) - bodies))
-    scale = np.minimum(np.ceil(fastest / (127.0 * RATE)), 65535.0)
-    unit = _unit(bodies, scale)
-    turn = np.rint(rotation_vector(joint_q) / TURN) + 0.0  # an integer has no negative zero
-    rate = np.minimum(np.maximum(np.rint(joint_qd / np.maximum(unit, RATE)), -127.0), 127.0) + 0.0
+    scale = np.minimum(np.ceil(fastest / (127.0 * RATE_LSB)), 65535.0)
+    unit = _unit_quaternions(bodies, scale)
+    turn = np.rint(rotation_vector(joint_q) / TURN_LSB) + 0.0  # an integer has no negative zero
+    rate = np.minimum(np.maximum(np.rint(joint_qd / np.maximum(unit, RATE_LSB)), -127.0), 127.0) + 0.0
     return turn, rate, scale, unit
 
 
-def _unit(bodies: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    return np.repeat(scale * RATE, bodies)[:, None]
+def _unit_quaternions(bodies: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    return np.repeat(scale * RATE_LSB, bodies)[:, None]
 
 
-def quantised(joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def quantise_tree(joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """State of one tree ([n, 4], [n, 3] rad/s) as every copy will hold it, to the bit.
 
     Rotations are off by at most 0.005 degrees; rates by 0.4 % of the fastest joint (beyond 83 rad/s they are clipped).
     """
     turn, rate, _, unit = _quantise(np.array([len(joint_q)]), np.asarray(joint_q, float), np.asarray(joint_qd, float))
-    return quaternion(turn * TURN), rate * unit
+    return quaternion(turn * TURN_LSB), rate * unit
 
 
-def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
+def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
     """Messages of at most 1.1 kB where single trees allow it, and what their receivers will decode, taken together."""
     ids = trees.tree
     if not len(ids) or (len(ids) > 1 and not (ids[1:] > ids[:-1]).all()):
@@ -468,16 +468,16 @@ def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
     roots = np.empty(len(trees.root), _ROOT)
     if len(trees.roots):
         cuts = trees.roots.tolist()
-        if max(cuts) > MOST_ROOTS or sum(cuts) != len(roots) or not np.isfinite(trees.root_x).all():
-            raise MessageError(f"trees with {cuts} bodies cut off (at most {MOST_ROOTS} each) and {len(roots)} places")
-        heads["flags"] += np.array(cuts, np.uint8) * ROOTS
+        if max(cuts) > MAX_ROOTS or sum(cuts) != len(roots) or not np.isfinite(trees.root_x).all():
+            raise MessageError(f"trees with {cuts} bodies cut off (at most {MAX_ROOTS} each) and {len(roots)} places")
+        heads["flags"] += np.array(cuts, np.uint8) * ROOT_FLAG_UNIT
         roots["body"], roots["position"] = trees.root, trees.root_x
-        roots["velocity"] = np.clip(np.rint(trees.root_xd / VELOCITY), -32767, 32767)
+        roots["velocity"] = np.clip(np.rint(trees.root_xd / VELOCITY_LSB), -32767, 32767)
 
     payloads, start, body, root = [], 0, 0, 0
     head_bytes, body_bytes, root_bytes = heads.tobytes(), records.tobytes(), roots.tobytes()
     while start < len(sizes):
-        end, last, end_root, room = start, body, root, SAMPLE - _HEAD.size
+        end, last, end_root, room = start, body, root, MAX_DATAGRAM - _HEAD.size
         while end < len(sizes):
             room -= _TREE.itemsize + sizes[end] * _BODY.itemsize + cuts[end] * _ROOT.itemsize
             if room < 0 and end > start:
@@ -493,13 +493,13 @@ def encode_trees(trees: Trees) -> tuple[list[bytes], Trees]:
         )
         start, body, root = end, last, end_root
     heard = dataclasses.replace(
-        trees, joint_q=quaternion(turn * TURN), joint_qd=rate * unit,
-        root_x=roots["position"].astype(float), root_xd=roots["velocity"] * VELOCITY,
+        trees, joint_q=quaternion(turn * TURN_LSB), joint_qd=rate * unit,
+        root_x=roots["position"].astype(float), root_xd=roots["velocity"] * VELOCITY_LSB,
     )  # fmt: skip
     return payloads, heard
 
 
-def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
+def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeStates:
     """Records of trees; with ``tree_size`` [tree] of the model, ids and body counts are held against it."""
     count, time = _open(payload, TREES, "trees")
     at = _HEAD.size + count * _TREE.itemsize
@@ -508,7 +508,7 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
     heads = np.frombuffer(payload, _TREE, count, _HEAD.size)
     tree, bodies = heads["tree"].astype(np.int64), heads["bodies"].astype(np.int64)
     total = int(bodies.sum())
-    cuts = heads["flags"].astype(np.int64) // ROOTS
+    cuts = heads["flags"].astype(np.int64) // ROOT_FLAG_UNIT
     after = at + total * _BODY.itemsize
     expected = after + int(cuts.sum()) * _ROOT.itemsize
     if len(payload) != expected or bodies.min() < 1 or total > MAX_BODIES:
@@ -524,24 +524,33 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> Trees:
                 f"tree {tree[wrong]} with {bodies[wrong]} bodies, this vineyard's has {tree_size[tree[wrong]]}"
             )
     records = np.frombuffer(payload, _BODY, total, at)
-    joint_q = quaternion(_checked_turn(records["turn"] * TURN, "tree"))
-    joint_qd = records["rate"] * _unit(bodies, heads["scale"])
-    known = (time, tree, heads["ownership"], heads["authority"], heads["flags"] % ROOTS, bodies, joint_q, joint_qd)
+    joint_q = quaternion(_checked_turn(records["turn"] * TURN_LSB, "tree"))
+    joint_qd = records["rate"] * _unit_quaternions(bodies, heads["scale"])
+    known = (
+        time,
+        tree,
+        heads["ownership"],
+        heads["authority"],
+        heads["flags"] % ROOT_FLAG_UNIT,
+        bodies,
+        joint_q,
+        joint_qd,
+    )
     if not cuts.any():
-        return Trees(*known)
+        return TreeStates(*known)
     roots = np.frombuffer(payload, _ROOT, int(cuts.sum()), after)
     root, root_x = roots["body"].astype(np.int64), roots["position"].astype(float)
-    if (root >= np.repeat(bodies, cuts)).any() or not (np.abs(root_x) < FARTHEST).all():
+    if (root >= np.repeat(bodies, cuts)).any() or not (np.abs(root_x) < MAX_COORDINATE).all():
         raise MessageError("a body cut off a tree that has not so many, or lying nowhere")
     if (np.diff(root)[np.diff(np.repeat(tree, cuts)) == 0] <= 0).any():
         raise MessageError("bodies cut off a tree in an order that does not increase")
-    return Trees(*known, cuts, root, root_x, roots["velocity"] * VELOCITY)
+    return TreeStates(*known, cuts, root, root_x, roots["velocity"] * VELOCITY_LSB)
 
 
 # ---------------------------------------------------------------- boxes and loose bunches
 
 
-def _smallest(q: np.ndarray) -> np.ndarray:
+def _pack_quaternion(q: np.ndarray) -> np.ndarray:
     """Unit quaternions [k, 4] as 32 bits [k]: which component is the largest, and the other three, 10 bits each."""
     rows = np.arange(len(q))
     largest = np.argmax(np.abs(q), axis=1)
@@ -551,7 +560,7 @@ def _smallest(q: np.ndarray) -> np.ndarray:
     return (largest.astype(np.uint32) << 30) | (steps[:, 0] << 20) | (steps[:, 1] << 10) | steps[:, 2]
 
 
-def _whole(bits: np.ndarray) -> np.ndarray:
+def _unpack_quaternion(bits: np.ndarray) -> np.ndarray:
     """Unit quaternions [k, 4] from 32 bits [k]; no other rotation has these bits, and these bits no other."""
     largest = (bits >> 30).astype(np.int64)
     three = (np.stack([bits >> 20, bits >> 10, bits], -1) & 1023).astype(float) - 511.0
@@ -566,95 +575,95 @@ def _whole(bits: np.ndarray) -> np.ndarray:
     return q
 
 
-def encode_things(things: Things, cell: Cell) -> tuple[list[bytes], Things]:
+def encode_objects(things: ObjectStates, cell: Cell) -> tuple[list[bytes], ObjectStates]:
     """Messages of at most 1.1 kB about things said under ``cell``, and what their receivers will decode, together."""
-    ids = things.thing
+    ids = things.object
     if not len(ids) or (len(ids) > 1 and not (ids[1:] > ids[:-1]).all()):
         raise MessageError("things of a batch must be at least one, in strictly increasing order")
     if not (np.isfinite(things.pose).all() and np.isfinite(things.velocity).all()):
         raise MessageError("state of a thing is not finite")
     records = np.empty(len(ids), _THING)
-    for name in ("thing", "ownership", "authority", "flags"):
+    for name in ("object", "ownership", "authority", "flags"):
         records[name] = getattr(things, name)
-    records["position"] = np.clip(np.rint((things.pose[:, :3] - _corner(cell)) / STEP), -32767, 32767)
-    records["turn"] = _smallest(things.pose[:, 3:])
+    records["position"] = np.clip(np.rint((things.pose[:, :3] - _cell_origin(cell)) / POSITION_LSB), -32767, 32767)
+    records["turn"] = _pack_quaternion(things.pose[:, 3:])
     velocity = things.velocity.reshape(-1, 2, 3)
-    fastest = np.maximum(np.abs(velocity).max(2) / (127.0 * SLOWEST), 1.0)
+    fastest = np.maximum(np.abs(velocity).max(2) / (127.0 * MIN_VELOCITY_SCALE), 1.0)
     doubled = np.minimum(np.ceil(np.log2(fastest)), 15.0)
-    steps = np.clip(np.rint(velocity / (SLOWEST * 2.0**doubled)[:, :, None]), -127.0, 127.0)
+    steps = np.clip(np.rint(velocity / (MIN_VELOCITY_SCALE * 2.0**doubled)[:, :, None]), -127.0, 127.0)
     records["velocity"], records["spin"] = steps[:, 0], steps[:, 1]
     records["scale"] = doubled[:, 0] + 16.0 * doubled[:, 1]
-    count = (SAMPLE - _HEAD.size) // _THING.itemsize
+    count = (MAX_DATAGRAM - _HEAD.size) // _THING.itemsize
     parts = [records[first : first + count] for first in range(0, len(records), count)]
     payloads = [_head(THINGS, len(part), things.time) + part.tobytes() for part in parts]
-    return payloads, _read_things(things.time, records, cell)
+    return payloads, _read_objects(things.time, records, cell)
 
 
-def decode_things(payload: bytes, cell: Cell) -> Things:
+def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
     """Records of things that were said under ``cell``; of which vineyard is for the reader to check."""
     count, time = _open(payload, THINGS, "things")
     if not 1 <= count <= MAX_TREES or len(payload) != _HEAD.size + count * _THING.itemsize:
         raise MessageError(f"{count} things announced (1 to {MAX_TREES}) in {len(payload)} B")
     records = np.frombuffer(payload, _THING, count, _HEAD.size)
-    ids = records["thing"].astype(np.int64)
-    if (ids[1:] <= ids[:-1]).any() or ids[0] < THING_STRIDE or ids[-1] >= len(Kind) * THING_STRIDE:
+    ids = records["object"].astype(np.int64)
+    if (ids[1:] <= ids[:-1]).any() or ids[0] < OBJECT_STRIDE or ids[-1] >= len(ObjectKind) * OBJECT_STRIDE:
         raise MessageError("things that are trees, of no kind, or in an order that does not increase")
     if (records["flags"] > TOUCHED).any():
         raise MessageError("things with unknown flags")
-    return _read_things(time, records, cell)
+    return _read_objects(time, records, cell)
 
 
-def _read_things(time: float, records: np.ndarray, cell: Cell) -> Things:
+def _read_objects(time: float, records: np.ndarray, cell: Cell) -> ObjectStates:
     pose = np.empty((len(records), 7))
-    pose[:, :3] = records["position"] * STEP + _corner(cell)
-    pose[:, 3:] = _whole(records["turn"])
+    pose[:, :3] = records["position"] * POSITION_LSB + _cell_origin(cell)
+    pose[:, 3:] = _unpack_quaternion(records["turn"])
     doubled = np.stack([records["scale"] % 16, records["scale"] // 16], -1).astype(float)
-    unit = np.repeat(SLOWEST * 2.0**doubled, 3, axis=1)
+    unit = np.repeat(MIN_VELOCITY_SCALE * 2.0**doubled, 3, axis=1)
     velocity = np.concatenate([records["velocity"], records["spin"]], -1) * unit
-    ids = records["thing"].astype(np.int64)
-    return Things(time, ids, records["ownership"], records["authority"], records["flags"], pose, velocity)
+    ids = records["object"].astype(np.int64)
+    return ObjectStates(time, ids, records["ownership"], records["authority"], records["flags"], pose, velocity)
 
 
-def _corner(cell: Cell) -> np.ndarray:
+def _cell_origin(cell: Cell) -> np.ndarray:
     """Where positions of a cell are zero [3] m."""
-    return np.array([cell[0] * CELL, cell[1] * CELL, 0.0]) + MIDDLE
+    return np.array([cell[0] * CELL_SIZE, cell[1] * CELL_SIZE, 0.0]) + CELL_CENTRE
 
 
 # ---------------------------------------------------------------- rare things
 
 
-def valid_name(name: str) -> bool:
+def is_valid_name(name: str) -> bool:
     """Whether an actor may be called so: the name is one chunk of a key."""
     return 1 <= len(name) <= 48 and all(c.isascii() and (c.isalnum() or c in "_-.") for c in name)
 
 
 def encode_hello(hello: Hello) -> bytes:
     """A greeting; :class:`MessageError` if its name cannot be part of a key."""
-    if not valid_name(hello.name):
+    if not is_valid_name(hello.name):
         raise MessageError(f"actor name {hello.name!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
     payload = _pack(HELLO, hello)
-    if len(payload) > LARGEST:
-        raise MessageError(f"greeting of {len(payload)} B, at most {LARGEST} B: the URDF is too long")
+    if len(payload) > MAX_MESSAGE:
+        raise MessageError(f"greeting of {len(payload)} B, at most {MAX_MESSAGE} B: the URDF is too long")
     return payload
 
 
 def decode_hello(payload: bytes) -> Hello:
     """A greeting. One of another protocol version raises :class:`WrongVersion` before anything else is read."""
     hello = _unpack(payload, HELLO, "greeting", _hello_decoder)
-    if not valid_name(hello.name):
+    if not is_valid_name(hello.name):
         raise MessageError(f"greeting of an actor named {hello.name[:60]!r}")
     if hello.protocol != PROTOCOL:
         raise WrongVersion(hello.protocol)
     return hello
 
 
-def check_thing(thing: int, counts: tuple[int, ...] | None = None) -> None:
+def check_object_id(thing: int, counts: tuple[int, ...] | None = None) -> None:
     """:class:`MessageError` unless there can be a thing of this number; ``counts``: how many there are of each kind."""
-    kind, index = divmod(thing, THING_STRIDE)
-    if not 0 <= kind < len(Kind):
+    kind, index = divmod(thing, OBJECT_STRIDE)
+    if not 0 <= kind < len(ObjectKind):
         raise MessageError(f"something is said of thing {thing}, which is of no kind")
     if counts is not None and index >= counts[kind]:
-        raise MessageError(f"{Kind(kind).name.lower()} {index}, this vineyard has {counts[kind]}")
+        raise MessageError(f"{ObjectKind(kind).name.lower()} {index}, this vineyard has {counts[kind]}")
 
 
 def encode_welcome(welcome: Welcome) -> bytes:
@@ -681,37 +690,37 @@ def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list
     if len(rows) > MAX_TREES:
         raise MessageError(f"{len(rows)} claims in one message, at most {MAX_TREES}")
     for tree, ownership, authority, owner, _ in rows:
-        check_thing(tree, counts)
-        if not (0 <= ownership < 1 << 16 and 0 <= authority < 1 << 16) or (owner and not valid_name(owner)):
+        check_object_id(tree, counts)
+        if not (0 <= ownership < 1 << 16 and 0 <= authority < 1 << 16) or (owner and not is_valid_name(owner)):
             raise MessageError(f"claim ({ownership}, {authority}, {owner[:60]!r}) on thing {tree} is impossible")
     return [
         (tree, Claim(ownership, authority, owner), touching) for tree, ownership, authority, owner, touching in rows
     ]
 
 
-def encode_facts(facts: list[Fact]) -> bytes:
+def encode_records(facts: list[RetainedRecord]) -> bytes:
     """Facts as their author, or the server that kept them, tells them."""
     return _pack(FACTS, facts)
 
 
-def decode_facts(payload: bytes, counts: tuple[int, ...] | None = None) -> list[Fact]:
+def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> list[RetainedRecord]:
     """Facts, each checked as far as that is possible without the vineyard: numbers, names, poses, sizes.
 
     ``counts``: how many things there are of each kind, if that is known.
     """
     facts = _unpack(payload, FACTS, "facts", _facts_decoder)
-    if len(facts) > MAX_FACTS:
-        raise MessageError(f"{len(facts)} facts in one message, at most {MAX_FACTS}")
+    if len(facts) > MAX_RECORDS:
+        raise MessageError(f"{len(facts)} facts in one message, at most {MAX_RECORDS}")
     for fact in facts:
-        check_thing(fact.thing, counts)
-        if not (0 <= fact.ownership < 1 << 16 and 0 <= fact.authority < 1 << 16 and valid_name(fact.author)):
+        check_object_id(fact.object, counts)
+        if not (0 <= fact.ownership < 1 << 16 and 0 <= fact.authority < 1 << 16 and is_valid_name(fact.author)):
             raise MessageError(f"fact by {fact.author[:60]!r} with claim ({fact.ownership}, {fact.authority})")
-        if not all(-FARTHEST < number < FARTHEST for number in fact.pose):
-            raise MessageError(f"fact about thing {fact.thing} at {fact.pose}, not finite or too far away")
+        if not all(-MAX_COORDINATE < number < MAX_COORDINATE for number in fact.pose):
+            raise MessageError(f"fact about thing {fact.object} at {fact.pose}, not finite or too far away")
         if not 0.95 < math.hypot(*fact.pose[3:]) < 1.05:
-            raise MessageError(f"fact about thing {fact.thing} with orientation {fact.pose[3:]}, no unit quaternion")
+            raise MessageError(f"fact about thing {fact.object} with orientation {fact.pose[3:]}, no unit quaternion")
         if len(fact.parent) > 200 or len(fact.cut) > MAX_BODIES or any(body < 0 for body in fact.cut):
-            raise MessageError(f"fact about thing {fact.thing} with a parent or cuts that cannot be")
+            raise MessageError(f"fact about thing {fact.object} with a parent or cuts that cannot be")
     return facts
 
 

@@ -28,23 +28,23 @@ from mcap.writer import Writer
 
 from vinesim import __version__
 from vinesim.net.codec import messages
-from vinesim.net.codec.human import decode_pose, decode_push
+from vinesim.net.codec.human import decode_pose, decode_wrenches
 from vinesim.net.codec.messages import MessageError
-from vinesim.scene.ids import Kind, unthing
+from vinesim.scene.ids import ObjectKind, split_object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 
-FLUSH = 0.5
+FLUSH_PERIOD = 0.5
 """What was recorded is in the hands of the operating system after this time [s], and on the disk: a recorder that is
 killed loses no more."""
 
-ABOUT = "vinesim"
+METADATA_NAME = "vinesim"
 """Name of the metadata record that says what was recorded; of several the last one holds."""
 
-_LONGEST = 1 << 26
+MAX_RECORD_LENGTH = 1 << 26
 """No record of a recording is larger [B]."""
 
 
-class NotARecording(ValueError):
+class InvalidRecording(ValueError):
     """A file that cannot be replayed; the text says why."""
 
 
@@ -54,7 +54,7 @@ class RecordingStopped(RuntimeError):
     exit_code = 4
 
 
-class Entry(NamedTuple):
+class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     time: float
@@ -77,11 +77,11 @@ def _pose(pose: np.ndarray) -> dict[str, dict[str, float]]:
 
 
 def _named(thing: int) -> dict[str, Any]:
-    kind, index = unthing(thing)
+    kind, index = split_object_id(thing)
     return {"kind": kind.name.lower(), "index": index}
 
 
-def _say_pose(payload: bytes, key: str) -> dict[str, Any]:
+def _describe_pose(payload: bytes, key: str) -> dict[str, Any]:
     update = decode_pose(payload, sender_of(key))
     here = {"timestamp": _stamp(update.time), "frame_id": "map", "pose": _pose(update.base_q)}
     if isinstance(update, HumanUpdate):
@@ -93,7 +93,7 @@ def _say_pose(payload: bytes, key: str) -> dict[str, Any]:
     }
 
 
-def _say_trees(payload: bytes, _: str) -> dict[str, Any]:
+def _describe_trees(payload: bytes, _: str) -> dict[str, Any]:
     trees = messages.decode_trees(payload)
     columns = (trees.tree, trees.ownership, trees.authority, trees.flags, trees.bodies)
     rows = zip(*(column.tolist() for column in columns), strict=True)
@@ -109,14 +109,14 @@ def _say_trees(payload: bytes, _: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _say_things(payload: bytes, key: str) -> dict[str, Any]:
+def _describe_objects(payload: bytes, key: str) -> dict[str, Any]:
     _, x, y, _ = key.split("/")
-    things = messages.decode_things(payload, (int(x), int(y)))
+    things = messages.decode_objects(payload, (int(x), int(y)))
     return {
         "timestamp": _stamp(things.time),
         "things": [
             {
-                **_named(update.thing), "ownership": update.ownership, "authority": update.authority,
+                **_named(update.object), "ownership": update.ownership, "authority": update.authority,
                 "touched": bool(flags & messages.TOUCHED), "pose": _pose(update.pose),
                 "velocity": update.velocity.tolist(),
             }
@@ -125,7 +125,7 @@ def _say_things(payload: bytes, key: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _say_claims(payload: bytes, _: str) -> dict[str, Any]:
+def _describe_claims(payload: bytes, _: str) -> dict[str, Any]:
     return {
         "claims": [
             {
@@ -137,40 +137,40 @@ def _say_claims(payload: bytes, _: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _say_facts(payload: bytes, _: str) -> dict[str, Any]:
+def _describe_records(payload: bytes, _: str) -> dict[str, Any]:
     return {
         "facts": [
             {
-                **_named(fact.thing), "ownership": fact.ownership, "authority": fact.authority, "author": fact.author,
+                **_named(fact.object), "ownership": fact.ownership, "authority": fact.authority, "author": fact.author,
                 "moving": fact.moving, "pose": _pose(np.array(fact.pose)), "parent": fact.parent,
                 "cut": list(fact.cut),
             }
-            for fact in messages.decode_facts(payload)
+            for fact in messages.decode_records(payload)
         ]
     }  # fmt: skip
 
 
-def _say_push(payload: bytes, _: str) -> dict[str, Any]:
-    push = decode_push(payload)
+def _describe_wrenches(payload: bytes, _: str) -> dict[str, Any]:
+    push = decode_wrenches(payload)
     return {
         "timestamp": _stamp(push.time),
         "links": [{"link": link, "wrench": wrench.tolist()} for link, wrench in sorted(push.wrenches.items())],
     }
 
 
-def _say_hello(payload: bytes, _: str) -> dict[str, Any]:
+def _describe_hello(payload: bytes, _: str) -> dict[str, Any]:
     return msgspec.to_builtins(messages.decode_hello(payload))
 
 
-_SAYS: dict[int, Callable[[bytes, str], dict[str, Any]]] = {
-    messages.ROBOT: _say_pose,
-    messages.TREES: _say_trees,
-    messages.CLAIMS: _say_claims,
-    messages.FACTS: _say_facts,
-    messages.THINGS: _say_things,
-    messages.HUMAN: _say_pose,
-    messages.FORCE: _say_push,
-    messages.HELLO: _say_hello,
+_DESCRIBE: dict[int, Callable[[bytes, str], dict[str, Any]]] = {
+    messages.ROBOT: _describe_pose,
+    messages.TREES: _describe_trees,
+    messages.CLAIMS: _describe_claims,
+    messages.FACTS: _describe_records,
+    messages.THINGS: _describe_objects,
+    messages.HUMAN: _describe_pose,
+    messages.FORCE: _describe_wrenches,
+    messages.HELLO: _describe_hello,
 }
 
 
@@ -180,13 +180,13 @@ def sender_of(key: str) -> str:
     return "" if chunks[0] == "snap" else chunks[1] if chunks[0] in ("a", "hello", "live") else chunks[-1]
 
 
-def said(key: str, payload: bytes) -> dict[str, Any]:
+def describe_message(key: str, payload: bytes) -> dict[str, Any]:
     """The JSON object of one message; of bytes that are no message, only those bytes and why."""
     raw = base64.b64encode(payload).decode()
     if key.startswith("live/"):
         return {"actor": sender_of(key), "live": bool(payload), "raw": raw}
     try:
-        say = _SAYS.get(messages.kind_of(payload))
+        say = _DESCRIBE.get(messages.kind_of(payload))
         return {"actor": sender_of(key), **(say(payload, key) if say is not None else {}), "raw": raw}
     except ValueError as error:  # a key that names no cell among them
         return {"actor": sender_of(key), "error": str(error), "raw": raw}
@@ -206,7 +206,7 @@ def _list(items: Any) -> dict[str, Any]:
 _NUMBER, _COUNT, _TEXT, _YES = ({"type": kind} for kind in ("number", "integer", "string", "boolean"))
 _TIME = _object("time", "network time", sec=_COUNT, nsec=_COUNT)
 _CLAIM = {"ownership": _COUNT, "authority": _COUNT}
-_THING = {"kind": {"type": "string", "enum": [kind.name.lower() for kind in Kind]}, "index": _COUNT, **_CLAIM}
+_THING = {"kind": {"type": "string", "enum": [kind.name.lower() for kind in ObjectKind]}, "index": _COUNT, **_CLAIM}
 _XYZ = _object("position", "m, world axes", x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _XYZW = _object("orientation", "unit quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 _COMMON = {
@@ -290,13 +290,13 @@ def free_path(path: pathlib.Path) -> pathlib.Path:
     return free
 
 
-class Recording:
+class RecordingWriter:
     """A file that grows: :meth:`put` takes no time, a thread writes. A context manager; :meth:`close` completes it."""
 
     def __init__(self, path: pathlib.Path, about: dict[str, str] | None = None) -> None:
         """A new file; :class:`RecordingStopped` if it cannot be made. ``about``: see :meth:`describe`."""
         self.path = path
-        self.about = {"release": __version__, "protocol": str(messages.PROTOCOL)} | (about or {})
+        self.metadata = {"release": __version__, "protocol": str(messages.PROTOCOL)} | (about or {})
         """What is known of what is recorded: scene, seed, digest, ..."""
         self.count = 0
         """Messages taken."""
@@ -314,10 +314,10 @@ class Recording:
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
 
-    def describe(self, **about: str) -> None:
+    def add_metadata(self, **about: str) -> None:
         """Say more of what is recorded."""
-        self.about |= about
-        self._work.put(dict(self.about))
+        self.metadata |= about
+        self._work.put(dict(self.metadata))
 
     def put(self, at: int, key: str, payload: bytes) -> None:
         """Take a message that was there at network time ``at`` [ns]; raises what went wrong with the file."""
@@ -337,7 +337,7 @@ class Recording:
             self._thread.join()
         self.check()
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> RecordingWriter:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -349,9 +349,9 @@ class Recording:
     def _run(self) -> None:
         try:
             self._writer.start(library=f"vinesim {__version__}")
-            self._write(dict(self.about))
-            self._save()
-            due = time.monotonic() + FLUSH
+            self._write(dict(self.metadata))
+            self._flush()
+            due = time.monotonic() + FLUSH_PERIOD
             while True:
                 with contextlib.suppress(queue.Empty):
                     work = self._work.get(timeout=max(due - time.monotonic(), 0.0))
@@ -359,18 +359,18 @@ class Recording:
                         break
                     self._write(work)
                 if time.monotonic() >= due:
-                    self._save()
-                    due = time.monotonic() + FLUSH
-            self._save()
+                    self._flush()
+                    due = time.monotonic() + FLUSH_PERIOD
+            self._flush()
             self._writer.finish()
-            self._save()
+            self._flush()
             self._file.close()
         except OSError as error:
-            self._trouble = RecordingStopped(self._give_up(error))
+            self._trouble = RecordingStopped(self._truncate(error))
 
     def _write(self, work: tuple[int, str, bytes] | dict[str, str]) -> None:
         if isinstance(work, dict):
-            self._writer.add_metadata(ABOUT, work)
+            self._writer.add_metadata(METADATA_NAME, work)
             return
         at, key, payload = work
         channel = self._channels.get(key)
@@ -381,7 +381,7 @@ class Recording:
         except MessageError:
             true_at = None
         published = at if true_at is None or not 0.0 <= true_at < 1e10 else round(true_at * 1e9)
-        self._writer.add_message(channel, at, msgspec.json.encode(said(key, payload)), published)
+        self._writer.add_message(channel, at, msgspec.json.encode(describe_message(key, payload)), published)
 
     def _schema_id(self, key: str) -> int:
         schema = _schema(key)
@@ -389,13 +389,13 @@ class Recording:
             self._schemas[schema] = self._writer.register_schema(schema[0], "jsonschema", schema[1])
         return self._schemas[schema]
 
-    def _save(self) -> None:
+    def _flush(self) -> None:
         """Complete the chunk and see it onto the disk."""
         self._writer.flush()
         os.fsync(self._file.fileno())
         self.size = self._file.tell()
 
-    def _give_up(self, error: OSError) -> str:
+    def _truncate(self, error: OSError) -> str:
         """Leave the file as it was when it was last whole."""
         with contextlib.suppress(OSError):
             self._file.close()
@@ -411,13 +411,13 @@ class Recording:
 
 
 @dataclasses.dataclass(frozen=True)
-class Tape:
+class Recording:
     """A recording that was read."""
 
     path: pathlib.Path
-    about: dict[str, str]
+    metadata: dict[str, str]
     """What the recorder knew: release, protocol, world, scene, seed, digest."""
-    entries: list[Entry]
+    messages: list[RecordedMessage]
     """All messages, in order of time."""
     damage: str
     """Empty, or in one line why the file ends before its end; what lies before is all here."""
@@ -425,38 +425,40 @@ class Tape:
     @property
     def start(self) -> float:
         """Network time of the first message [s]."""
-        return self.entries[0].time
+        return self.messages[0].time
 
     @property
     def length(self) -> float:
         """From the first message to the last [s]."""
-        return self.entries[-1].time - self.start
+        return self.messages[-1].time - self.start
 
     @property
     def actors(self) -> list[str]:
         """Who was there at any time, sorted."""
-        return sorted({sender_of(entry.key) for entry in self.entries if entry.key.startswith("live/")})
+        return sorted({sender_of(entry.key) for entry in self.messages if entry.key.startswith("live/")})
 
 
-def read(path: pathlib.Path) -> Tape:
+def read(path: pathlib.Path) -> Recording:
     """A recording, as far as it is whole; :class:`NotARecording` if it is none or speaks another protocol."""
     about: dict[str, str] = {}
-    entries: list[Entry] = []
+    entries: list[RecordedMessage] = []
     channels: dict[int, str] = {}
     damage = ""
     try:
         with path.open("rb") as file:
             try:
-                for record in StreamReader(file, validate_crcs=True, record_size_limit=_LONGEST).records:
-                    if isinstance(record, Metadata) and record.name == ABOUT:
+                for record in StreamReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_LENGTH).records:
+                    if isinstance(record, Metadata) and record.name == METADATA_NAME:
                         about |= record.metadata
                     elif isinstance(record, Channel):
                         channels[record.id] = record.topic
                     elif isinstance(record, Message):
-                        entries.append(Entry(record.log_time * 1e-9, channels[record.channel_id], _raw(record.data)))
+                        entries.append(
+                            RecordedMessage(record.log_time * 1e-9, channels[record.channel_id], _raw(record.data))
+                        )
             except InvalidMagic:
                 if file.tell() <= 8:
-                    raise NotARecording(f"{path} is no MCAP file: give one that 'vinesim record' wrote") from None
+                    raise InvalidRecording(f"{path} is no MCAP file: give one that 'vinesim record' wrote") from None
                 damage = "it is not whole"
             except EndOfFile:
                 damage = "it ends in the middle"
@@ -465,11 +467,13 @@ def read(path: pathlib.Path) -> Tape:
             except Exception as error:  # a damaged byte can break anything that reads it
                 damage = f"it is damaged: {error}" if str(error) else "it is damaged"
     except OSError as error:
-        raise NotARecording(f"cannot read {path}: {error.strerror}; give a file that 'vinesim record' wrote") from error
+        raise InvalidRecording(
+            f"cannot read {path}: {error.strerror}; give a file that 'vinesim record' wrote"
+        ) from error
     if "protocol" not in about:
-        raise NotARecording(f"{path} holds no recording of vinesim: {damage or 'another program wrote it'}")
+        raise InvalidRecording(f"{path} holds no recording of vinesim: {damage or 'another program wrote it'}")
     if about["protocol"] != str(messages.PROTOCOL):
-        raise NotARecording(
+        raise InvalidRecording(
             f"{path} speaks protocol version {about['protocol']}, this program version {messages.PROTOCOL}: "
             f"replay it with release {about.get('release', '?')} of vinesim, which recorded it"
         )
@@ -477,7 +481,7 @@ def read(path: pathlib.Path) -> Tape:
     if damage:
         until = f"the {entries[-1].time - entries[0].time:.1f} s before" if entries else "nothing"
         damage = f"{path}: {damage} (was the recorder killed?); {until} can be read"
-    return Tape(path, about, entries, damage)
+    return Recording(path, about, entries, damage)
 
 
 def _raw(data: bytes) -> bytes:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 
-WINDOW = 8
+PING_WINDOW = 8
 """How many pings are remembered."""
 
-SLEW = 0.01
+MAX_SLEW_RATE = 0.01
 """Largest change of the offset in use [s/s]."""
 
-STEP = 0.5
+STEP_THRESHOLD = 0.5
 """An estimate this far away [s] is taken at once: it is another server, not drift."""
 
 
@@ -45,32 +45,32 @@ def estimate(pings: tuple[Ping, ...]) -> float | None:
     return min(reversed(pings), key=lambda ping: ping.round_trip).offset if pings else None
 
 
-def slewed(offset: float, target: float, dt: float) -> float:
+def slew(offset: float, target: float, dt: float) -> float:
     """The offset in use after ``dt`` seconds on its way to ``target``: at most 10 ms per second, far ones at once."""
     away = target - offset
-    if abs(away) >= STEP:
+    if abs(away) >= STEP_THRESHOLD:
         return target
-    return offset + min(max(away, -SLEW * dt), SLEW * dt)
+    return offset + min(max(away, -MAX_SLEW_RATE * dt), MAX_SLEW_RATE * dt)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Clock:
+class ClockEstimate:
     """Own clock plus an offset; every change makes a new one."""
 
     pings: tuple[Ping, ...] = ()
     offset: float = 0.0
     """Server's clock minus own clock as used now [s]."""
 
-    def heard(self, ping: Ping) -> Clock:
+    def with_ping(self, ping: Ping) -> ClockEstimate:
         """With one more ping. While the first eight come in the best estimate is taken at once, later it is slewed."""
-        settling = len(self.pings) < WINDOW
-        pings = (*self.pings, ping)[-WINDOW:]
+        settling = len(self.pings) < PING_WINDOW
+        pings = (*self.pings, ping)[-PING_WINDOW:]
         best = estimate(pings)
-        return Clock(pings, best if settling and best is not None else self.offset)
+        return ClockEstimate(pings, best if settling and best is not None else self.offset)
 
-    def after(self, dt: float) -> Clock:
+    def advanced(self, dt: float) -> ClockEstimate:
         """``dt`` seconds later, slewed towards the estimate."""
         best = estimate(self.pings)
         if best is None or best == self.offset:
             return self
-        return Clock(self.pings, slewed(self.offset, best, dt))
+        return ClockEstimate(self.pings, slew(self.offset, best, dt))

@@ -13,62 +13,64 @@ from __future__ import annotations
 
 import numpy as np
 
-CELL = 6.0
+CELL_SIZE = 6.0
 """Edge of a cell [m]; the same for everybody, it is part of the keys."""
 
 HYSTERESIS = 1.0
 """A window moves only when its owner is this far [m] outside of the middle cell."""
 
-REACH = CELL - HYSTERESIS
+MAX_INTEREST_RADIUS = CELL_SIZE - HYSTERESIS
 """The window covers at least this distance [m] on all sides, wherever its owner stands in it."""
 
-NEAR = 5.0
+INTEREST_RADIUS = 5.0
 """Default of the setting *near* [m]: nearer than this to a tree one sees it moved by others."""
 
-ACTOR_NEAR = 10.0
+FULL_RATE_DISTANCE = 10.0
 """Actors nearer than this [m] hear each other's poses at the full rate."""
 
-ACTOR_LEAVE = 12.0
+REDUCED_RATE_DISTANCE = 12.0
 """... until they are this far apart [m]."""
 
 Cell = tuple[int, int]
 
 
-def cell(position: np.ndarray) -> Cell:
+def cell_of(position: np.ndarray) -> Cell:
     """The cell of a position [2 or 3] m, world axes."""
-    return int(position[0] // CELL), int(position[1] // CELL)
+    return int(position[0] // CELL_SIZE), int(position[1] // CELL_SIZE)
 
 
-def cells(positions: np.ndarray) -> np.ndarray:
+def cells_of(positions: np.ndarray) -> np.ndarray:
     """Cells [k, 2] int of positions [k, 2 or 3] m."""
-    return np.floor(positions[:, :2] / CELL).astype(np.int64)
+    return np.floor(positions[:, :2] / CELL_SIZE).astype(np.int64)
 
 
-def window(middle: Cell) -> frozenset[Cell]:
+def cell_window(middle: Cell) -> frozenset[Cell]:
     """The 3x3 cells around ``middle``."""
     return frozenset((middle[0] + x, middle[1] + y) for x in (-1, 0, 1) for y in (-1, 0, 1))
 
 
-def moved(middle: Cell | None, position: np.ndarray) -> Cell:
+def move_window(middle: Cell | None, position: np.ndarray) -> Cell:
     """The middle cell of the window of somebody at ``position`` m, until now ``middle``: it clings by 1 m."""
     if middle is not None:
         inside = all(
-            CELL * middle[axis] - HYSTERESIS <= position[axis] <= CELL * (middle[axis] + 1) + HYSTERESIS
+            CELL_SIZE * middle[axis] - HYSTERESIS <= position[axis] <= CELL_SIZE * (middle[axis] + 1) + HYSTERESIS
             for axis in (0, 1)
         )
         if inside:
             return middle
-    return cell(position)
+    return cell_of(position)
 
 
-def checked(near: float) -> float:
+def check_radius(near: float) -> float:
     """``near`` [m] if the window can cover it; :class:`ValueError` with the bound otherwise."""
-    if not 0.0 < near <= REACH:
-        raise ValueError(f"near = {near} m: must be above 0 and at most {REACH} m, what 3x3 cells of {CELL} m cover")
+    if not 0.0 < near <= MAX_INTEREST_RADIUS:
+        raise ValueError(
+            f"near = {near} m: must be above 0 and at most {MAX_INTEREST_RADIUS} m, what 3x3 cells of {CELL_SIZE} m cover"
+        )
     return float(near)
 
 
-def listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.ndarray:
+def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.ndarray:
     """How many ``actors`` [a, 3] m are within ``near`` m, on the ground plan, of each middle [k, 3] m: [k] int."""
     if not len(actors) or not len(middles):
         return np.zeros(len(middles), np.int64)
@@ -77,6 +79,6 @@ def listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.ndarra
     return np.count_nonzero(x * x + y * y <= near * near, axis=1)
 
 
-def full_rate(distance: float, now: bool) -> bool:
+def is_full_rate(distance: float, now: bool) -> bool:
     """Whether an actor at ``distance`` [m] is heard at the full rate, given whether it is so ``now``: hysteresis."""
-    return distance <= (ACTOR_LEAVE if now else ACTOR_NEAR)
+    return distance <= (REDUCED_RATE_DISTANCE if now else FULL_RATE_DISTANCE)

@@ -14,15 +14,15 @@ import numpy as np
 
 from vinesim.net.replication import dead_reckoning
 
-LONGEST = 0.5
+MAX_DELAY = 0.5
 """No buffer waits longer than this [s]."""
 
-KEPT = 64
+MAX_SAMPLES = 64
 """Samples that are remembered: half a second at the full rate, and as much again."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Buffer:
+class JitterBuffer:
     """What one actor said, in the order of its times; every sample more makes a new one."""
 
     delay: float = 0.0
@@ -34,35 +34,35 @@ class Buffer:
     """Their change [1/s], for the time after the newest."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.delay <= LONGEST:
-            raise ValueError(f"jitter buffer of {1e3 * self.delay:g} ms: give 0 to {1e3 * LONGEST:g} ms")
+        if not 0.0 <= self.delay <= MAX_DELAY:
+            raise ValueError(f"jitter buffer of {1e3 * self.delay:g} ms: give 0 to {1e3 * MAX_DELAY:g} ms")
 
-    def heard(self, time: float, state: np.ndarray, rate: np.ndarray) -> Buffer:
+    def insert(self, time: float, state: np.ndarray, rate: np.ndarray) -> JitterBuffer:
         """With one more sample, whenever it comes; the first of two of the same time is kept."""
         at = bisect.bisect_left(self.times, time)
         if at < len(self.times) and self.times[at] == time:
             return self
 
         def put(values: tuple, value: object) -> tuple:
-            return (*values[:at], value, *values[at:])[-KEPT:]
+            return (*values[:at], value, *values[at:])[-MAX_SAMPLES:]
 
-        return Buffer(self.delay, put(self.times, time), put(self.states, state), put(self.rates, rate))
+        return JitterBuffer(self.delay, put(self.times, time), put(self.states, state), put(self.rates, rate))
 
-    def shown(self, now: float) -> np.ndarray:
+    def sample(self, now: float) -> np.ndarray:
         """The state to show at ``now``: what was ``delay`` earlier, on a straight line between two samples.
 
         Before the first sample it is that one; after the newest it is extrapolated, as without a buffer.
         """
         before, after, share, since = self._between(now)
         if before == after:
-            return self.states[before] + self.rates[before] * dead_reckoning.horizon(since)
+            return self.states[before] + self.rates[before] * dead_reckoning.clamp_age(since)
         return (1.0 - share) * self.states[before] + share * self.states[after]
 
     def rate(self, now: float) -> np.ndarray:
         """The change of what is shown at ``now`` [1/s]: said by its author, not found by differences."""
         before, after, share, since = self._between(now)
         if before == after:
-            return self.rates[before] * float(0.0 <= since <= dead_reckoning.EXTRAPOLATION)
+            return self.rates[before] * float(0.0 <= since <= dead_reckoning.MAX_EXTRAPOLATION)
         return (1.0 - share) * self.rates[before] + share * self.rates[after]
 
     def _between(self, now: float) -> tuple[int, int, float, float]:

@@ -18,10 +18,10 @@ from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.counters import Counters
 from vinesim.net.replication import interest
-from vinesim.net.replication.clock_sync import WINDOW, Clock, Ping
-from vinesim.net.replication.jitter_buffer import Buffer
-from vinesim.net.replication.remote_pose import Actor
-from vinesim.net.transport.bus import NEWEST, Answer, Bus, Publisher
+from vinesim.net.replication.clock_sync import PING_WINDOW, ClockEstimate, Ping
+from vinesim.net.replication.jitter_buffer import JitterBuffer
+from vinesim.net.replication.remote_pose import RemotePose
+from vinesim.net.transport.bus import KEEP_LAST_1, Bus, Publisher, Reply
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
@@ -41,47 +41,47 @@ PING_PERIOD = (0.05, 2.0)
 _LONG_AGO = -1e9
 
 
-class Mismatch(RuntimeError):
+class WorldMismatch(RuntimeError):
     """Actors that cannot share a world: their vineyards or their protocols differ."""
 
     exit_code = 4
 
 
-class Actors:
+class PeerRegistry:
     """All others in this world: who came, who went, where they are."""
 
     def __init__(self, bus: Bus, me: Hello, counters: Counters, buffer: float = 0.0) -> None:
         """``buffer`` [s]: all others' poses are shown so much later, see :class:`Buffer`."""
-        self.bus, self.me, self.counters = bus, me, counters
-        self._buffer = Buffer(buffer).delay
-        self.kin: set[str] = set()
-        self.clock = Clock()
-        self.known: dict[str, Actor] = {}
-        self.met: set[str] = set()
+        self.bus, self.name, self.counters = bus, me, counters
+        self._buffer = JitterBuffer(buffer).delay
+        self.local_actors: set[str] = set()
+        self.clock = ClockEstimate()
+        self.known: dict[str, RemotePose] = {}
+        self.seen_names: set[str] = set()
         """Who was ever let in: last words may arrive when their author has gone."""
         greeting = messages.encode_hello(me)
         bus.join(greeting)
-        bus.serve(f"hello/{me.name}", lambda _: greeting)
-        self._elders = bus.alive() - {me.name}
+        bus.declare_queryable(f"hello/{me.name}", lambda _: greeting)
+        self._initial_names = bus.alive() - {me.name}
         self._asked: dict[str, float] = {}
         self._refused: set[str] = set()
         self._blamed: set[str] = set()
         self._pose = bus.publisher(f"a/{me.name}")
         self._far_pose = bus.publisher(f"a/{me.name}/far")
-        bus.subscribe("a/*/far", NEWEST)
+        bus.subscribe("a/*/far", KEEP_LAST_1)
         self._pose_due: dict[Publisher, float] = {}
         self._phase = zlib.crc32(me.name.encode()) % 1024 / 1024.0
         self._pinged, self._pings = _LONG_AGO, 0
 
-    def places(self) -> dict[str, np.ndarray]:
+    def positions(self) -> dict[str, np.ndarray]:
         """Where everybody else is [m], as far as it is known."""
         return {name: actor.update.base_q[:3] for name, actor in self.known.items() if actor.update is not None}
 
     # ------------------------------------------------------------ who is here
 
-    def roster(self, now: float) -> list[str]:
+    def poll_liveliness(self, now: float) -> list[str]:
         """Notice who came and ask for their greetings; who went."""
-        alive = self.bus.alive() - self.kin
+        alive = self.bus.alive() - self.local_actors
         gone = sorted(self.known.keys() - alive)
         for name in gone:
             actor = self.known.pop(name)
@@ -90,72 +90,74 @@ class Actors:
             if actor.near is not None:
                 actor.near.close()
         self._refused &= alive
-        self._elders &= alive
-        for name in sorted(alive - self.known.keys() - self._refused - {self.me.name}):
+        self._initial_names &= alive
+        for name in sorted(alive - self.known.keys() - self._refused - {self.name.name}):
             if now - self._asked.get(name, _LONG_AGO) >= ASK_PERIOD:
                 self._asked[name] = now
-                self.bus.ask(f"hello/{name}")
-        if now - self._pinged >= PING_PERIOD[self._pings >= 2 * WINDOW]:
+                self.bus.query(f"hello/{name}")
+        if now - self._pinged >= PING_PERIOD[self._pings >= 2 * PING_WINDOW]:
             self._pinged, self._pings = now, self._pings + 1
-            self.bus.ask("clock", messages.encode_time(now))
+            self.bus.query("clock", messages.encode_time(now))
         return gone
 
-    def answers(self, now: float) -> tuple[list[Hello], list[Answer]]:
+    def process_replies(self, now: float) -> tuple[list[Hello], list[Reply]]:
         """Take greetings and the clock's answers; who joined, and the answers to other questions."""
         joined: list[Hello] = []
-        others: list[Answer] = []
-        for answer in self.bus.answers():
+        others: list[Reply] = []
+        for answer in self.bus.replies():
             key, payload, age = answer
-            self.counters.control.heard(payload)
+            self.counters.control.count_in(payload)
             family, _, name = key.partition("/")
             try:
                 if key == "clock":
                     asked, server = messages.decode_time(payload)
                     received = now - age
                     if asked <= received:
-                        self.clock = self.clock.heard(Ping(asked, server, received))
+                        self.clock = self.clock.with_ping(Ping(asked, server, received))
                 elif family != "hello":
                     others.append(answer)
                 elif name in self.bus.alive() and name not in self.known and name not in self._refused:
-                    joined += self._greet(name, payload)
+                    joined += self._admit(name, payload)
             except MessageError as error:
-                self.blame(name or "the clock", error)
+                self.count_malformed(name or "the clock", error)
         return joined, others
 
-    def _greet(self, name: str, payload: bytes) -> Iterator[Hello]:
+    def _admit(self, name: str, payload: bytes) -> Iterator[Hello]:
         """Let an actor in, unless it lives in another vineyard or speaks another protocol."""
         try:
             hello = messages.decode_hello(payload)
         except messages.WrongVersion as error:
-            self._refuse(name, f"speaks protocol version {error.theirs}, {self.me.name!r} version {messages.PROTOCOL}")
+            self._reject(
+                name, f"speaks protocol version {error.theirs}, {self.name.name!r} version {messages.PROTOCOL}"
+            )
             return
         if hello.name != name:
             raise MessageError(f"{name!r} introduces itself as {hello.name!r}")
-        if hello.digest != self.me.digest:
-            self._refuse(
+        if hello.digest != self.name.digest:
+            self._reject(
                 name,
                 f"has scene {hello.scene!r} with digest {hello.digest!r}, "
-                f"{self.me.name!r} has {self.me.scene!r} with {self.me.digest!r}",
+                f"{self.name.name!r} has {self.name.scene!r} with {self.name.digest!r}",
             )
             return
-        self.known[name] = Actor(hello, self._buffer)
-        self.met.add(name)
+        self.known[name] = RemotePose(hello, self._buffer)
+        self.seen_names.add(name)
         yield hello
 
-    def _refuse(self, name: str, why: str) -> None:
+    def _reject(self, name: str, why: str) -> None:
         """Whoever was here first is right: the newcomer stops, those who were here ignore it."""
         text = f"{name!r} {why}: start both with the same scene, seed and release of vinesim"
-        if name in self._elders:
-            raise Mismatch(text)
+        if name in self._initial_names:
+            raise WorldMismatch(text)
         log.warning("ignoring a newcomer: %s", text)
         self._refused.add(name)
-        self.met.discard(name)
+        self.seen_names.discard(name)
 
-    def refused(self, name: str) -> bool:
+    def is_rejected(self, name: str) -> bool:
         """Whether an actor was found to live in another world."""
         return name in self._refused
 
-    def blame(self, sender: str, error: MessageError) -> None:
+    def count_malformed(self, sender: str, error: MessageError) -> None:
         """Count a message that cannot be believed, and say so once for each sender."""
         self.counters.malformed += 1
         if sender not in self._blamed:
@@ -164,19 +166,19 @@ class Actors:
 
     # ------------------------------------------------------------ poses
 
-    def follow(self, position: np.ndarray) -> None:
+    def update_interest(self, position: np.ndarray) -> None:
         """Move the circle of actors heard at the full rate."""
         for name, actor in self.known.items():
             if actor.update is None:
                 continue
             away = float(np.hypot(*(actor.update.base_q[:2] - position[:2])))
-            if interest.full_rate(away, actor.near is not None):
-                actor.near = actor.near or self.bus.subscribe(f"a/{name}", NEWEST)
+            if interest.is_full_rate(away, actor.near is not None):
+                actor.near = actor.near or self.bus.subscribe(f"a/{name}", KEEP_LAST_1)
             elif actor.near is not None:
                 actor.near.close()
                 actor.near = None
 
-    def say(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
+    def publish_pose(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
         """My pose: 60 Hz to those who are near, 5 Hz to everybody; encoded once, and only if somebody listens."""
         payload = b""
         for publisher, period in ((self._pose, ACTOR_PERIOD), (self._far_pose, FAR_PERIOD)):
@@ -187,6 +189,6 @@ class Actors:
                 continue
             self._pose_due[publisher] = max(due, now - period) + period
             if publisher.matching:
-                payload = payload or encode_pose(dataclasses.replace(robot, actor=self.me.name, time=time))
+                payload = payload or encode_pose(dataclasses.replace(robot, actor=self.name.name, time=time))
                 if publisher.put(payload):
-                    self.counters.actor.said(payload)
+                    self.counters.actor.count_out(payload)

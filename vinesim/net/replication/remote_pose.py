@@ -8,14 +8,14 @@ import numpy as np
 
 from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.replication import dead_reckoning
-from vinesim.net.replication.jitter_buffer import Buffer
+from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.transport.bus import Subscription
 from vinesim.scene.values import POINT_NAMES, HumanUpdate, RobotUpdate
 
-ELSEWHERE = 1.0
+TELEPORT_DISTANCE = 1.0
 """Who is this far [m] from where he was taken to be has been put there: it is shown at once, not blended."""
 
-FAR_SHOWN = 0.1
+FAR_BLEND_TIME = 0.1
 """Of who is far away nothing is heard for 200 ms: what is shown of him is computed anew only so often [s]."""
 
 _BASE = np.arange(3, 7)[None]
@@ -23,13 +23,13 @@ _HIPS = slice(7 * POINT_NAMES.index("hips"), 7 * POINT_NAMES.index("hips") + 3)
 _TURNS = 7 * np.arange(len(POINT_NAMES))[:, None] + _BASE
 
 
-class Actor:
+class RemotePose:
     """Another actor and the last that is known of its pose."""
 
     def __init__(self, hello: Hello, buffer: float = 0.0) -> None:
         """``buffer`` [s]: its poses are shown so much later, see :class:`Buffer`; 0 extrapolates them to now."""
         self.hello = hello
-        self._buffer = Buffer(buffer)
+        self._buffer = JitterBuffer(buffer)
         self.joints = hello.joints
         self.update: RobotUpdate | HumanUpdate | None = None
         self.near: Subscription | None = None
@@ -41,12 +41,12 @@ class Actor:
         self._state = self._rate = self._off = np.zeros(0)
         self._seen: RobotUpdate | HumanUpdate | None = None
 
-    def hear(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
+    def receive(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
         """Take a newer pose at network ``time``; False if it is not newer."""
         if (self.hello.kind == "human") != isinstance(update, HumanUpdate):
             raise MessageError(f"pose of a {type(update).__name__} by {update.actor!r}, which is a {self.hello.kind}")
-        if update.time > time + dead_reckoning.FUTURE:
-            update = dataclasses.replace(update, time=time + dead_reckoning.FUTURE)
+        if update.time > time + dead_reckoning.MAX_CLOCK_SKEW:
+            update = dataclasses.replace(update, time=time + dead_reckoning.MAX_CLOCK_SKEW)
         if self.update is not None and update.time <= self.update.time:
             return False
         if isinstance(update, RobotUpdate):
@@ -64,21 +64,21 @@ class Actor:
             here = self._shown(time)
             turn = shown[self._turns]
             shown[self._turns] = np.copysign(1.0, (turn * here[self._turns]).sum(1, keepdims=True)) * turn
-            if float(np.linalg.norm((shown - here)[self._place])) < ELSEWHERE:
+            if float(np.linalg.norm((shown - here)[self._place])) < TELEPORT_DISTANCE:
                 self._off = shown - here
             self.moved_at = time
         return True
 
-    def at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
+    def sample(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
         """The pose at network ``time``, to be shown ``now``; of an actor that is not near, at most 100 ms old."""
-        if self._seen is None or self.near is not None or not 0.0 <= now - self._seen.time < FAR_SHOWN:
+        if self._seen is None or self.near is not None or not 0.0 <= now - self._seen.time < FAR_BLEND_TIME:
             self._seen = self._at(time, now)
         return self._seen
 
     def _at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
         heard, shown = self.update, self._shown(time)
         assert heard is not None
-        going = 1.0 if time - heard.time <= dead_reckoning.EXTRAPOLATION else 0.0
+        going = 1.0 if time - heard.time <= dead_reckoning.MAX_EXTRAPOLATION else 0.0
         turn = shown[self._turns]
         shown[self._turns] = turn / np.sqrt((turn * turn).sum(1, keepdims=True))
         if self._buffer.delay > 0.0 and isinstance(heard, RobotUpdate):
@@ -99,15 +99,15 @@ class Actor:
             side = np.copysign(1.0, (before[turns] * self._state[turns]).sum(1, keepdims=True))
             self._state[turns] *= side
             self._rate[turns] *= side
-        self._buffer = self._buffer.heard(time, self._state, self._rate)
+        self._buffer = self._buffer.insert(time, self._state, self._rate)
 
     def _shown(self, time: float) -> np.ndarray:
         assert self.update is not None
         if self._buffer.delay > 0.0:
-            return self._buffer.shown(time).copy()
-        shown = self._state + self._rate * dead_reckoning.horizon(time - self.update.time)
+            return self._buffer.sample(time).copy()
+        shown = self._state + self._rate * dead_reckoning.clamp_age(time - self.update.time)
         if len(self._off):
-            shown += self._off * dead_reckoning.remaining(time - self.moved_at)
+            shown += self._off * dead_reckoning.blend_weight(time - self.moved_at)
         return shown
 
 
@@ -115,9 +115,11 @@ def _numbers(update: RobotUpdate | HumanUpdate) -> tuple[np.ndarray, np.ndarray]
     """A pose as flat numbers, and their rates."""
     if isinstance(update, HumanUpdate):
         points = update.pose.points
-        rate = np.concatenate([update.velocity[:, :3], dead_reckoning.spin(points[:, 3:], update.velocity[:, 3:])], 1)
+        rate = np.concatenate(
+            [update.velocity[:, :3], dead_reckoning.quaternion_rate(points[:, 3:], update.velocity[:, 3:])], 1
+        )
         return points.ravel(), rate.ravel()
-    spin = dead_reckoning.spin(update.base_q[3:], update.base_qd[3:])
+    spin = dead_reckoning.quaternion_rate(update.base_q[3:], update.base_qd[3:])
     return (
         np.concatenate([update.base_q, update.position]),
         np.concatenate([update.base_qd[:3], spin, update.velocity]),

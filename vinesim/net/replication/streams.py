@@ -13,24 +13,24 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Things, Trees
+from vinesim.net.codec.messages import ObjectStates, TreeStates
 from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.interest import Cell
 from vinesim.scene.model import Model
-from vinesim.scene.values import ThingUpdate, TreeUpdate
+from vinesim.scene.values import ObjectUpdate, TreeUpdate
 
-Read = Callable[[int], tuple[np.ndarray, np.ndarray]]
+StateReader = Callable[[int], tuple[np.ndarray, np.ndarray]]
 """State and rate of one thing: joints of a tree ([n, 4], [n, 3] rad/s), pose and velocity of any other ([7], [6])."""
 
-Roots = tuple[np.ndarray, np.ndarray, np.ndarray]
+DetachedRoots = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Numbers [k] in their tree of bodies that were cut off it, where they are [k, 3] m, how fast [k, 3] m/s."""
 
-NO_ROOTS: Roots = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+NO_ROOTS: DetachedRoots = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Said:
+class ClaimColumns:
     """By whom and with what right the things of one message are moved, thing by thing."""
 
     claims: list[Claim]
@@ -50,20 +50,20 @@ class TreeStream:
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        self.middle = _middles(model)
-        self.cell = [tuple(cell) for cell in interest.cells(self.middle).tolist()]
+        self.middle = _tree_centres(model)
+        self.cell = [tuple(cell) for cell in interest.cells_of(self.middle).tolist()]
         body_count = len(model.body_mass)
         self._bodies = [model.bodies_of(tree) for tree in range(len(model.tree_first))]
-        self._reach = _reaches(model)
+        self._reach = _lever_arms(model)
         self._said_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (body_count, 1))
         self._said_rate = np.zeros((body_count, 4))
-        self._said_roots: dict[int, Roots] = {}
+        self._said_roots: dict[int, DetachedRoots] = {}
         self._active: tuple[int, ...] | None = None
         self._sizes = self._starts = self._order = np.zeros(0, np.int64)
         self._q = self._qd = np.zeros((0, 4))
-        self._roots: list[Roots] = []
+        self._roots: list[DetachedRoots] = []
 
-    def places(self, active: tuple[int, ...], read: Read) -> np.ndarray:
+    def positions(self, active: tuple[int, ...], read: StateReader) -> np.ndarray:
         """Where these trees are [k, 3] m."""
         return self.middle[list(active)]
 
@@ -71,8 +71,8 @@ class TreeStream:
         """Under which cells they are said [k]."""
         return [self.cell[tree] for tree in active]
 
-    def wrong(
-        self, active: tuple[int, ...], silence: np.ndarray, read: Read, cut: Callable[[int], Roots]
+    def prediction_error(
+        self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
     ) -> tuple[np.ndarray, np.ndarray]:
         """How far off everybody's copies are by now [k] m and [k] rad; ``silence`` [k] s since the last record."""
         if self._active != active:
@@ -84,10 +84,10 @@ class TreeStream:
         self._q = np.concatenate([joint_q for joint_q, _ in state]).astype(np.float64)
         self._qd = np.concatenate([joint_qd for _, joint_qd in state]).astype(np.float64)
         self._roots = [cut(tree) for tree in active]
-        bodies, horizon = self._order, dead_reckoning.horizon(silence)
+        bodies, horizon = self._order, dead_reckoning.clamp_age(silence)
         dt = np.repeat(horizon, self._sizes)[:, None]
         off = dead_reckoning.angle_between(
-            self._q, dead_reckoning.ahead(self._said_q[bodies], self._said_rate[bodies], dt)
+            self._q, dead_reckoning.extrapolate(self._said_q[bodies], self._said_rate[bodies], dt)
         )
         position = np.add.reduceat(off * self._reach[bodies], self._starts)
         for row, (tree, roots) in enumerate(zip(active, self._roots, strict=True)):
@@ -100,36 +100,36 @@ class TreeStream:
                     position[row] += np.linalg.norm(roots[1] - there, axis=1).max()
         return position, np.maximum.reduceat(off, self._starts)
 
-    def encode(self, rows: list[int], said: Said, time: float, cell: Cell) -> list[bytes]:
+    def encode(self, rows: list[int], said: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
         """Messages about some rows of the trees that were last judged; from now on this is what was said."""
         assert self._active is not None
         here = [self._active[row] for row in rows]
         part: slice | np.ndarray = slice(None)
         if len(rows) < len(self._active):
             part = np.concatenate([np.arange(self._starts[r], self._starts[r] + self._sizes[r]) for r in rows])
-        batch = Trees(time, np.array(here), *said.columns(), self._sizes[rows], self._q[part], self._qd[part])
+        batch = TreeStates(time, np.array(here), *said.columns(), self._sizes[rows], self._q[part], self._qd[part])
         payloads, heard = messages.encode_trees(with_roots(batch, [self._roots[row] for row in rows]))
         self._remember(self._order[part], heard, heard.updates(""))
         return payloads
 
-    def _remember(self, bodies: np.ndarray, heard: Trees, updates: Iterable[TreeUpdate]) -> None:
+    def _remember(self, bodies: np.ndarray, heard: TreeStates, updates: Iterable[TreeUpdate]) -> None:
         self._said_q[bodies] = heard.joint_q
-        self._said_rate[bodies] = dead_reckoning.spin(heard.joint_q, heard.joint_qd)
+        self._said_rate[bodies] = dead_reckoning.quaternion_rate(heard.joint_q, heard.joint_qd)
         if len(heard.root):
             for update in updates:
                 self._said_roots[update.tree] = update.root, update.root_x, update.root_xd
 
-    def extrapolated(self, news: dict[int, tuple[Trees, str]], now: float, time: float) -> list[TreeUpdate]:
+    def extrapolated(self, news: dict[int, tuple[TreeStates, str]], now: float, time: float) -> list[TreeUpdate]:
         """The last record of each tree, now; what was said is remembered for the next prediction."""
         found: dict[int, TreeUpdate] = {}
         for trees, sender in {id(batch[0]): batch for batch in news.values()}.values():
-            rate = dead_reckoning.spin(trees.joint_q, trees.joint_qd)
-            age = float(dead_reckoning.horizon(time - trees.time))
+            rate = dead_reckoning.quaternion_rate(trees.joint_q, trees.joint_qd)
+            age = float(dead_reckoning.clamp_age(time - trees.time))
             here = dataclasses.replace(trees, time=now)
             if age > 0.0 and not (trees.flags & messages.RESTING).any():
                 here = dataclasses.replace(
                     here,
-                    joint_q=dead_reckoning.ahead(trees.joint_q, rate, age),
+                    joint_q=dead_reckoning.extrapolate(trees.joint_q, rate, age),
                     root_x=trees.root_x + age * trees.root_xd,
                 )
             first = 0
@@ -144,12 +144,12 @@ class TreeStream:
         return [found[tree] for tree in sorted(found)]
 
 
-class ThingStream:
+class ObjectStream:
     """Boxes and loose bunches that move."""
 
     def __init__(self) -> None:
         self._said: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._heard: dict[int, ThingUpdate] = {}
+        self._heard: dict[int, ObjectUpdate] = {}
         self._cell: dict[int, Cell] = {}
         self._pose = self._velocity = np.zeros((0, 7))
         self._active: tuple[int, ...] = ()
@@ -158,17 +158,17 @@ class ThingStream:
         """Under which cell a thing was last said."""
         return self._cell.get(thing)
 
-    def place(self, thing: int) -> np.ndarray:
+    def position(self, thing: int) -> np.ndarray:
         """Where a thing was when it was last spoken of [3] m."""
         return self._said[thing][0][:3] if thing in self._said else np.zeros(3)
 
-    def places(self, active: tuple[int, ...], read: Read) -> np.ndarray:
+    def positions(self, active: tuple[int, ...], read: StateReader) -> np.ndarray:
         """Where these things are [k, 3] m."""
         self._active = active
         state = [read(thing) for thing in active]
         self._pose = np.array([pose for pose, _ in state], float)
         self._velocity = np.array([velocity for _, velocity in state], float)
-        for thing, cell in zip(active, interest.cells(self._pose).tolist(), strict=True):
+        for thing, cell in zip(active, interest.cells_of(self._pose).tolist(), strict=True):
             self._cell[thing] = tuple(cell)
         return self._pose[:, :3]
 
@@ -176,54 +176,54 @@ class ThingStream:
         """Under which cells they are said [k]."""
         return [self._cell[thing] for thing in active]
 
-    def wrong(
-        self, active: tuple[int, ...], silence: np.ndarray, read: Read, cut: Callable[[int], Roots]
+    def prediction_error(
+        self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
     ) -> tuple[np.ndarray, np.ndarray]:
         """How far off everybody's copies are by now [k] m and [k] rad; ``silence`` [k] s since the last record."""
         nothing = np.full(7, np.inf), np.zeros(6)
         said = [self._said.get(thing, nothing) for thing in active]
         pose, velocity = np.array([pose for pose, _ in said]), np.array([velocity for _, velocity in said])
         pose[:, 3:] = np.where(np.isfinite(pose[:, 3:]), pose[:, 3:], self._pose[:, 3:])
-        there = _moved(pose, velocity, dead_reckoning.horizon(silence)[:, None])
+        there = _extrapolate_pose(pose, velocity, dead_reckoning.clamp_age(silence)[:, None])
         return np.linalg.norm(self._pose[:, :3] - there[:, :3], axis=1), dead_reckoning.angle_between(
             self._pose[:, 3:], there[:, 3:]
         )
 
-    def encode(self, rows: list[int], said: Said, time: float, cell: Cell) -> list[bytes]:
+    def encode(self, rows: list[int], said: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
         """Messages about some rows of the things that were last judged; from now on this is what was said."""
         ids = np.array([self._active[row] for row in rows])
-        batch = Things(time, ids, *said.columns(), self._pose[rows], self._velocity[rows])
-        payloads, heard = messages.encode_things(batch, cell)
+        batch = ObjectStates(time, ids, *said.columns(), self._pose[rows], self._velocity[rows])
+        payloads, heard = messages.encode_objects(batch, cell)
         for thing, pose, velocity in zip(ids.tolist(), heard.pose, heard.velocity, strict=True):
             self._said[thing] = pose, velocity
         return payloads
 
-    def hear(self, update: ThingUpdate, cell: Cell) -> None:
+    def receive(self, update: ObjectUpdate, cell: Cell) -> None:
         """Take a record that is to be believed; its time is the network's."""
-        self._heard[update.thing] = update
-        self._said[update.thing] = update.pose, update.velocity
-        self._cell[update.thing] = cell
+        self._heard[update.object] = update
+        self._said[update.object] = update.pose, update.velocity
+        self._cell[update.object] = cell
 
-    def forget(self, thing: int) -> None:
+    def remove(self, thing: int) -> None:
         """It rests, or its owner is gone."""
         self._heard.pop(thing, None)
 
-    def extrapolated(self, theirs: set[int], now: float, time: float) -> list[ThingUpdate]:
+    def extrapolated(self, theirs: set[int], now: float, time: float) -> list[ObjectUpdate]:
         """Everything that others move, where it is now; after 150 ms without a word it stands still."""
         heard = [self._heard[thing] for thing in sorted(self._heard.keys() & theirs)]
         if not heard:
             return []
         age = time - np.array([update.time for update in heard])[:, None]
         velocity = np.array([update.velocity for update in heard])
-        poses = _moved(np.array([update.pose for update in heard]), velocity, dead_reckoning.horizon(age))
-        going = velocity * (age <= dead_reckoning.EXTRAPOLATION)
+        poses = _extrapolate_pose(np.array([update.pose for update in heard]), velocity, dead_reckoning.clamp_age(age))
+        going = velocity * (age <= dead_reckoning.MAX_EXTRAPOLATION)
         return [
             dataclasses.replace(update, time=now, pose=pose, velocity=rate)
             for update, pose, rate in zip(heard, poses, going, strict=True)
         ]
 
 
-def with_roots(trees: Trees, roots: list[Roots]) -> Trees:
+def with_roots(trees: TreeStates, roots: list[DetachedRoots]) -> TreeStates:
     """A batch of trees with what was cut off each."""
     if not any(len(numbers) for numbers, _, _ in roots):
         return trees
@@ -232,18 +232,20 @@ def with_roots(trees: Trees, roots: list[Roots]) -> Trees:
     return dataclasses.replace(trees, roots=counts, root=body, root_x=x, root_xd=xd)
 
 
-def counts(model: Model) -> tuple[int, ...]:
+def object_counts(model: Model) -> tuple[int, ...]:
     """How many things of each kind a vineyard has: trees, bunches, boxes."""
     return len(model.tree_first), len(model.bunch_body), len(model.box_mass)
 
 
-def _moved(pose: np.ndarray, velocity: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
+def _extrapolate_pose(pose: np.ndarray, velocity: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
     """Poses [..., 7] after ``dt`` s at velocities [..., 6]."""
-    turned = dead_reckoning.ahead(pose[..., 3:], dead_reckoning.spin(pose[..., 3:], velocity[..., 3:]), dt)
+    turned = dead_reckoning.extrapolate(
+        pose[..., 3:], dead_reckoning.quaternion_rate(pose[..., 3:], velocity[..., 3:]), dt
+    )
     return np.concatenate([pose[..., :3] + velocity[..., :3] * dt, turned], -1)
 
 
-def _middles(model: Model) -> np.ndarray:
+def _tree_centres(model: Model) -> np.ndarray:
     """Where each tree is [tree, 3] m: the mean of its settled bodies."""
     origins = model.forward_kinematics(model.joint_settled)[:, :3]
     middles = np.zeros((len(model.tree_first), 3))
@@ -251,7 +253,7 @@ def _middles(model: Model) -> np.ndarray:
     return middles / np.maximum(model.tree_size, 1)[:, None]
 
 
-def _reaches(model: Model) -> np.ndarray:
+def _lever_arms(model: Model) -> np.ndarray:
     """How far from each body's joint the wood it carries ends, along the longest way [body] m."""
     reach = model.body_length.astype(float).copy()
     for body in range(len(reach) - 1, -1, -1):

@@ -11,11 +11,11 @@ from typing import NamedTuple
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import PROTOCOL, Hello, MessageError, Welcome, WrongVersion
 
-PROVISIONAL = 5.0
+PROVISIONAL_TIMEOUT = 5.0
 """How long the place of an actor is held that was let in and has not been seen alive yet [s]."""
 
 
-class Plan(NamedTuple):
+class SceneId(NamedTuple):
     """A scene as far as a server knows it."""
 
     scene: str = ""
@@ -24,13 +24,13 @@ class Plan(NamedTuple):
     """``Model.digest()`` of its vineyard; empty: not known."""
 
 
-class Agreement:
+class AdmissionControl:
     """Decides about greetings. ``session`` is whatever tells two programs with one name apart."""
 
-    def __init__(self, plan: Plan | None = None, most: int | None = None) -> None:
+    def __init__(self, plan: SceneId | None = None, most: int | None = None) -> None:
         """Only ``plan`` is allowed, in every world; at most ``most`` actors over all worlds. None: no such bound."""
         self._plan, self._most = plan, most
-        self._plans: dict[str, Plan] = {}
+        self._plans: dict[str, SceneId] = {}
         self._kept: set[str] = set()
         self._alive: dict[tuple[str, str], set[str]] = {}
         self._admitted: dict[tuple[str, str], tuple[str, float]] = {}
@@ -44,22 +44,22 @@ class Agreement:
         """Who is alive now, as ``world/name``, sorted."""
         return sorted(f"{world}/{name}" for (world, name), sessions in self._alive.items() if sessions)
 
-    def plan(self, world: str) -> Plan:
+    def scene_of(self, world: str) -> SceneId:
         """The scene that a world has now."""
-        return self._plan or self._plans.get(world, Plan())
+        return self._plan or self._plans.get(world, SceneId())
 
-    def keep(self, world: str, plan: Plan) -> None:
+    def pin_scene(self, world: str, plan: SceneId) -> None:
         """Facts are kept of this world: its scene stays what it is, even when nobody is there."""
         self._plans[world] = plan
         self._kept.add(world)
 
-    def came(self, world: str, name: str, session: str) -> None:
+    def on_join(self, world: str, name: str, session: str) -> None:
         """A program with this name is alive."""
         sessions = self._alive.setdefault((world, name), set())
         self.joined += not sessions
         sessions.add(session)
 
-    def went(self, world: str, name: str, session: str) -> None:
+    def on_leave(self, world: str, name: str, session: str) -> None:
         """It is alive no more."""
         actor = (world, name)
         sessions = self._alive.get(actor, set())
@@ -73,7 +73,7 @@ class Agreement:
     def answer(self, world: str, name: str, session: str, greeting: bytes, now: float) -> Welcome:
         """Decide about a greeting that came under this name at ``now`` [s]; to ask twice is no harm."""
         for actor, (other, since) in list(self._admitted.items()):
-            if now - since > PROVISIONAL and other not in self._alive.get(actor, ()):
+            if now - since > PROVISIONAL_TIMEOUT and other not in self._alive.get(actor, ()):
                 del self._admitted[actor]
                 self._forget(actor[0])
         try:
@@ -89,9 +89,9 @@ class Agreement:
         else:
             if not why:
                 self._admitted[world, name] = (session, now)
-                self._plans.setdefault(world, Plan(hello.scene, hello.digest))
+                self._plans.setdefault(world, SceneId(hello.scene, hello.digest))
         self.refused += bool(why)
-        return Welcome(why, *self.plan(world))
+        return Welcome(why, *self.scene_of(world))
 
     def _objection(self, world: str, name: str, session: str, hello: Hello) -> str:
         if hello.name != name:
@@ -99,7 +99,7 @@ class Agreement:
         admitted = self._admitted.get((world, name), (session, 0.0))[0]
         if admitted != session or self._alive.get((world, name), {session}) - {session}:
             return f"an actor named {name!r} is already live in world {world!r}: choose another name or stop that one"
-        plan = self.plan(world)
+        plan = self.scene_of(world)
         if plan.digest and plan.digest != hello.digest:
             if self._plan is not None:
                 whose = "the server was started for"

@@ -19,10 +19,10 @@ from typing import BinaryIO, Self
 import msgspec
 
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Fact, MessageError
+from vinesim.net.codec.messages import MessageError, RetainedRecord
 from vinesim.net.replication.interest import Cell
-from vinesim.net.replication.retained import Facts
-from vinesim.net.server.admission import Plan
+from vinesim.net.replication.retained import RetainedState
+from vinesim.net.server.admission import SceneId
 from vinesim.net.transport.bus import BusError
 
 log = logging.getLogger(__name__)
@@ -31,18 +31,18 @@ MAGIC = b"vsfacts"
 VERSION = 1
 SUFFIX = ".facts"
 
-SLACK = 1000
+MAX_OBSOLETE_RECORDS = 1000
 """So many records, and three for each fact that holds, may be outdated before a journal is written anew."""
 
 _RECORD = struct.Struct("<II")  # length, CRC-32
 _CELL = struct.Struct("<ii")
 
 
-class NotKept(BusError):
+class JournalError(BusError):
     """What is on disk cannot be used, or nothing can be written there; the text says which file and what to do."""
 
 
-class _Head(msgspec.Struct, frozen=True):
+class _Header(msgspec.Struct, frozen=True):
     world: str
     scene: str
     digest: str
@@ -52,8 +52,8 @@ class _Head(msgspec.Struct, frozen=True):
 class Journal:
     """The facts of one world, in memory and on disk. A context manager; used by one thread."""
 
-    def __init__(self, path: pathlib.Path, world: str, plan: Plan, facts: Facts) -> None:
-        self.path, self.world, self.plan, self.facts = path, world, plan, facts
+    def __init__(self, path: pathlib.Path, world: str, plan: SceneId, facts: RetainedState) -> None:
+        self.path, self.world, self.scene_id, self.state = path, world, plan, facts
         self._file: BinaryIO | None = None
         self._records = 0
         self.rewrite()
@@ -67,19 +67,19 @@ class Journal:
         try:
             content = path.read_bytes()
         except OSError as error:
-            raise NotKept(
+            raise JournalError(
                 f"{path}: cannot be read ({error.strerror}): mend that, or give another --state-dir"
             ) from error
         start = MAGIC + bytes((VERSION,))
         if not content.startswith(MAGIC):
-            raise NotKept(f"{path}: is no journal of facts: move it away, or give another --state-dir")
+            raise JournalError(f"{path}: is no journal of facts: move it away, or give another --state-dir")
         if not content.startswith(start):
-            raise NotKept(
+            raise JournalError(
                 f"{path}: journal of version {content[len(MAGIC) : len(start)].hex() or 'none'}, this release reads "
                 f"{VERSION:02x}: use the release that wrote it, or give another --state-dir"
             )
-        head: _Head | None = None
-        facts = Facts()
+        head: _Header | None = None
+        facts = RetainedState()
         sound = len(start)
         why = "its head is torn"
         try:
@@ -87,18 +87,18 @@ class Journal:
                 if head is None:
                     head = _head_decoder.decode(record)
                     if head.protocol != messages.PROTOCOL:
-                        raise NotKept(
+                        raise JournalError(
                             f"{path}: facts of protocol version {head.protocol}, this release speaks "
                             f"{messages.PROTOCOL}: use the release that wrote them, or give another --state-dir"
                         )
                 else:
-                    for fact in messages.decode_facts(record[_CELL.size :]):
-                        facts.add(_CELL.unpack_from(record), fact)
+                    for fact in messages.decode_records(record[_CELL.size :]):
+                        facts.merge(_CELL.unpack_from(record), fact)
                 sound = end
         except (msgspec.DecodeError, MessageError, struct.error) as error:
             why = str(error)
         if head is None:
-            raise NotKept(
+            raise JournalError(
                 f"{path}: {why}, so nobody knows whose facts these are: move it away, or give another --state-dir"
             )
         if sound < len(content):
@@ -108,22 +108,22 @@ class Journal:
                 "%s: torn after %d of %d bytes; %d facts before that hold, the file as it was is kept as %s",
                 path, sound, len(content), len(facts), aside.name,
             )  # fmt: skip
-        return cls(path, head.world, Plan(head.scene, head.digest), facts)
+        return cls(path, head.world, SceneId(head.scene, head.digest), facts)
 
-    def append(self, cell: Cell, fact: Fact) -> None:
+    def append(self, cell: Cell, fact: RetainedRecord) -> None:
         """Write a fact down that :attr:`facts` has taken in. Safe against the end of this process at once."""
         assert self._file is not None
         try:
-            self._file.write(_packed(_CELL.pack(*cell) + messages.encode_facts([fact])))
+            self._file.write(_packed(_CELL.pack(*cell) + messages.encode_records([fact])))
             self._file.flush()
         except OSError as error:
             raise _cannot_write(self.path, error) from error
         self._records += 1
 
-    def settle(self) -> None:
+    def sync(self) -> None:
         """Make what was appended safe against the end of the machine; leave out what holds no more."""
         try:
-            if self._records > SLACK + 4 * len(self.facts):
+            if self._records > MAX_OBSOLETE_RECORDS + 4 * len(self.state):
                 self.rewrite()
             elif self._file is not None:
                 os.fsync(self._file.fileno())
@@ -132,9 +132,9 @@ class Journal:
 
     def rewrite(self) -> None:
         """Write all anew, beside the old file, then put it in its place."""
-        head = _encoder.encode(_Head(self.world, *self.plan))
+        head = _encoder.encode(_Header(self.world, *self.scene_id))
         parts = [MAGIC + bytes((VERSION,)), _packed(head)]
-        parts += [_packed(_CELL.pack(*cell) + messages.encode_facts([fact])) for cell, fact in self.facts]
+        parts += [_packed(_CELL.pack(*cell) + messages.encode_records([fact])) for cell, fact in self.state]
         try:
             _write(self.path, b"".join(parts))
             if self._file is not None:
@@ -142,13 +142,13 @@ class Journal:
             self._file = self.path.open("ab")
         except OSError as error:
             raise _cannot_write(self.path, error) from error
-        self._records = len(self.facts)
+        self._records = len(self.state)
 
     def close(self) -> None:
         """Settle and give the file up."""
         if self._file is not None:
             try:
-                self.settle()
+                self.sync()
             finally:
                 self._file.close()
                 self._file = None
@@ -172,7 +172,7 @@ def load_all(folder: pathlib.Path) -> dict[str, Journal]:
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         journal = Journal.load(path)
         if path.name != f"{journal.world}{SUFFIX}":
-            raise NotKept(
+            raise JournalError(
                 f"{path}: holds world {journal.world!r}: rename it to {journal.world}{SUFFIX} or move it away"
             )
         journals[journal.world] = journal
@@ -216,9 +216,9 @@ def _free_name(path: pathlib.Path) -> pathlib.Path:
     return aside
 
 
-def _cannot_write(path: pathlib.Path, error: OSError) -> NotKept:
-    return NotKept(f"{path}: cannot be written ({error.strerror}): make room or give another --state-dir")
+def _cannot_write(path: pathlib.Path, error: OSError) -> JournalError:
+    return JournalError(f"{path}: cannot be written ({error.strerror}): make room or give another --state-dir")
 
 
 _encoder = msgspec.msgpack.Encoder()
-_head_decoder = msgspec.msgpack.Decoder(_Head)
+_head_decoder = msgspec.msgpack.Decoder(_Header)

@@ -18,10 +18,10 @@ import zenoh
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.replication.interest import Cell
-from vinesim.net.server.admission import Agreement, Plan
-from vinesim.net.server.retained_store import Archive, Quota
+from vinesim.net.server.admission import AdmissionControl, SceneId
+from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.net.transport import endpoints
-from vinesim.net.transport.access_control import SERVER, control, secured
+from vinesim.net.transport.access_control import SERVER, acl_config, tls_config
 from vinesim.net.transport.bus import BusError, WrongUse
 from vinesim.net.transport.zenoh_bus import ROOT, WORLD, close_session, config, open_session
 
@@ -54,7 +54,7 @@ class Server:
         *,
         connect: Sequence[str] = (),
         keep: pathlib.Path | None = None,
-        plan: Plan | None = None,
+        plan: SceneId | None = None,
         most: int | None = None,
         quota: Quota = Quota(),
         certificates: pathlib.Path | None = None,
@@ -82,19 +82,19 @@ class Server:
         if certificates is not None:
             from vinesim.net.transport.certificates import roles
 
-            settings = secured(certificates, SERVER) | control(f"{ROOT}/{world}", roles(certificates))
+            settings = tls_config(certificates, SERVER) | acl_config(f"{ROOT}/{world}", roles(certificates))
         try:
-            self.endpoints = endpoints.chosen(listen, secured=safe)
+            self.endpoints = endpoints.resolve_ports(listen, secured=safe)
         except OSError as error:
             raise PortTaken(listen[0], str(error.strerror)) from error
         self.pings = 0
         """How many times the clock was asked."""
         self._unreadable = 0
-        self._agreement = Agreement(plan, most)
+        self._admission = AdmissionControl(plan, most)
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._blamed: set[str] = set()
-        self.archive = None if linked else Archive(keep, quota)
+        self.store = None if linked else RetainedStore(keep, quota)
         """What is kept; None where another server keeps."""
         try:
             self._session = open_session(
@@ -111,22 +111,24 @@ class Server:
                 )
             )
         except zenoh.ZError as error:
-            if self.archive is not None:
-                self.archive.close()
+            if self.store is not None:
+                self.store.close()
             reason = "address already in use" if "in use" in str(error) else str(error).split(" at /")[0]
             raise PortTaken(", ".join(map(str, self.endpoints)), reason) from error
         session = self._session
         # under access control a declaration that reaches beyond the one world would be told to nobody
         where = f"{ROOT}/{'*' if certificates is None else world}"
         self._declared: list[object] = [
-            session.liveliness().declare_subscriber(f"{where}/live/*/*", self._notice, history=True)
+            session.liveliness().declare_subscriber(f"{where}/live/*/*", self._on_liveliness, history=True)
         ]
-        if self.archive is not None:
+        if self.store is not None:
             self._declared += [
-                session.declare_queryable(f"{where}/join/*/*", self._join),  # first: who is back joins, then tells
-                session.declare_queryable(f"{where}/clock", self._clock),
-                session.declare_queryable(f"{where}/snap/*/*", self._snapshot),
-                session.declare_subscriber(f"{where}/fact/**", self._fact),
+                session.declare_queryable(
+                    f"{where}/join/*/*", self._on_join_query
+                ),  # first: who is back joins, then tells
+                session.declare_queryable(f"{where}/clock", self._on_clock_query),
+                session.declare_queryable(f"{where}/snap/*/*", self._on_snapshot_query),
+                session.declare_subscriber(f"{where}/fact/**", self._on_record),
             ]
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
 
@@ -139,17 +141,17 @@ class Server:
     def actors(self) -> list[str]:
         """Who is there now, as ``world/name``, sorted."""
         with self._lock:
-            return self._agreement.actors
+            return self._admission.actors
 
     @property
     def joined(self) -> int:
         """How many actors ever came."""
-        return self._agreement.joined
+        return self._admission.joined
 
     @property
     def malformed(self) -> int:
         """How many messages and questions could not be understood."""
-        return self._unreadable + (self.archive.counters.malformed if self.archive is not None else 0)
+        return self._unreadable + (self.store.counters.malformed if self.store is not None else 0)
 
     def figures(self) -> dict[str, Any]:
         """What a status line says: who is there, and what was counted since the start."""
@@ -158,19 +160,19 @@ class Server:
             "actors": self.actors,
             "links": len(self._session.info.links()),
             "joined": self.joined,
-            "refused": self._agreement.refused,
+            "refused": self._admission.refused,
             "pings": self.pings,
             "malformed": self.malformed,
         }
-        if self.archive is not None:
-            counters = self.archive.counters
+        if self.store is not None:
+            counters = self.store.counters
             figures |= {
-                "facts": self.archive.count(),
-                "facts_heard": counters.heard,
+                "facts": self.store.count(),
+                "facts_heard": counters.received,
                 "facts_over_quota": counters.over_quota,
-                "facts_strange": counters.strange,
+                "facts_strange": counters.rejected,
                 "snapshots": counters.snapshots,
-                "trouble": self.archive.trouble,
+                "trouble": self.store.status_message,
             }
         return figures
 
@@ -186,8 +188,8 @@ class Server:
         """Stop carrying messages and write down what is kept; the second time nothing happens."""
         self.stop()
         close_session(self._session)
-        if self.archive is not None:
-            self.archive.close()
+        if self.store is not None:
+            self.store.close()
 
     def __enter__(self) -> Self:
         return self
@@ -197,48 +199,48 @@ class Server:
 
     # ------------------------------------------------------------ called by Zenoh's threads
 
-    def _notice(self, sample: zenoh.Sample) -> None:
+    def _on_liveliness(self, sample: zenoh.Sample) -> None:
         world, _, name, session = str(sample.key_expr).split("/")[-4:]
         there = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
-            (self._agreement.came if there else self._agreement.went)(world, name, session)
+            (self._admission.on_join if there else self._admission.on_leave)(world, name, session)
         log.info("%s/%s %s", world, name, "came" if there else "left")
 
-    def _fact(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT and self.archive is not None:
-            payload = sample.payload.to_bytes() if len(sample.payload) <= messages.LARGEST else b""
-            self.archive.hear(_inside(sample.key_expr), payload)
+    def _on_record(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT and self.store is not None:
+            payload = sample.payload.to_bytes() if len(sample.payload) <= messages.MAX_MESSAGE else b""
+            self.store.submit(_strip_root(sample.key_expr), payload)
 
-    def _clock(self, query: zenoh.Query) -> None:
+    def _on_clock_query(self, query: zenoh.Query) -> None:
         with query:
             try:
-                asked, _ = messages.decode_time(_asked(query))
+                asked, _ = messages.decode_time(_query_payload(query))
             except MessageError as error:
-                self._blame(f"{_inside(query.key_expr)}", error)
+                self._count_malformed(f"{_strip_root(query.key_expr)}", error)
                 return
             self.pings += 1
             query.reply(str(query.key_expr), messages.encode_time(asked, time.time()))
 
-    def _join(self, query: zenoh.Query) -> None:
+    def _on_join_query(self, query: zenoh.Query) -> None:
         with query:
-            key = _inside(query.key_expr)
+            key = _strip_root(query.key_expr)
             world, _, name, session = key.split("/")
-            if "*" in key or self.archive is None:
+            if "*" in key or self.store is None:
                 return
             with self._lock:
-                if (kept := self.archive.plan(world)) is not None:
-                    self._agreement.keep(world, kept)
-                welcome = self._agreement.answer(world, name, session, _asked(query), time.monotonic())
+                if (kept := self.store.scene_of(world)) is not None:
+                    self._admission.pin_scene(world, kept)
+                welcome = self._admission.answer(world, name, session, _query_payload(query), time.monotonic())
                 if not welcome.refused:
-                    self.archive.open(world, self._agreement.plan(world))
+                    self.store.open(world, self._admission.scene_of(world))
             if welcome.refused:
                 log.warning("refused %s/%s: %s", world, name, welcome.refused)
             query.reply(str(query.key_expr), messages.encode_welcome(welcome))
 
-    def _snapshot(self, query: zenoh.Query) -> None:
+    def _on_snapshot_query(self, query: zenoh.Query) -> None:
         with query:
-            world, _, x, y = _inside(query.key_expr).split("/")
-            if world == "*" or self.archive is None:
+            world, _, x, y = _strip_root(query.key_expr).split("/")
+            if world == "*" or self.store is None:
                 return
             cells: list[Cell]
             try:
@@ -246,18 +248,18 @@ class Server:
                     wanted = query.key_expr
                     cells = [
                         cell
-                        for cell in self.archive.cells(world)
+                        for cell in self.store.cells(world)
                         if wanted.intersects(zenoh.KeyExpr(f"{ROOT}/{world}/snap/{cell[0]}/{cell[1]}"))
                     ]
                 else:
                     cells = [(int(x), int(y))]
             except ValueError:
-                self._blame(_inside(query.key_expr), MessageError("the question names no cell"))
+                self._count_malformed(_strip_root(query.key_expr), MessageError("the question names no cell"))
                 return
-            for cell, payload in self.archive.snapshot(world, cells):
+            for cell, payload in self.store.snapshot(world, cells):
                 query.reply(f"{ROOT}/{world}/snap/{cell[0]}/{cell[1]}", payload)
 
-    def _blame(self, key: str, error: MessageError) -> None:
+    def _count_malformed(self, key: str, error: MessageError) -> None:
         """Count what cannot be believed, and say so once for each key."""
         self._unreadable += 1
         if key not in self._blamed and len(self._blamed) < 1000:
@@ -265,11 +267,11 @@ class Server:
             log.warning("a question to %s cannot be answered (said once): %s", key, error)
 
 
-def _inside(key: zenoh.KeyExpr) -> str:
+def _strip_root(key: zenoh.KeyExpr) -> str:
     """A key without the root: it starts with its world."""
     return str(key)[len(ROOT) + 1 :]
 
 
-def _asked(query: zenoh.Query) -> bytes:
+def _query_payload(query: zenoh.Query) -> bytes:
     payload = query.payload
-    return payload.to_bytes() if payload is not None and len(payload) <= messages.LARGEST else b""
+    return payload.to_bytes() if payload is not None and len(payload) <= messages.MAX_MESSAGE else b""

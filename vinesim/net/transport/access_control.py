@@ -18,7 +18,7 @@ from vinesim.net.transport.bus import BusError
 SERVER = "server"
 """Common name of all servers: they carry for everybody, so nothing is denied between them."""
 
-AUTHORITY = "ca"
+CA_NAME = "ca"
 """Common name of whoever signs, and the file of its certificate."""
 
 
@@ -31,7 +31,7 @@ class Role(enum.StrEnum):
     SERVER = "server"
 
 
-class NoCertificate(BusError):
+class CertificateError(BusError):
     """A certificate or key is missing or unusable; the text says which."""
 
 
@@ -44,12 +44,12 @@ _EVERYTHING = [
 ]  # fmt: skip
 
 
-def secured(folder: pathlib.Path, name: str) -> dict[str, Any]:
+def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
     """Settings of a session that shows the certificate of ``name`` and believes only what ``folder/ca.pem`` signed."""
-    authority, certificate, key = (folder / file for file in (f"{AUTHORITY}.pem", f"{name}.pem", f"{name}.key"))
+    authority, certificate, key = (folder / file for file in (f"{CA_NAME}.pem", f"{name}.pem", f"{name}.key"))
     for file in (authority, certificate, key):
         if not file.is_file():
-            raise NoCertificate(
+            raise CertificateError(
                 f"no {file}: make it with 'vinesim certs new {name} --dir {folder}' where the authority's key is, "
                 f"and copy {authority.name}, {certificate.name} and {key.name} here"
             )
@@ -66,7 +66,7 @@ def secured(folder: pathlib.Path, name: str) -> dict[str, Any]:
     }
 
 
-def control(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
+def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
     """Access control of a router for one world under ``root`` (like ``vs/1/vineyard``); all others do not exist."""
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []

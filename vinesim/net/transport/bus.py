@@ -14,13 +14,13 @@ import random
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, Self
 
-NEWEST = 1
+KEEP_LAST_1 = 1
 """Depth of a subscription that wants the newest sample of each key: poses."""
 
-RECENT = 64
+KEEP_LAST_64 = 64
 """... the last few of each key, in order: records that complete each other."""
 
-EVERY = 10_000
+KEEP_ALL = 10_000
 """... all of them, in order: events (the bound only stops a flood)."""
 
 
@@ -43,11 +43,11 @@ class NameTaken(BusError):
         )
 
 
-class Refused(BusError):
+class JoinRejected(BusError):
     """The server does not let this actor in; the text is the server's."""
 
 
-class Answer(NamedTuple):
+class Reply(NamedTuple):
     """Reply to :meth:`Bus.ask`."""
 
     key: str
@@ -85,11 +85,11 @@ class Bus(Protocol):
     """Payload bytes that arrived."""
     bytes_out: int
     """Payload bytes that left: with no listener none leave."""
-    lost: int
+    dropped: int
     """Samples thrown away here because a store was full or a sample was too large."""
 
     @property
-    def trouble(self) -> str:
+    def status_message(self) -> str:
         """Empty, or in words why nobody can be reached now."""
 
     def join(self, greeting: bytes) -> None:
@@ -101,22 +101,22 @@ class Bus(Protocol):
     def publisher(self, key: str, reliable: bool = False) -> Publisher:
         """For one exact key. Reliable: nothing is lost or reordered while the connection lives."""
 
-    def subscribe(self, pattern: str, depth: int = NEWEST) -> Subscription:
+    def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> Subscription:
         """Hear what others send: the last ``depth`` samples of each key until they are drained.
 
         What is sent reliably is heard with ``EVERY``: it travels apart from poses.
         """
 
-    def drain(self) -> list[tuple[str, bytes]]:
+    def poll(self) -> list[tuple[str, bytes]]:
         """All (key, payload) that arrived since, in order of arrival."""
 
-    def ask(self, key: str, payload: bytes = b"") -> None:
+    def query(self, key: str, payload: bytes = b"") -> None:
         """Put a question to whoever serves ``key``; answers appear in :meth:`answers`, or never."""
 
-    def answers(self) -> list[Answer]:
+    def replies(self) -> list[Reply]:
         """Replies that arrived since."""
 
-    def serve(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         """Answer questions under ``key`` until closed; ``respond`` is called by any thread and must be quick."""
 
     def alive(self) -> frozenset[str]:
@@ -140,7 +140,7 @@ def _covers(pattern: tuple[str, ...], key: tuple[str, ...]) -> bool:
     return bool(key) and pattern[0] in ("*", key[0]) and _covers(pattern[1:], key[1:])
 
 
-class Store:
+class SampleStore:
     """Where arrivals wait for the tick. Appending is safe from another thread; only one thread takes."""
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ class Store:
     def put(self, depth: int, key: str, payload: bytes) -> None:
         """Keep a sample that arrived under a subscription of this depth."""
         self._samples.append((depth, key, payload))
-        if len(self._samples) > EVERY:
+        if len(self._samples) > KEEP_ALL:
             self._samples.popleft()
             self.overflowed += 1
 
@@ -327,27 +327,27 @@ class MemoryBus:
         self.bytes_in = self.bytes_out = 0
         self.served: dict[str, Callable[[bytes], bytes]] = {}
         self.replied: list[tuple[str, bytes, float]] = []
-        self._store = Store()
+        self._store = SampleStore()
         self._subscriptions: list[MemorySubscription] = []
 
     @property
-    def lost(self) -> int:
+    def dropped(self) -> int:
         return self._store.overflowed
 
     @property
-    def trouble(self) -> str:
+    def status_message(self) -> str:
         return "the hub is down" if self.hub.down else ""
 
     def join(self, greeting: bytes) -> None:
         if why := self.hub.refuses(greeting):
-            raise Refused(why)
+            raise JoinRejected(why)
 
     def publisher(self, key: str, reliable: bool = False) -> MemoryPublisher:
         if "*" in key:
             raise ValueError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
         return MemoryPublisher(self, key, reliable)
 
-    def subscribe(self, pattern: str, depth: int = NEWEST) -> MemorySubscription:
+    def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> MemorySubscription:
         subscription = MemorySubscription(self, pattern, depth)
         self._subscriptions.append(subscription)
         return subscription
@@ -365,18 +365,18 @@ class MemoryBus:
             self.bytes_in += len(payload)
             self._store.put(max(depths), key, payload)
 
-    def drain(self) -> list[tuple[str, bytes]]:
+    def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
 
-    def ask(self, key: str, payload: bytes = b"") -> None:
+    def query(self, key: str, payload: bytes = b"") -> None:
         if not self.hub.down:
             self.hub.question(self, key, payload)
 
-    def answers(self) -> list[Answer]:
+    def replies(self) -> list[Reply]:
         replied, self.replied = self.replied, []
-        return [Answer(key, payload, self.hub.time - at) for key, payload, at in replied]
+        return [Reply(key, payload, self.hub.time - at) for key, payload, at in replied]
 
-    def serve(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         self.served[key] = respond
 
     def alive(self) -> frozenset[str]:

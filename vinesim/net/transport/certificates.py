@@ -14,8 +14,8 @@ import pathlib
 import socket
 from collections.abc import Sequence
 
-from vinesim.net.codec.messages import valid_name
-from vinesim.net.transport.access_control import AUTHORITY, SERVER, NoCertificate, Role
+from vinesim.net.codec.messages import is_valid_name
+from vinesim.net.transport.access_control import CA_NAME, SERVER, CertificateError, Role
 from vinesim.net.transport.bus import WrongUse
 
 try:
@@ -29,12 +29,12 @@ except ImportError as error:
 else:
     _missing = None
 
-YEARS_OF_AUTHORITY = 10
-DAYS = 825
+AUTHORITY_YEARS = 10
+CERTIFICATE_DAYS = 825
 """How long an actor's or server's certificate is valid."""
 
 
-class NotInstalled(RuntimeError):
+class CryptographyMissing(RuntimeError):
     """The library that makes certificates is not there."""
 
     exit_code = 3
@@ -43,8 +43,8 @@ class NotInstalled(RuntimeError):
         super().__init__("certificates need the library cryptography: pip install 'vinesim[tls]'")
 
 
-def new(
-    folder: pathlib.Path, name: str, role: Role = Role.ROBOT, hosts: Sequence[str] = (), days: int = DAYS
+def create(
+    folder: pathlib.Path, name: str, role: Role = Role.ROBOT, hosts: Sequence[str] = (), days: int = CERTIFICATE_DAYS
 ) -> list[pathlib.Path]:
     """Make the certificate of an actor, and at first use the authority and the server; what was written.
 
@@ -52,33 +52,33 @@ def new(
     own; its certificate is replaced. An actor that has one is refused with :class:`NoCertificate`.
     """
     if _missing is not None:
-        raise NotInstalled from _missing
-    if not valid_name(name) or name == AUTHORITY:
-        raise WrongUse(f"actor name {name!r}: use 1 to 48 letters, digits, '_', '-' or '.', and not {AUTHORITY!r}")
+        raise CryptographyMissing from _missing
+    if not is_valid_name(name) or name == CA_NAME:
+        raise WrongUse(f"actor name {name!r}: use 1 to 48 letters, digits, '_', '-' or '.', and not {CA_NAME!r}")
     if (name == SERVER) != (role == Role.SERVER):
         raise WrongUse(f"{name!r} as {role}: only the server is called {SERVER!r}")
     if hosts and role != Role.SERVER:
         raise WrongUse(f"hosts {', '.join(hosts)} for {name!r}: only the server's certificate names hosts")
     if name != SERVER and (folder / f"{name}.pem").exists():
-        raise NoCertificate(f"{folder / name}.pem is there already: remove it and its key first, if that is meant")
+        raise CertificateError(f"{folder / name}.pem is there already: remove it and its key first, if that is meant")
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        written = [] if (folder / f"{AUTHORITY}.key").exists() else _new_authority(folder)
+        written = [] if (folder / f"{CA_NAME}.key").exists() else _create_authority(folder)
         if name != SERVER and not (folder / f"{SERVER}.pem").exists():
             written += _signed(folder, SERVER, Role.SERVER, (), days)
         return written + _signed(folder, name, role, hosts, days)
     except OSError as error:
-        raise NoCertificate(f"{error.filename}: {error.strerror}: the certificate cannot be made there") from error
+        raise CertificateError(f"{error.filename}: {error.strerror}: the certificate cannot be made there") from error
 
 
 def roles(folder: pathlib.Path) -> dict[str, Role]:
     """Who has a certificate of this folder's authority, and what for; others in the folder are refused in words."""
     if _missing is not None:
-        raise NotInstalled from _missing
-    authority = _read(folder / f"{AUTHORITY}.pem")
+        raise CryptographyMissing from _missing
+    authority = _read(folder / f"{CA_NAME}.pem")
     found: dict[str, Role] = {}
     for file in sorted(folder.glob("*.pem")):
-        if file.stem == AUTHORITY:
+        if file.stem == CA_NAME:
             continue
         certificate = _read(file)
         try:
@@ -87,17 +87,17 @@ def roles(folder: pathlib.Path) -> dict[str, Role]:
                 _text(certificate, NameOID.ORGANIZATIONAL_UNIT_NAME)
             )  # fmt: skip
         except (InvalidSignature, ValueError, TypeError) as error:
-            raise NoCertificate(
-                f"{file}: not signed by {AUTHORITY}.pem beside it, or without a role: remove it, or make it anew with "
+            raise CertificateError(
+                f"{file}: not signed by {CA_NAME}.pem beside it, or without a role: remove it, or make it anew with "
                 f"'vinesim certs new {file.stem} --dir {folder}'"
             ) from error
         if name != file.stem:
-            raise NoCertificate(f"{file}: is the certificate of {name!r}: rename it to {name}.pem")
+            raise CertificateError(f"{file}: is the certificate of {name!r}: rename it to {name}.pem")
         if role == Role.SERVER:
             now = datetime.datetime.now(datetime.UTC)
             first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
             if not first <= now <= last:
-                raise NoCertificate(
+                raise CertificateError(
                     f"{file}: not valid now, but from {first:%Y-%m-%d} to {last:%Y-%m-%d}: make it anew with "
                     f"'vinesim certs new {name} --dir {folder} --host HOST'"
                 )
@@ -105,7 +105,7 @@ def roles(folder: pathlib.Path) -> dict[str, Role]:
     return found
 
 
-def _new_authority(folder: pathlib.Path) -> list[pathlib.Path]:
+def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "vinesim authority")])
     usage = x509.KeyUsage(
@@ -113,22 +113,24 @@ def _new_authority(folder: pathlib.Path) -> list[pathlib.Path]:
         data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
     )  # fmt: skip
     certificate = (
-        _builder(name, name, key.public_key(), 365 * YEARS_OF_AUTHORITY)
+        _builder(name, name, key.public_key(), 365 * AUTHORITY_YEARS)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .sign(key, hashes.SHA256())
     )
-    return _save(folder, AUTHORITY, key, certificate)
+    return _save(folder, CA_NAME, key, certificate)
 
 
 def _signed(folder: pathlib.Path, name: str, role: Role, hosts: Sequence[str], days: int) -> list[pathlib.Path]:
     """A key and the certificate for it, signed by the folder's authority."""
-    authority = _read(folder / f"{AUTHORITY}.pem")
+    authority = _read(folder / f"{CA_NAME}.pem")
     try:
-        signer = serialization.load_pem_private_key((folder / f"{AUTHORITY}.key").read_bytes(), None)
+        signer = serialization.load_pem_private_key((folder / f"{CA_NAME}.key").read_bytes(), None)
     except ValueError as error:
-        raise NoCertificate(f"{folder / AUTHORITY}.key is no private key: restore it, or begin a new folder") from error
+        raise CertificateError(
+            f"{folder / CA_NAME}.key is no private key: restore it, or begin a new folder"
+        ) from error
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name(
@@ -202,11 +204,13 @@ def _read(file: pathlib.Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(file.read_bytes())
     except FileNotFoundError as error:
-        raise NoCertificate(
+        raise CertificateError(
             f"no {file}: make certificates with 'vinesim certs new server --dir {file.parent} --host HOST'"
         ) from error
     except (OSError, ValueError) as error:
-        raise NoCertificate(f"{file}: cannot be read as a certificate ({error}): remove it or make it anew") from error
+        raise CertificateError(
+            f"{file}: cannot be read as a certificate ({error}): remove it or make it anew"
+        ) from error
 
 
 def _text(certificate: x509.Certificate, what: x509.ObjectIdentifier) -> str:

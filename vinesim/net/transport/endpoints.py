@@ -16,7 +16,7 @@ from vinesim.net.transport.bus import WrongUse
 PORT = 7447
 """Zenoh's."""
 
-_BESIDE = {"tcp": "udp", "udp": "tcp", "tls": "quic", "quic": "tls"}
+_COUNTERPART = {"tcp": "udp", "udp": "tcp", "tls": "quic", "quic": "tls"}
 _MIXED = {"udp": "?rel=1;mixed_rel=auto", "quic": "?mixed_rel=auto"}
 """One session over two links: a reliable one, and datagrams. Without ``rel=1`` udp would silently be lossy only."""
 
@@ -55,9 +55,9 @@ class Endpoint(NamedTuple):
             return self.host == "localhost"
 
     @property
-    def beside(self) -> Endpoint:
+    def counterpart(self) -> Endpoint:
         """The other way to the same server: datagrams beside a stream and the reverse."""
-        return self._replace(protocol=_BESIDE[self.protocol])
+        return self._replace(protocol=_COUNTERPART[self.protocol])
 
 
 def parse(text: str, *, secured: bool = False) -> Endpoint:
@@ -66,7 +66,7 @@ def parse(text: str, *, secured: bool = False) -> Endpoint:
     protocol, _, address = text.partition("/")
     host, colon, port = address.rpartition(":")
     example = f"expected {allowed[0]}/HOST:PORT or {allowed[1]}/HOST:PORT, e.g. {allowed[0]}/192.168.1.5:{PORT}"
-    if protocol in _BESIDE and protocol not in allowed:
+    if protocol in _COUNTERPART and protocol not in allowed:
         remedy = "use tls/ or quic/ where certificates are given" if secured else "give the certificates with --tls DIR"
         raise WrongUse(f"endpoint {text!r}: {remedy}; {example}")
     if protocol not in allowed or not colon or not host or any(c in host for c in "?#;/ "):
@@ -76,12 +76,12 @@ def parse(text: str, *, secured: bool = False) -> Endpoint:
     return Endpoint(protocol, host, int(port))
 
 
-def everywhere(*, secured: bool = False) -> tuple[str, ...]:
+def default_listen(*, secured: bool = False) -> tuple[str, ...]:
     """Where a server listens unless told otherwise: all interfaces, both ways."""
     return tuple(f"{protocol}/0.0.0.0:{PORT}" for protocol in (("tls", "quic") if secured else ("tcp", "udp")))
 
 
-class Ways(NamedTuple):
+class Links(NamedTuple):
     """How one client reaches its server."""
 
     bulk: Endpoint
@@ -90,15 +90,15 @@ class Ways(NamedTuple):
     """Datagrams: poses and motion. None: they take the stream as well."""
 
 
-def ways(connect: str, *, secured: bool = False) -> Ways:
+def client_links(connect: str, *, secured: bool = False) -> Links:
     """To a server elsewhere both, on this machine a stream alone: cheapest; ``udp/`` or ``quic/`` asks for both."""
     endpoint = parse(connect, secured=secured)
     if endpoint.datagrams:
-        return Ways(endpoint.beside, endpoint)
-    return Ways(endpoint, None if endpoint.loopback else endpoint.beside)
+        return Links(endpoint.counterpart, endpoint)
+    return Links(endpoint, None if endpoint.loopback else endpoint.counterpart)
 
 
-def chosen(listen: Sequence[str], *, secured: bool = False) -> tuple[Endpoint, ...]:
+def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endpoint, ...]:
     """Endpoints to listen at, port 0 replaced by one number that is free for streams and datagrams alike."""
     wanted = [parse(text, secured=secured) for text in listen]
     if not wanted:
@@ -107,13 +107,13 @@ def chosen(listen: Sequence[str], *, secured: bool = False) -> tuple[Endpoint, .
     found = []
     for endpoint in wanted:
         if endpoint.port == 0:
-            free = free or _free(endpoint.host)
+            free = free or _free_port(endpoint.host)
             endpoint = endpoint._replace(port=free)
         found.append(endpoint)
     return tuple(found)
 
 
-def _free(host: str) -> int:
+def _free_port(host: str) -> int:
     family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
     while True:
         with socket.socket(family, socket.SOCK_STREAM) as stream, socket.socket(family, socket.SOCK_DGRAM) as datagram:

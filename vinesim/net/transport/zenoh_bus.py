@@ -25,9 +25,18 @@ from typing import Any, Self
 import zenoh
 
 from vinesim.net.codec import messages
-from vinesim.net.transport.access_control import secured
-from vinesim.net.transport.bus import EVERY, NEWEST, Answer, BusError, NameTaken, Refused, Store, WrongUse
-from vinesim.net.transport.endpoints import Endpoint, ways
+from vinesim.net.transport.access_control import tls_config
+from vinesim.net.transport.bus import (
+    KEEP_ALL,
+    KEEP_LAST_1,
+    BusError,
+    JoinRejected,
+    NameTaken,
+    Reply,
+    SampleStore,
+    WrongUse,
+)
+from vinesim.net.transport.endpoints import Endpoint, client_links
 
 log = logging.getLogger(__name__)
 
@@ -43,20 +52,20 @@ CONNECT = "tcp/127.0.0.1:7447"
 LEASE = 2000
 """A peer that is silent for this long is gone [ms]."""
 
-HUGE = 4 * messages.LARGEST
+MAX_RECEIVE = 4 * messages.MAX_MESSAGE
 """What is larger [B] is not even put together from its fragments, here or in the router."""
 
-PATIENCE = 2.0
+CONNECT_TIMEOUT = 2.0
 """How long connecting may take [s]."""
 
 
-WATCH = 0.5
+WATCH_PERIOD = 0.5
 """Between two looks at whether datagrams pass [s]."""
 
-SILENT = 3.0
+SILENCE_TIMEOUT = 3.0
 """They do not if they have not for so long, while the stream did [s]."""
 
-RETRY = 0.05
+RETRY_PERIOD = 0.05
 """Between two attempts to be let in again [s]."""
 
 
@@ -65,7 +74,7 @@ class ServerUnreachable(BusError):
 
     def __init__(self, endpoint: str, reason: str) -> None:
         super().__init__(
-            f"no vinesim server answers at {endpoint} within {PATIENCE:g} s ({reason}): "
+            f"no vinesim server answers at {endpoint} within {CONNECT_TIMEOUT:g} s ({reason}): "
             f"start one with 'vinesim server', or give its endpoint, e.g. {endpoint.partition('/')[0]}/HOST:7447"
         )
 
@@ -81,7 +90,7 @@ def config(mode: str, **settings: Any) -> zenoh.Config:
         "scouting__gossip__enabled": False,
         "scouting__delay": 0,
         "transport__link__tx__lease": LEASE,
-        "transport__link__rx__max_message_size": HUGE,
+        "transport__link__rx__max_message_size": MAX_RECEIVE,
         "transport__shared_memory__enabled": False,
         "transport__unicast__open_timeout": 1500,
         "transport__unicast__accept_timeout": 1500,
@@ -124,7 +133,7 @@ def _close_all() -> None:
 
 
 @contextlib.contextmanager
-def _meant_for_the_user(endpoint: str) -> Iterator[None]:
+def _user_facing(endpoint: str) -> Iterator[None]:
     try:
         yield
     except zenoh.ZError as error:
@@ -133,12 +142,12 @@ def _meant_for_the_user(endpoint: str) -> Iterator[None]:
 
 def _opened(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Session:
     """A client session over one endpoint; :class:`ServerUnreachable` if nobody is there."""
-    with _meant_for_the_user(str(endpoint)):
+    with _user_facing(str(endpoint)):
         return open_session(
             config(
                 "client",
                 connect__endpoints=[endpoint.locator],
-                connect__timeout_ms=int(1000 * PATIENCE),
+                connect__timeout_ms=int(1000 * CONNECT_TIMEOUT),
                 connect__exit_on_failure=True,
                 connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
                 **credentials,
@@ -151,7 +160,7 @@ class _Publisher:
 
     def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], reliable: bool) -> None:
         self._bus, self._declare, self._reliable = bus, declare, reliable
-        self._publisher = declare(bus.carrier(reliable))
+        self._publisher = declare(bus.session_for(reliable))
 
     @property
     def matching(self) -> bool:
@@ -162,7 +171,7 @@ class _Publisher:
             return False
         self._bus.bytes_out += len(payload)
         if self._reliable:
-            self._bus.outside(lambda: self._publisher.put(payload))
+            self._bus.submit(lambda: self._publisher.put(payload))
         else:
             self._publisher.put(payload)
         return True
@@ -173,7 +182,7 @@ class _Publisher:
 
     def close(self) -> None:
         self._bus.movable.discard(self)
-        self._bus.outside(lambda: self._publisher.undeclare())
+        self._bus.submit(lambda: self._publisher.undeclare())
 
 
 class _Subscription:
@@ -182,7 +191,7 @@ class _Subscription:
     def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Subscriber], reliable: bool) -> None:
         self._bus, self._declare = bus, declare
         self._declared: zenoh.Subscriber | None = None
-        bus.outside(lambda: self.move(bus.carrier(reliable)))
+        bus.submit(lambda: self.move(bus.session_for(reliable)))
 
     def move(self, session: zenoh.Session) -> None:
         """Hear it over another session from now on."""
@@ -190,7 +199,7 @@ class _Subscription:
 
     def close(self) -> None:
         self._bus.movable.discard(self)
-        self._bus.outside(lambda: self._declared and self._declared.undeclare())
+        self._bus.submit(lambda: self._declared and self._declared.undeclare())
 
 
 class ZenohBus:
@@ -209,14 +218,14 @@ class ZenohBus:
         name is live, :class:`WrongUse` if name or world cannot be part of a key or the endpoint is none.
         """
         for what, text in (("actor name", name), ("world", world)):
-            if not messages.valid_name(text):
+            if not messages.is_valid_name(text):
                 raise WrongUse(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
-        way = ways(connect, secured=certificates is not None)
-        self._credentials = {} if certificates is None else secured(certificates, name)
+        way = client_links(connect, secured=certificates is not None)
+        self._credentials = {} if certificates is None else tls_config(certificates, name)
         self.name, self.world, self.endpoint = name, world, str(way.bulk)
         self.bytes_in = self.bytes_out = self._huge = 0
         self._prefix = f"{ROOT}/{world}/"
-        self._store = Store()
+        self._store = SampleStore()
         self._answers: collections.deque[tuple[str, bytes, float]] = collections.deque()
         self._live: dict[str, set[str]] = {}
         self._me = frozenset((name,)) if live else frozenset()
@@ -238,7 +247,7 @@ class ZenohBus:
                 self._listen_for_loss(self._session, self.endpoint),
                 *([self._claim_name()] if live else []),
             ]
-            for reply in liveliness.get(f"{self._prefix}live/*/*", timeout=PATIENCE):
+            for reply in liveliness.get(f"{self._prefix}live/*/*", timeout=CONNECT_TIMEOUT):
                 if reply.ok is not None:
                     self._living(str(reply.ok.key_expr), True)
             self._declared.append(liveliness.declare_subscriber(f"{self._prefix}live/*/*", self._notice, history=True))
@@ -269,7 +278,7 @@ class ZenohBus:
             )  # fmt: skip
         return session
 
-    def carrier(self, reliable: bool) -> zenoh.Session:
+    def session_for(self, reliable: bool) -> zenoh.Session:
         """The session over which events go, or poses."""
         return self._session if reliable else self._poses
 
@@ -282,7 +291,7 @@ class ZenohBus:
             return
         now = time.monotonic()
         self._silent_since = self._silent_since or now
-        if now - self._silent_since < SILENT:
+        if now - self._silent_since < SILENCE_TIMEOUT:
             return
         log.warning("%s: no datagrams pass to %s any more: poses go over %s", self.name, self._datagrams_to,
                     self.endpoint)  # fmt: skip
@@ -318,7 +327,7 @@ class ZenohBus:
         return token
 
     def _holders(self) -> set[str]:
-        replies = self._session.liveliness().get(f"{self._prefix}live/{self.name}/*", timeout=PATIENCE)
+        replies = self._session.liveliness().get(f"{self._prefix}live/{self.name}/*", timeout=CONNECT_TIMEOUT)
         return {str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok is not None}
 
     # ------------------------------------------------------------ called by Zenoh's threads
@@ -349,11 +358,11 @@ class ZenohBus:
     # ------------------------------------------------------------ the bus
 
     @property
-    def lost(self) -> int:
+    def dropped(self) -> int:
         return self._store.overflowed + self._huge
 
     @property
-    def trouble(self) -> str:
+    def status_message(self) -> str:
         if self._refusal:
             return self._refusal
         for endpoint in sorted(self._gone):
@@ -367,11 +376,11 @@ class ZenohBus:
 
     def join(self, greeting: bytes) -> None:
         key = f"{self._prefix}join/{self.name}/{self._session.zid()}"
-        welcomes = self._ask_in(key, greeting)
+        welcomes = self._query_admission(key, greeting)
         if any(welcome.refused for welcome in welcomes):
-            raise Refused(next(welcome.refused for welcome in welcomes if welcome.refused))
+            raise JoinRejected(next(welcome.refused for welcome in welcomes if welcome.refused))
         if not welcomes and self._credentials:
-            raise Refused(
+            raise JoinRejected(
                 f"the server at {self.endpoint} lets nobody named {self.name!r} in: its folder of certificates must "
                 f"hold {self.name}.pem, and it reads them when it starts"
             )
@@ -385,11 +394,11 @@ class ZenohBus:
         doorkeeper = self._session.declare_querier(key)
 
         def ask_again() -> None:
-            answers, end = self._ask_in(key, greeting), time.monotonic() + PATIENCE
+            answers, end = self._query_admission(key, greeting), time.monotonic() + CONNECT_TIMEOUT
             # between linked routers a server is announced before questions find the way to it
             while not answers and doorkeeper.matching_status.matching and time.monotonic() < end:
-                time.sleep(RETRY)
-                answers = self._ask_in(key, greeting)
+                time.sleep(RETRY_PERIOD)
+                answers = self._query_admission(key, greeting)
             refused = [welcome.refused for welcome in answers if welcome.refused]
             self._refusal = refused[0] if refused else ""
             if refused:
@@ -398,14 +407,16 @@ class ZenohBus:
         def notice(status: zenoh.MatchingStatus) -> None:
             self._kept = status.matching
             if status.matching:
-                self.outside(ask_again)
+                self.submit(ask_again)
 
         self._declared += [doorkeeper, doorkeeper.declare_matching_listener(notice)]
         if not welcomes and doorkeeper.matching_status.matching:
-            self.outside(ask_again)
+            self.submit(ask_again)
 
-    def _ask_in(self, key: str, greeting: bytes) -> list[messages.Welcome]:
-        replies = self._session.get(key, payload=greeting, timeout=PATIENCE, consolidation=zenoh.ConsolidationMode.NONE)
+    def _query_admission(self, key: str, greeting: bytes) -> list[messages.Welcome]:
+        replies = self._session.get(
+            key, payload=greeting, timeout=CONNECT_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
+        )
         answers: Iterable[bytes] = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
         try:
             return [messages.decode_welcome(answer) for answer in answers]
@@ -438,13 +449,13 @@ class ZenohBus:
             self.movable.add(publisher)
         return publisher
 
-    def subscribe(self, pattern: str, depth: int = NEWEST) -> _Subscription:
+    def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> _Subscription:
         skip = len(self._prefix)
 
         def store(sample: zenoh.Sample) -> None:
             size = len(sample.payload)
             self.bytes_in += size
-            if size > messages.LARGEST:
+            if size > messages.MAX_MESSAGE:
                 self._huge += 1
             else:
                 self._store.put(depth, str(sample.key_expr)[skip:], sample.payload.to_bytes())
@@ -452,36 +463,38 @@ class ZenohBus:
         def declare(session: zenoh.Session) -> zenoh.Subscriber:
             return session.declare_subscriber(self._prefix + pattern, store, allowed_origin=zenoh.Locality.REMOTE)
 
-        subscription = _Subscription(self, declare, depth >= EVERY)
-        if depth < EVERY:
+        subscription = _Subscription(self, declare, depth >= KEEP_ALL)
+        if depth < KEEP_ALL:
             self.movable.add(subscription)
         return subscription
 
-    def drain(self) -> list[tuple[str, bytes]]:
+    def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
 
-    def ask(self, key: str, payload: bytes = b"") -> None:
+    def query(self, key: str, payload: bytes = b"") -> None:
         skip = len(self._prefix)
 
         def hear(reply: zenoh.Reply) -> None:
-            if reply.ok is not None and len(reply.ok.payload) <= messages.LARGEST:
+            if reply.ok is not None and len(reply.ok.payload) <= messages.MAX_MESSAGE:
                 arrived = time.monotonic()
                 self._answers.append((str(reply.ok.key_expr)[skip:], reply.ok.payload.to_bytes(), arrived))
 
         # Zenoh's own choice would keep one reply of a key: a snapshot comes in several
         every = zenoh.ConsolidationMode.NONE
-        self.outside(
-            lambda: self._session.get(self._prefix + key, hear, payload=payload, timeout=PATIENCE, consolidation=every)
+        self.submit(
+            lambda: self._session.get(
+                self._prefix + key, hear, payload=payload, timeout=CONNECT_TIMEOUT, consolidation=every
+            )
         )
 
-    def answers(self) -> list[Answer]:
+    def replies(self) -> list[Reply]:
         now, found = time.monotonic(), []
         while self._answers:
             key, payload, arrived = self._answers.popleft()
-            found.append(Answer(key, payload, now - arrived))
+            found.append(Reply(key, payload, now - arrived))
         return found
 
-    def serve(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         def answer(query: zenoh.Query) -> None:
             with query:
                 asked = query.payload
@@ -492,13 +505,13 @@ class ZenohBus:
     def alive(self) -> frozenset[str]:
         return self._alive
 
-    def outside(self, what: Callable[[], object]) -> None:
+    def submit(self, what: Callable[[], object]) -> None:
         """Do something that may take its time, in order, in the thread outside the tick."""
         self._work.put(what)
 
     def _run(self) -> None:
         """The thread outside the tick."""
-        due = time.monotonic() + WATCH
+        due = time.monotonic() + WATCH_PERIOD
         while True:
             what: Callable[[], object] | None = self._watch
             if (left := due - time.monotonic()) > 0.0:
@@ -507,7 +520,7 @@ class ZenohBus:
             if what is None:
                 return
             if what == self._watch:
-                due = time.monotonic() + WATCH
+                due = time.monotonic() + WATCH_PERIOD
             try:
                 what()
             except zenoh.ZError as error:
@@ -517,7 +530,7 @@ class ZenohBus:
         work = getattr(self, "_work", None)
         if work is not None:
             work.put(None)
-            self._worker.join(timeout=PATIENCE)
+            self._worker.join(timeout=CONNECT_TIMEOUT)
         for session in (self._poses, self._session):
             close_session(session)
 

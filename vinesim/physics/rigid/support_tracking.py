@@ -15,7 +15,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.rigid.mujoco_sleep import wake_body
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.scene.ids import Kind, thing, thing_named
+from vinesim.scene.ids import ObjectKind, object_id, parse_object_name
 
 STILL_BAND = 0.005, float(np.radians(1.0))
 """[m, rad] An object that moves and turns less than this in its support's frame is still. TUNED."""
@@ -117,7 +117,7 @@ class SupportTracker:
         touched = np.zeros(len(self.object_ids), bool)
         touched[row[np.isin(other, bodies)]] = True
         for hand in self.rigid.human(actor).hands if actor in self.rigid.humans else ():
-            held = None if hand.held is None else thing_named(hand.held[0])
+            held = None if hand.held is None else parse_object_name(hand.held[0])
             if held in self._row_of_object:
                 touched[self._row_of_object[held]] = True
         on = self._row_of_body[other]
@@ -137,7 +137,7 @@ class SupportTracker:
                 found.add((int(self.object_ids[row]), owner[0]))
         for name in self.rigid.humans:
             for hand in self.rigid.human(name).hands:
-                held = None if hand.held is None else thing_named(hand.held[0])
+                held = None if hand.held is None else parse_object_name(hand.held[0])
                 if held in self._row_of_object and self._still_steps[self._row_of_object[held]] < self._rest_steps:
                     found.add((held, name))
         return sorted(found)
@@ -167,7 +167,7 @@ class SupportTracker:
         if support == GROUND:
             return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
         self._update_tables()
-        box = thing_named(support)
+        box = parse_object_name(support)
         if box is not None:
             return self.object_state(box) if box in self._row_of_object else None
         body = self._body_named.get(support)
@@ -316,8 +316,8 @@ class SupportTracker:
             for number, row in self._row_of_object.items()
         }
         self._generation = rigid.generation
-        boxes = [thing(Kind.BOX, i) for i in range(len(rigid.model.box_mass))]
-        bunches = [thing(Kind.BUNCH, i) for i in rigid.free_bunches]
+        boxes = [object_id(ObjectKind.BOX, i) for i in range(len(rigid.model.box_mass))]
+        bunches = [object_id(ObjectKind.BUNCH, i) for i in rigid.free_bunches]
         self.object_ids = np.array(sorted(boxes + bunches), np.int64)
         self._row_of_object = {number: row for row, number in enumerate(self.object_ids.tolist())}
         self._kind_of_body = np.full(m.nbody, _STATIC)
@@ -325,9 +325,9 @@ class SupportTracker:
         self._body = np.zeros(len(self.object_ids), np.int64)
         self._body_named: dict[str, int] = {GROUND: 0}
         for body, (actor, link) in rigid.owners.items():
-            number = thing_named(actor)
+            number = parse_object_name(actor)
             if number is not None:
-                self._kind_of_body[body] = _BOX if number >= thing(Kind.BOX, 0) else _BUNCH
+                self._kind_of_body[body] = _BOX if number >= object_id(ObjectKind.BOX, 0) else _BUNCH
                 self._row_of_body[body] = self._row_of_object[number]
                 self._body[self._row_of_object[number]] = body
                 self._body_named[actor] = body
@@ -339,7 +339,7 @@ class SupportTracker:
         self._tree = m.body_treeid[self._body]
         self._support = np.zeros(len(self.object_ids), np.int64)
         self._anchor_pose = self._poses(np.arange(len(self.object_ids)))
-        self._still_steps = np.where(self.object_ids >= thing(Kind.BOX, 0), self._rest_steps, 0)
+        self._still_steps = np.where(self.object_ids >= object_id(ObjectKind.BOX, 0), self._rest_steps, 0)
         self._slow_steps = self._still_steps.copy()
         self._touching_pairs, self._touched = np.zeros((0, 2), np.int64), None
         self._bands_before = np.tile(STILL_BAND, (len(self.object_ids), 1))
