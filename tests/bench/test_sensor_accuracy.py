@@ -22,7 +22,7 @@ def test_a_plane_is_measured_as_the_formula_says(monkeypatch) -> None:
         assert error == pytest.approx(float(depth_noise_formula(spec, np.array(away))), rel=0.2)
 
 
-def test_depths_are_told_only_of_enough_pixels() -> None:
+def test_depths_need_enough_pixels() -> None:
     depths, exact = DepthStatistics(), np.full(1000, 2.0)
     measured = exact + 0.01 * np.random.default_rng(1).standard_normal(1000)
     measured[:100] = np.nan

@@ -69,7 +69,7 @@ def test_crates_come_after_those_of_the_scene_and_change_no_plant() -> None:
     assert SceneComposer().compose(model).bunch_attached.all()
 
 
-def test_whoever_is_told_of_has_the_label_of_the_links() -> None:
+def test_actor_records_have_the_labels_of_the_visuals() -> None:
     model = sensor_scenes.demo()
     stage = SceneComposer(
         (RobotPlacement("logistic", 1.3, 1.2),),
@@ -77,10 +77,10 @@ def test_whoever_is_told_of_has_the_label_of_the_links() -> None:
         (CratePlacement(4.0, 1.3),),
     )
     links = stage.compose(model).visuals
-    told = {one["label"]: one for one in stage.actor_records(model)}
+    records = {one["label"]: one for one in stage.actor_records(model)}
     drawn = {label(link.organ, link.index) for link in links}
-    assert drawn - {label(Organ.BOX, k) for k in range(len(model.box_size))} == set(told)
-    assert told[label(Organ.HUMAN, 0)]["height"] == 1.6
+    assert drawn - {label(Organ.BOX, k) for k in range(len(model.box_size))} == set(records)
+    assert records[label(Organ.HUMAN, 0)]["height"] == 1.6
 
 
 @pytest.mark.parametrize(

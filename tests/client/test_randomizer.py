@@ -1,4 +1,4 @@
-"""Life in the pictures of a data set: who comes, where there is room, and that it follows from the random numbers."""
+"""Random scenes of a data set: actors, free places, and that all follows from the random numbers."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def test_the_same_numbers_give_the_same_life_and_others_another() -> None:
     for seed in (1, 1, 2):
         happens = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
         assert happens is not None
-        view, near, told = happens
-        seen.append((view.visual_q.tobytes(), view.body_q.tobytes(), near.tobytes(), str(told)))
+        view, near, record = happens
+        seen.append((view.visual_q.tobytes(), view.body_q.tobytes(), near.tobytes(), str(record)))
     assert seen[0] == seen[1] != seen[2]
 
 
@@ -41,10 +41,10 @@ def test_wind_sways_the_plants() -> None:
     for seed in range(8):
         happens = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
         assert happens is not None
-        view, _, told = happens
+        view, _, record = happens
         hanging = np.ones(len(rest), bool)
         hanging[model.bunch_of_body() >= 0] = False
-        moved["wind" in told].append(np.linalg.norm(view.body_q[:, :3] - rest, axis=1)[hanging].max())
+        moved["wind" in record].append(np.linalg.norm(view.body_q[:, :3] - rest, axis=1)[hanging].max())
     assert max(moved[False]) < 0.02
     assert max(moved[True]) > 0.02
 

@@ -17,6 +17,7 @@ import warp as wp
 
 from tests.laws import test_contact, test_rod_in_space
 from tests.support import beam_theory
+from tests.support.contact_forces import force_on
 from tests.support.contact_scenes import bunch_scene, grasp, gripper
 from vinesim.bench.mujoco_reference import MujocoScene
 from vinesim.physics.step import Physics
@@ -148,18 +149,18 @@ def damping() -> Table:
 def grasped() -> Table:
     """A bunch grasped, lifted, moved, pulled, let go: ours and the same scene wholly in MuJoCo."""
     model, body, middle = bunch_scene()
-    ours, oracle = Physics(model), MujocoScene(model, [gripper(middle)])
+    ours, reference = Physics(model), MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     place, force = np.zeros((2, 800, 3)), np.zeros((2, 800))
     for tick in range(800):
         target, pull = grasp(0.01 * tick)
-        for rigid in (ours.rigid, oracle.rigid):
+        for rigid in (ours.rigid, reference.rigid):
             rigid.command("grip", target)
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, pull]))
         ours.step()
-        oracle.step()
-        place[:, tick] = [test_contact.middle_of(q) for q in (ours.snapshot().body_q[body], oracle.body_pose(body))]
-        force[:, tick] = abs(test_contact.force_on(ours, "left")[1]), abs(oracle.contact_force_on("left")[1])
+        reference.step()
+        place[:, tick] = [test_contact.middle_of(q) for q in (ours.snapshot().body_q[body], reference.body_pose(body))]
+        force[:, tick] = abs(force_on(ours, "left")[1]), abs(reference.contact_force_on("left")[1])
     time = 0.01 * np.arange(800)
     figure, (way, press) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
     for axis, name, colour in ((1, "aside", LEAF), (2, "up", GRAPE)):

@@ -11,7 +11,7 @@ from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
-from vinesim.scene.values import Parting
+from vinesim.scene.values import Detachment
 
 
 def momentum(physics: Physics, name: str) -> np.ndarray:
@@ -99,7 +99,7 @@ def test_twice_the_same_bits():
     assert data[0].qpos.tobytes() + data[0].qvel.tobytes() == data[1].qpos.tobytes() + data[1].qvel.tobytes()
 
 
-def pulled(pull: float, bend: float, ticks: int = 400) -> tuple[Physics, tuple[Parting, ...], np.ndarray]:
+def pulled(pull: float, bend: float, ticks: int = 400) -> tuple[Physics, tuple[Detachment, ...], np.ndarray]:
     """A gripper closes on a bunch and goes down and down: the partings, and the peduncle's wrench tick by tick."""
     model, _, middle = bunch_scene()
     model.bunch_pull[0], model.bunch_bend[0] = pull, bend

@@ -186,7 +186,7 @@ def test_life_is_in_a_share_of_the_images_and_all_bunches_have_their_ripeness(wh
 def test_an_image_is_the_same_whatever_was_drawn_before(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    """The last image of a vineyard, alone: wind, company and picked bunches of the others leave no trace."""
+    """The last image of a vineyard, alone: wind, actors and picked bunches of the others leave no trace."""
     plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
     dataset.prepare_folder(plan, tmp_path)
     last = dataset.IMAGES_PER_VINEYARD - 1
@@ -297,7 +297,7 @@ def test_what_cannot_be_drawn_is_said(tmp_path: pathlib.Path, changed: dict, err
     assert not (tmp_path / "shot").exists()
 
 
-def test_a_picture_with_company(tmp_path: pathlib.Path) -> None:
+def test_a_picture_with_actors(tmp_path: pathlib.Path) -> None:
     """Whoever is asked for is there, where asked, with a label that truth tells; the vineyard is the same one."""
     things = {"robots": ["vinebot@3,1.3,-2.5"], "people": ["2.2,0.9,2.4,pick"], "crates": ["1.6,1.4,0.2,0.25"]}
     assert _render(tmp_path / "shot", look="2.2,1.2,0.6", **things) == 0

@@ -1,4 +1,4 @@
-"""The sensing thread: newest view wins, nobody's sensor costs nothing, failures surface."""
+"""The sensing thread: the latest snapshot wins, sensors without demand cost nothing, failures surface."""
 
 import dataclasses
 import threading
@@ -77,7 +77,7 @@ def test_the_newest_view_wins_and_the_rest_is_counted(view) -> None:
     assert eyes.dropped == {"head": 6}
 
 
-def test_nothing_is_rendered_that_nobody_wants(view) -> None:
+def test_nothing_is_rendered_without_demand(view) -> None:
     wanted, unwanted, taken, listening = Inbox(), Inbox(), Inbox(), threading.Event()
     lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
     mounts = [
@@ -102,7 +102,7 @@ def test_nothing_is_rendered_that_nobody_wants(view) -> None:
 
 
 def test_a_late_thread_fires_from_where_the_lidar_was() -> None:
-    """Views that nobody had time for leave their poses behind: no shot is fired from a wrong place."""
+    """Snapshots that were skipped still give their poses: no shot is fired from a wrong place."""
     gate, inbox, started = threading.Event(), Inbox(), Inbox()
     wall = sensor_scenes.thing(sensor_scenes.shape("box", 0.1, 30.0, 30.0, at=(6.1, 0.0, 1.0)))
     rest = np.array([[0, 0, 0, 0, 0, 0, 1.0]])

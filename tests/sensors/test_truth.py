@@ -299,7 +299,7 @@ def test_flow_of_a_moved_camera_lands_on_the_same_points(grove) -> None:
     assert np.abs(image - np.stack([column, row], 1) - shift[ground])[near].max() < 1e-3
 
 
-def test_flow_of_a_moved_plant_is_its_motion_and_nobody_elses(grove) -> None:
+def test_flow_of_a_moved_plant_is_its_motion_alone(grove) -> None:
     model, _, view = grove
     primitives, bunch = Primitives(model, grass=0.0), 22
     pose = _before(model, view, bunch)

@@ -1,8 +1,10 @@
 """A client in Python: joins a vineyard as a robot, steps, leaves.
 
-with Client("demo", "vinebot", connect="tcp/127.0.0.1:7447", name="picker") as client:
-    client.robot.command_base(0.3, 0.0, client.time)
-    client.run(2.0)
+    with Client("demo", "vinebot", connect="tcp/127.0.0.1:7447", name="picker") as client:
+        client.robot.command_base(0.3, 0.0, client.time)
+        client.run(0.4)
+
+A base command lapses after half a second unless it is repeated.
 """
 
 from __future__ import annotations

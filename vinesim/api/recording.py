@@ -1,7 +1,9 @@
 """MCAP recordings of a world, read message by message.
 
-for message in Recording("harvest.mcap"):
-    print(message.time, message.actor, message.key, message.data)
+    for message in Recording("harvest.mcap"):
+        print(message.time, message.actor, message.key, message.data)
+
+``vinesim record`` writes them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """Cameras and lidars that look at a simulation: from a pose, or from a frame of a robot.
 
-frame = Camera("d435").render(simulation, look_at((1.0, -1.0, 1.5), (0.0, 0.0, 1.2)))
-scan = Lidar("vlp16").scan(simulation, robot=robot)
+    frame = Camera("d435").render(simulation, look_at((1.0, -1.0, 1.5), (0.0, 0.0, 1.2)))
+    scan = Lidar("vlp16").scan(simulation, robot=robot)
+
+A sensor may look at several simulations in turn.
 """
 
 from __future__ import annotations

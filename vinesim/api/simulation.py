@@ -1,8 +1,10 @@
 """One simulation in one object: plants, robots, contacts, energy.
 
-simulation = Simulation(CaneBuilder(tip_mass=0.1, damping_ratio=0.05))
-simulation.step(500)
-print(simulation.tip(), simulation.energy().total)
+    simulation = Simulation(CaneBuilder(tip_mass=0.1, damping_ratio=0.05))
+    simulation.step(500)
+    print(simulation.tip(), simulation.energy().total)
+
+Positions are in m, forces in N, in world axes (:mod:`vinesim.frames`).
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
-from vinesim.scene.values import Contact, Parting, Snapshot
+from vinesim.scene.values import Contact, Detachment, Snapshot
 
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
@@ -59,14 +61,16 @@ class Simulation:
         device: str = "cpu",
         threads: int = 1,
     ) -> None:
-        """Args:
-        source: see :data:`Source`. A scene brings its physics parameters and its wind.
-        dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
-        parameters: all numbers of the physics, in place of those of the scene.
-        sleep: whether trees at rest fall asleep, in place of ``parameters.sleep``.
-        detach: whether bunches detach when they are pulled too hard.
-        device: ``"cpu"`` or ``"cuda"``: where plants are stepped.
-        threads: of the CPU that share the plants.
+        """Build the world; it does not move until :meth:`step`.
+
+        Args:
+            source: see :data:`Source`. A scene brings its physics parameters and its wind.
+            dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
+            parameters: all numbers of the physics, in place of those of the scene.
+            sleep: whether trees at rest fall asleep, in place of ``parameters.sleep``.
+            detach: whether bunches detach when they are pulled too hard.
+            device: ``"cpu"`` or ``"cuda"``: where plants are stepped.
+            threads: of the CPU that share the plants.
         """
         self.scene: Scene | None = None
         """The scene that was simulated; None for a model or canes."""
@@ -87,7 +91,7 @@ class Simulation:
             wind = self.scene.wind
             self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=self.scene.seed)
         self._loads: dict[int, np.ndarray] = {}
-        self._detachments: list[Parting] = []
+        self._detachments: list[Detachment] = []
         self._primitives: Primitives | None = None
         self._wake_unbalanced()
 
@@ -144,7 +148,7 @@ class Simulation:
         return self.physics.contacts
 
     @property
-    def detachments(self) -> tuple[Parting, ...]:
+    def detachments(self) -> tuple[Detachment, ...]:
         """Bunches and canes that left their plant in the last call of :meth:`step`."""
         return tuple(self._detachments)
 

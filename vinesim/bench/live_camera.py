@@ -73,7 +73,7 @@ def _run(pictures: bool) -> _Run:
 
 
 def eyes() -> Iterator[Measurement]:
-    """Ticks and pictures a second; the peer is the same client whose camera nobody wants."""
+    """Steps and pictures per second; the peer is the same client without a camera subscriber."""
     runs = {False: [], True: []}
     for pictures in (False, True, False, True):
         runs[pictures].append(_run(pictures))

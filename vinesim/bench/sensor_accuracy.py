@@ -36,7 +36,7 @@ VIEWS_PER_RANGE = 8
 """Bunches that are looked at from each of the ranges."""
 LIDARS = ("vlp16", "os1_64")
 MIXED_RETURN_ERROR = 0.05
-"""A lidar's echo counts as mixed if it lies farther than this from what the middle of its beam meets [m]."""
+"""A return counts as mixed if its range differs by more than this [m] from the hit of the beam's axis."""
 SEED = 7
 RENDERER_VIEW = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
 """Where renderers are compared: from, to [m]."""

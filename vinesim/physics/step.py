@@ -23,10 +23,10 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import (
     Contact,
+    Detachment,
     HandSample,
     HumanPose,
     HumanSpec,
-    Parting,
     RigidVisual,
     RobotSpec,
     Snapshot,
@@ -66,7 +66,7 @@ class Physics:
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
         """What blows, if anything does; set it as you like."""
-        self.detachments: tuple[Parting, ...] = ()
+        self.detachments: tuple[Detachment, ...] = ()
         """What left its plant in the last tick, or by command before it; sorted by body."""
         self.remotely_posed = np.zeros(0, np.int32)
         """Trees that have moved without being awake [k], because others said so since the last tick."""

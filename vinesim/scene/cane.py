@@ -1,8 +1,10 @@
 """Single canes from a few numbers: length, radius, Young's modulus, tip mass, damping ratio, shape.
 
-builder = CaneBuilder(length=1.0, radius=(0.006, 0.003), tip_mass=0.2, damping_ratio=0.05)
-model = builder.build()                       # one cane
-model = assemble([builder, CaneBuilder()])    # several
+    builder = CaneBuilder(length=1.0, radius=(0.006, 0.003), tip_mass=0.2, damping_ratio=0.05)
+    model = builder.build()  # one cane
+    model = assemble([builder, CaneBuilder()])  # several
+
+Branches and bunches are added through :meth:`CaneBuilder.tree`.
 """
 
 from __future__ import annotations
@@ -75,7 +77,10 @@ class CaneBuilder:
 
     @property
     def _radii(self) -> tuple[float, float]:
-        return (self.radius, self.radius) if isinstance(self.radius, (int, float)) else tuple(self.radius)
+        if isinstance(self.radius, (int, float)):
+            return float(self.radius), float(self.radius)
+        base, tip = self.radius
+        return float(base), float(tip)
 
     def first_mode(self) -> float:
         """Angular frequency [rad/s] of the first bending mode of the straight cane, clamped, without gravity.
@@ -119,6 +124,8 @@ class CaneBuilder:
     def _check(self) -> None:
         """:class:`ValueError` naming the first field that is out of range."""
         vars(self).pop("_undamped", None)
+        if np.shape(self.radius) not in ((), (2,)):
+            raise ValueError(f"cane: radius is {self.radius}; give one number, or two for base and tip")
         numbers = {"length": self.length, "youngs_modulus": self.youngs_modulus, "density": self.density}
         numbers |= {f"radius[{i}]": value for i, value in enumerate(self._radii)}
         for name, value in numbers.items():
@@ -129,8 +136,6 @@ class CaneBuilder:
                 raise ValueError(f"cane: {name} is {value}; give a finite number of 0 or more")
         if self.segments < 1:
             raise ValueError(f"cane: segments is {self.segments}; give 1 or more")
-        if len(self._radii) != 2:
-            raise ValueError(f"cane: radius is {self.radius}; give one number, or two for base and tip")
         if self.damping_ratio is not None and self.beta is not None:
             raise ValueError(
                 f"cane: damping_ratio {self.damping_ratio} and beta {self.beta} are given; give one of them"

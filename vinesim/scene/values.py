@@ -233,7 +233,7 @@ class Contact:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Parting:
+class Detachment:
     """Something left its plant: a bunch its peduncle, or a cane the rest of its tree."""
 
     tick: int

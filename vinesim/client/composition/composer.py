@@ -1,12 +1,11 @@
-"""Robots, people and crates set down in a vineyard for a picture: what a simulation would show at that instant.
+"""Robots, people and crates placed in a vineyard for a picture, as the simulation would show them at that instant.
 
     composer = SceneComposer(
         robots=(RobotPlacement("vinebot", 1.5, 0.8),), crates=(CratePlacement(3.0, 0.5, fill=0.6),)
     )
     snapshot = composer.compose(model)
 
-Bunches in a crate were picked from the nearest vines and fell in one after another, by the rigid world that clients
-simulate.
+Bunches in a crate are picked from the nearest vines and fall in one after another, simulated by the rigid world.
 """
 
 from __future__ import annotations
@@ -28,22 +27,22 @@ from vinesim.scene.values import HumanSpec, Snapshot
 from vinesim.sensors.scene.primitives import rest_snapshot
 
 HEAP_DENSITY = 330.0
-"""Of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
+"""Bulk density of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
 CRATE_WALL, CRATE_MASS = 0.012, 1.6
-"""[m] and [kg] of a crate: how thick its walls are, and how heavy it is when empty."""
+"""Thickness of the walls [m] and mass of an empty crate [kg]: GUESSED."""
 MAX_PENETRATION = 0.01
-"""[m] Whoever stands deeper than this in something else stands in it."""
+"""Actors must not penetrate anything deeper than this [m]."""
 FALL_STEPS, SETTLE_STEPS, MAX_REFILLS = 25, 100, 3
-"""[tick] between bunches that fall into a crate; for the heap to settle; how often what rolled out is put back."""
+"""Steps between bunches that fall into a crate; steps for the heap to settle; tries to put back what rolled out."""
 
 
 class PlacementError(ValueError):
-    """Something cannot stand where it is asked to. The text is one line."""
+    """An actor or crate does not fit where it is placed. The text is one line."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RobotPlacement:
-    """A robot by the name of its description, as it stands at ``x``, ``y`` [m], ``yaw`` [rad]."""
+    """A robot, by the name of its description, at ``x``, ``y`` [m], ``yaw`` [rad]."""
 
     robot: str
     x: float
@@ -82,7 +81,7 @@ class CratePlacement:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SceneComposer:
-    """Who and what is in a picture beside the vineyard; labels count from 0 in the order given here."""
+    """The actors and crates of a picture; labels count from 0 in the order given here."""
 
     robots: tuple[RobotPlacement, ...] = ()
     people: tuple[PersonPlacement, ...] = ()
@@ -90,7 +89,7 @@ class SceneComposer:
     """After those of the scene."""
 
     def compose(self, model: Model) -> Snapshot:
-        """The vineyard with all of it at rest; :class:`PlacementError` if two would stand in each other."""
+        """Snapshot of the vineyard with all of them at rest; :class:`PlacementError` if two would overlap."""
         furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
             return self.populate(Physics(furnished))
@@ -99,7 +98,7 @@ class SceneComposer:
         return rest_snapshot(model, rigid.visuals(), rigid.visual_q())
 
     def with_crates(self, model: Model) -> Model:
-        """The same vineyard with the crates after its own boxes."""
+        """The model with the crates after its own boxes."""
         count = len(self.crates)
         pose, size = np.array([c.pose for c in self.crates]), np.array([c.size for c in self.crates])
         return dataclasses.replace(
@@ -110,14 +109,14 @@ class SceneComposer:
         )
 
     def populate(self, physics: Physics) -> Snapshot:
-        """In a world that is furnished: fill the crates, then let everybody in."""
+        """Fill the crates, then add the actors, to physics of :meth:`with_crates`; returns the snapshot."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             fill_crate(physics, number, crate)
         self._add_actors(physics.rigid)
         return physics.snapshot()
 
     def _add_actors(self, rigid: RigidWorld) -> None:
-        """Let robots and people in."""
+        """Add robots and people; :class:`PlacementError` if one overlaps something."""
         for index, one in enumerate(self.robots):
             pose = _ground_pose(one.x, one.y, one.yaw)
             rigid.add_robot(load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
@@ -129,7 +128,7 @@ class SceneComposer:
         _check_clearance(rigid)
 
     def actor_records(self, model: Model) -> list[dict]:
-        """Everything that is set down in a vineyard, as JSON: label, kind, where."""
+        """All robots, people and boxes, as JSON: kind, label, placement."""
         records = []
         for organ, things, start in (
             (Organ.ROBOT, self.robots, 0), (Organ.HUMAN, self.people, 0), (Organ.BOX, self.crates, len(model.box_size)),
@@ -144,12 +143,12 @@ def _ground_pose(x: float, y: float, yaw: float) -> np.ndarray:
 
 
 def bunch_masses(model: Model) -> np.ndarray:
-    """Of all bunches [kg]."""
+    """Mass [bunch] kg of all bunches."""
     return model.bunch_berries * np.array([v.mass for v in VARIETIES])[model.bunch_variety]
 
 
 def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int]:
-    """Let the bunches that hang nearest to a crate fall into it until they fill their share; returns which."""
+    """Let the bunches that hang nearest to a crate fall into it until its ``fill`` is reached; returns their indices."""
     model, rigid = physics.model, physics.rigid
     inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
     wanted = crate.fill * HEAP_DENSITY * float(np.prod(inside))
@@ -185,7 +184,7 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
 
 
 def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.random.Generator) -> np.ndarray:
-    """Pose [7] of a bunch that lies just above ``top`` [m] of a heap in a crate, in the crate's frame."""
+    """Pose [7] of a bunch just above the height ``top`` [m] of a heap, in the crate's frame."""
     length, radius = float(model.bunch_length[bunch]), float(model.bunch_radius[bunch])
     room = np.maximum(0.5 * inside[:2] - [0.5 * length + 0.02, radius + 0.01], 0.0)
     yaw = rng.choice([0.0, np.pi]) + rng.uniform(-0.35, 0.35)
@@ -195,26 +194,26 @@ def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np
 
 
 def _rachis_ends(physics: Physics, bunch: int) -> np.ndarray:
-    """Both ends [2, 3] m of a loose bunch's rachis."""
+    """Both ends [2, 3] m of a free bunch's rachis, in the world."""
     reach = np.array([[0.0, 0.0, 0.0], [float(physics.model.bunch_length[bunch]), 0.0, 0.0]])
     pose = physics.rigid.bunch_pose(bunch)
     return pose[:3] + frames.rotate(pose[3:], reach)
 
 
 def _top_height(physics: Physics, bunch: int) -> float:
-    """[m] Height of the highest point that a bunch may reach."""
+    """Height [m] of the highest point that a bunch may reach."""
     return float(_rachis_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 
 def _step_rigid(rigid: RigidWorld, ticks: int) -> None:
-    """Let loose things fall, without the plants."""
+    """Step the rigid world without the plants."""
     for _ in range(ticks):
         rigid.predict()
         rigid.integrate()
 
 
 def _check_clearance(rigid: RigidWorld) -> None:
-    """:class:`PlacementError` if whoever has come stands in somebody or something."""
+    """Raise :class:`PlacementError` if an actor overlaps another actor, an object or the trellis."""
     rigid.predict()
     for names in rigid.penetrations():
         one, other = sorted(names[:2], key=rigid.actors.__contains__, reverse=True)

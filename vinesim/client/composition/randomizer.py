@@ -1,6 +1,6 @@
-"""Life in the pictures of a data set: wind, people, robots and crates at random, where there is room for them.
+"""Random scenes for the images of a data set: wind, people, robots and crates where there is space for them.
 
-What happens in an image follows from the image's own random numbers; nothing is kept from one image to the next.
+A scene follows from the random numbers of its image alone; nothing is kept from one image to the next.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from vinesim.scene.values import Snapshot
 
 ROBOT_NAMES = ("vinebot", "logistic")
 FOOTPRINT_RADIUS = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
-"""[m] Radius of the ground that each takes up, arms and hands included."""
+"""Radius of the ground that each covers [m], arms and hands included: GUESSED."""
 MIN_DISTANCE, MAX_DISTANCE = 0.5, 3.5
-"""[m] From below the bunch that is looked at to where somebody stands."""
+"""Distance on the ground from the bunch in view to an actor or crate [m]."""
 CRATE_HEIGHTS = (0.15, 0.20, 0.24, 0.30)
-"""Of crates [m]."""
+"""Heights of crates [m]."""
 WIND_SHARE = 0.6
-"""Share of the lively images in which wind blows."""
+"""Share of the images with actors in which wind blows."""
 WIND_SPEED = (0.5, 3.5)
 """Mean wind in the canopy [m/s]: GUESSED, calm to a fresh breeze above it."""
 WIND_STEPS = (50, 130)
-"""[tick] from calm to the picture."""
+"""Steps of wind before the picture, lowest and highest."""
 _MAX_TRIES = 40
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SceneRandomizer:
-    """What may happen in an image; see :class:`vinesim.sensors.export.dataset.SnapshotSource`."""
+    """Composes random scenes; implements :class:`vinesim.sensors.export.dataset.SnapshotSource`."""
 
     share: float = 0.4
-    """Of the images in which anything does."""
+    """Share of the images with actors or wind."""
 
     def settings(self) -> dict[str, Any]:
-        """All that decides what happens, as JSON."""
+        """All that decides the scenes, as JSON."""
         return {"share": self.share, "robots": list(ROBOT_NAMES)}
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
@@ -72,7 +72,7 @@ class SceneRandomizer:
 
 
 def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generator) -> SceneComposer:
-    """Who is about a point [2] m of the ground: each where there is room, clear of wood and of one another."""
+    """Random actors and crates around ``middle`` [2] m of the ground, clear of trunks, poles and each other."""
     wood = np.isin(model.fixed_organ, [Organ.POLE, Organ.TRUNK])
     taken = [(spot, 0.12) for spot in model.fixed_start[wood, :2].astype(float)]
     taken += [(spot, FOOTPRINT_RADIUS["crate"]) for spot in model.box_pose[:, :2].astype(float)]
@@ -100,7 +100,7 @@ def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generato
 def _free_place(
     middle: np.ndarray, taken: list[tuple[np.ndarray, float]], radius: float, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """A place [2] m for a disc, at which no other is."""
+    """A place [2] m for a disc that overlaps no other; None if none is found."""
     for _ in range(_MAX_TRIES):
         away, around = rng.uniform(MIN_DISTANCE, MAX_DISTANCE), rng.uniform(0.0, 2.0 * np.pi)
         spot = middle + away * np.array([np.cos(around), np.sin(around)])
@@ -110,7 +110,7 @@ def _free_place(
 
 
 def _simulate_wind(physics: Physics, rng: np.random.Generator) -> dict[str, Any]:
-    """Let wind blow for a while; what it was."""
+    """Step physics with a random wind; returns its parameters, as JSON."""
     speed, heading = float(rng.uniform(*WIND_SPEED)), float(rng.uniform(-np.pi, np.pi))
     ticks, seed = int(rng.integers(*WIND_STEPS)), int(rng.integers(1 << 31))
     mean = np.array([speed * np.cos(heading), speed * np.sin(heading), 0.0])

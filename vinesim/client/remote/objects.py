@@ -17,7 +17,7 @@ from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.physics.rigid.support_tracking import GROUND
 from vinesim.physics.step import Physics
 from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name, split_object_id
-from vinesim.scene.values import ObjectUpdate, Parting, TreeUpdate
+from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 
 BLEND_PER_STEP = 0.2
 """Share of the way to where its owner says it is by which a copy moves in one tick."""
@@ -36,7 +36,7 @@ class ObjectSync:
         self._supported: dict[str, set[int]] = {}
         self._changed_trees: set[int] = set()
         self._cut_bodies: dict[int, list[int]] = {}
-        self._detachments: tuple[Parting, ...] = ()
+        self._detachments: tuple[Detachment, ...] = ()
 
     # ------------------------------------------------------------------ what others say
 

@@ -31,7 +31,10 @@ def cull_clusters(
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """One thread tells how near one cluster may come to the eye, or FAR if no pixel can see it."""
+    """One thread bounds one cluster: its least distance [m] to the eye, or FAR if no pixel can see it.
+
+    ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] m.
+    """
     i = wp.tid()
     r = ball[i][3]
     p = lens.rotation * (xyz(ball[i]) - lens.eye)
@@ -55,7 +58,11 @@ def raster_solids(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th box, ellipsoid or cylinder of one visible cluster."""
+    """One thread draws every ``lanes``-th box, ellipsoid or cylinder of one visible cluster.
+
+    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    :mod:`vinesim.kernels.raster.pinhole`.
+    """
     k, lane = wp.tid()
     cluster = visible[k]
     kind = clusters.kind[cluster]
@@ -134,7 +141,11 @@ def raster_triangles(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th triangle of one visible cluster."""
+    """One thread draws every ``lanes``-th triangle of one visible cluster.
+
+    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    :mod:`vinesim.kernels.raster.pinhole`.
+    """
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]

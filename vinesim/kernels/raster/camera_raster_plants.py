@@ -45,7 +45,11 @@ def raster_spheroids(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th berry of one visible cluster."""
+    """One thread draws every ``lanes``-th spheroid of one visible cluster.
+
+    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    :mod:`vinesim.kernels.raster.pinhole`.
+    """
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
@@ -162,7 +166,11 @@ def raster_cones(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th cone of one visible cluster."""
+    """One thread draws every ``lanes``-th cone of one visible cluster.
+
+    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    :mod:`vinesim.kernels.raster.pinhole`.
+    """
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]
@@ -299,7 +307,11 @@ def raster_leaves(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th leaf of one visible cluster."""
+    """One thread draws every ``lanes``-th leaf of one visible cluster.
+
+    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    :mod:`vinesim.kernels.raster.pinhole`.
+    """
     k, lane = wp.tid()
     cluster = visible[k]
     first = clusters.first[cluster]

@@ -196,7 +196,7 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
 
 @wp.func
 def outline_of(s: Shapes, i: int, lens: Pinhole) -> Outline:
-    """Where primitive ``i`` can be; its box is empty if it lies behind the camera or beside the picture."""
+    """Where primitive ``i`` can be; its box is empty if it is behind the camera or beside the picture."""
     kind = s.kind[i]
     o = Outline()
     if kind == LEAF:
@@ -313,7 +313,10 @@ def draw_tiles(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One of ``lanes`` threads draws its share of the pixels of every ``groups``-th piece of one list."""
+    """One of ``lanes`` threads draws its share of the pixels of every ``groups``-th tile of one list.
+
+    count: [list] tiles in each list; pieces: [list, slot] tiles, see :func:`draw_tile`; keys: [pixel].
+    """
     group = wp.tid() // lanes
     lane = wp.tid() % lanes
     mine = group % TILE_LISTS

@@ -1,4 +1,4 @@
-"""What the rays of a spinning head meet first: primitives rasterised into its grid of azimuths and elevations.
+"""The nearest primitive along each ray of a spinning head: primitives rasterised into its grid of azimuths and elevations.
 
 A primitive is bound by balls: one, or several along a cone or cylinder. A ball reaches over a range of elevations, which
 picks rows, and over a range of azimuths, which picks columns; the rays found are tested eight at a time and kept as a
@@ -77,7 +77,7 @@ def ray_direction(head: LidarHead, at: int) -> wp.vec3:
 
 @wp.func
 def elevation_slot(tangent: float) -> int:
-    """Where an elevation lies between straight down and straight up."""
+    """Slot of an elevation, given by its tangent: 0 straight down, ELEVATION_SLOTS straight up."""
     return int((tangent / (1.0 + wp.abs(tangent)) + 1.0) * (0.5 * float(ELEVATION_SLOTS) - 0.01))
 
 
@@ -120,7 +120,10 @@ def cull_clusters(
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """One thread tells how near one cluster may come to the head, or FAR if no ray can meet it."""
+    """One thread bounds one cluster: its least distance [m] to the head, or FAR if no ray can meet it.
+
+    ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] m.
+    """
     i = wp.tid()
     r = ball[i][3]
     p = head.rotation * (xyz(ball[i]) - head.eye)

@@ -83,7 +83,11 @@ def cast_rays(
     distance_out: wp.array(dtype=wp.float32),
     primitive_out: wp.array(dtype=wp.int32),
 ):
-    """One thread follows one ray to what it meets first (-2 ground, -1 nothing)."""
+    """One thread finds the nearest hit of one ray.
+
+    origin: [ray] m; direction: [ray] of any length; reach: farthest hit and distance: [ray] nearest hit, both in lengths
+    of the direction; primitive: [ray] -2 the ground, -1 nothing.
+    """
     i = wp.tid()
     best = first_hit(hierarchies, shapes, origin[i], direction[i], reach, 0.0, direction[i])
     distance_out[i] = wp.where(best.primitive == -1, FAR, best.t)
@@ -101,7 +105,10 @@ def cast_camera(
     depth_out: wp.array(dtype=wp.float32),
     primitive_out: wp.array(dtype=wp.int32),
 ):
-    """One thread follows the ray of one pixel: what the rasteriser must find too."""
+    """One thread finds the nearest hit of the ray of one pixel, which the rasteriser must find too.
+
+    depth: [pixel] m along the optical axis, FAR for nothing; primitive: [pixel] -2 the ground, -1 nothing.
+    """
     pixel = wp.tid()
     back = wp.transpose(lens.rotation)
     d = back * pixel_ray(lens, pixel % lens.width, pixel // lens.width)

@@ -251,7 +251,7 @@ def shade_pixels(
     primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; near, far: shadow maps;
     block: [px]; radiance: [pixel] linear RGB.
     """
-    half = block - 1  # corners are told apart by bits: divisions would cost as much as the light
+    half = block - 1  # corners are numbered by bits: divisions would cost as much as the shading
     across = (lens.width + half) >> half
     first = wp.tid() * run
     corners = block * block
@@ -266,7 +266,7 @@ def shade_pixels(
             y = top + (c >> half)
             if x < lens.width and y < lens.height:
                 i = primitive[y * lens.width + x]
-                for k in range(c):  # whoever comes first speaks for all that see the same
+                for k in range(c):  # the first corner that shows a primitive stands for all that show it
                     if primitive[(top + (k >> half)) * lens.width + left + (k & half)] == i:
                         i = -3
             if i != -3:
@@ -312,7 +312,10 @@ def meter_luminance(
     # out
     sum_out: wp.array(dtype=wp.int64),
 ):
-    """One thread adds log2 luminance of one pixel in ``step`` squared to a sum of millionths, the same in any order."""
+    """One thread adds the log2 luminance of one pixel in ``step`` squared to a sum of integers, the same in any order.
+
+    radiance: [pixel] linear RGB; sum: sum of log2 luminance times 65536, and number of pixels.
+    """
     i = wp.tid()
     across = width // step
     x = (i % across) * step + step / 2
@@ -337,7 +340,11 @@ def update_exposure(
     sum_out: wp.array(dtype=wp.int64),
     exposure_out: wp.array(dtype=wp.float32),
 ):
-    """One thread goes a ``share`` of the stops from the usual exposure to the key's, and keeps some of the old one."""
+    """One thread updates the exposure: ``share`` of the stops from the usual one to the key value's, smoothed in time.
+
+    key: exposed geometric mean of the luminance that is aimed at (Reinhard et al. 2002); keep: weight of the old exposure,
+    in stops; sum: as from :func:`meter_luminance`, set to 0; exposure: [1].
+    """
     mean = float(sum_out[0]) / (65536.0 * float(wp.max(sum_out[1], wp.int64(1))))
     wanted = wp.clamp(usual * wp.pow(key * wp.pow(2.0, -mean) / usual, share), least, most)
     old = exposure_out[0]
@@ -359,7 +366,10 @@ def tone_map(
     # out
     rgb_out: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread turns the light of ``run`` neighbouring pixels, each of ``samples`` squared samples, into 8-bit sRGB."""
+    """One thread turns the light of ``run`` neighbouring pixels, each of ``samples`` squared samples, into 8-bit sRGB.
+
+    radiance: [sample] linear RGB; balance: white balance, factors; tone: [4096] sRGB of sqrt(light / 4); rgb: [pixel, 3].
+    """
     first = wp.tid() * run
     per = 1.0 / float(samples * samples)
     gain = balance * exposure[0]

@@ -18,7 +18,7 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
-from vinesim.scene.values import Contact, Parting
+from vinesim.scene.values import Contact, Detachment
 
 STUB_MASS = 1e-3
 """What stays of a bunch on the tree [kg]."""
@@ -67,11 +67,11 @@ class DetachmentMonitor:
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
         self._awake: np.ndarray | None = None
         self._awake_bunches = self._bunches[:0]
-        self._detachments: list[Parting] = []
+        self._detachments: list[Detachment] = []
 
     # ------------------------------------------------------------------ the tick
 
-    def update(self, *, check_load: bool = True) -> tuple[Parting, ...]:
+    def update(self, *, check_load: bool = True) -> tuple[Detachment, ...]:
         """After a commit: all that parted since the last call, sorted by body. ``strain`` off: only what is cut."""
         if check_load:
             self._detach_overloaded()
@@ -231,7 +231,7 @@ class DetachmentMonitor:
     def _record(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
         tree = int(self.plants.model.body_tree[body])
         force, moment = carried[:3].astype(float), carried[3:].astype(float)
-        self._detachments.append(Parting(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
+        self._detachments.append(Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
 
     def _hardest_pressing_actor(self, bunch: int) -> str:
         """Who presses hardest on a bunch, nobody if none does."""

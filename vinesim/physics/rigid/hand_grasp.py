@@ -18,7 +18,7 @@ from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody
 from vinesim.physics.rigid.human_shapes import GRASP_POINTS, HAND_HALF_THICKNESS
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.scene.values import Contact, Parting
+from vinesim.scene.values import Contact, Detachment
 
 _NO_TREES = np.zeros(0, int)
 
@@ -76,7 +76,7 @@ class GraspManager:
         if self._grasps:
             self.plants.wake(self.held_trees)
 
-    def end_step(self, detachments: tuple[Parting, ...]) -> None:
+    def end_step(self, detachments: tuple[Detachment, ...]) -> None:
         """After a step: place hands on the plants that they hold; go on holding bunches that were detached."""
         detached = {detachment.body: detachment.bunch for detachment in detachments if detachment.bunch >= 0}
         contacts = []

@@ -91,7 +91,7 @@ QUALITIES = {
     "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1),
     "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2),
 }
-"""``fast`` for live robots, ``full`` for pictures that somebody looks at, ``still`` for pictures nobody waits for."""
+"""``fast`` for live robots, ``full`` for spectators, ``still`` for pictures that are not live."""
 
 
 @dataclasses.dataclass
@@ -144,7 +144,7 @@ class Camera:
     ) -> CameraFrame:
         """The frame seen from ``pose`` [7], the optical frame in the world.
 
-        Who looks at colours only saves the second view by ``measure=False``: depth is then exact, where in range.
+        ``measure_depth=False`` saves the second imager's view: depth is then exact, where in range.
         """
         pose = np.array(pose, float)
         picture = self.render_on_device(primitives, pose, time)

@@ -15,13 +15,13 @@ NOON_EXPOSURE = 0.75
 KEY_VALUE = 0.13
 """Exposed light of the usual picture's geometric mean; white is 1."""
 ADAPTED_SHARE = 0.5
-"""Of the stops that would bring any picture to the key: what is dark stays darker than what is bright."""
+"""Share of the stops that would bring any picture to the key value: dark scenes stay darker than bright ones."""
 LOW_SUN_SHARE = 0.7
 """Share of the stops by which a low sun gives less light that exposure makes up beforehand."""
 MIN_EXPOSURE, MAX_EXPOSURE = 0.25, 8.0
 """Exposure stays within these."""
 ADAPTATION_TIME = 0.25
-"""Time in which exposure comes within a factor e, in stops, of what it should be [s]."""
+"""Time constant with which exposure, in stops, follows its target [s]."""
 _METERING_STRIDE = 8
 """One of so many pixels, squared, is metered."""
 _GLARE = ((2.0, 0.5), (9.0, 0.12))

@@ -35,7 +35,7 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     noise: Annotated[Number, "px", (0.0, 10.0)]
     """Standard deviation of disparity on a well-textured plane."""
     step: Annotated[Number, "px", (0.0, 10.0)]
-    """Between two disparities that can be told; 0 for none."""
+    """Resolution of disparity; 0 for none."""
     window: Annotated[Number, "px", (1.0, 63.0)]
     """Side of the matching window: noise is alike within it, and it sees one surface."""
     fattening: Annotated[Number, "1", (0.1, 10.0)]
@@ -55,7 +55,7 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Stereo:
-    """The depth sensor of one camera: its second view, and its luck."""
+    """The depth sensor of one camera: its second imager, matching and noise."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class Stereo:
         rgb: np.ndarray,
         rng: np.random.Generator,
     ) -> np.ndarray:
-        """Measured depth [height, width] m where ``depth`` [height, width] m is true and ``rgb`` what it looks like."""
+        """Measured depth [height, width] m from exact ``depth`` [height, width] m and the picture ``rgb``."""
         second = self._second_pinhole(lens)
         self._second.draw(primitives, second)
         self._noise.assign(self._correlated_noise(rng))

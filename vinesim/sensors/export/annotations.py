@@ -17,7 +17,7 @@ from vinesim.scene.values import CameraInfo
 from vinesim.sensors.truth.truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
-"""What annotations tell of a bunch beside what COCO asks for."""
+"""Fields of a bunch in annotations beside those of COCO."""
 MIN_ANNOTATED_PIXELS = 16
 """A bunch is annotated (COCO, YOLO) if at least so many pixels show it; records name all."""
 
@@ -172,7 +172,7 @@ def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:
 
 
 def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
-    """A picture with what is true of it: visible boxes green, amodal boxes where they differ white, cut points yellow
+    """A picture with its ground truth: visible boxes green, amodal boxes where they differ white, cut points yellow
     discs (rings where hidden), and of each bunch its number, berries seen and share that is hidden.
     """
     scale = max(1, round(1280 / rgb.shape[1]))

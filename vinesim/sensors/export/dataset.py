@@ -1,4 +1,4 @@
-"""Random pictures of random vineyards with all that is true of them, as files that a killed run leaves whole.
+"""Data sets: random pictures of random vineyards with their ground truth, in files that a killed run leaves whole.
 
 What an image shows follows from (plan, its number) alone: any process may draw it, in any order, and gets the same
 bits. An image is done when its record is there; the record is written last, and every file is renamed into place.
@@ -35,21 +35,21 @@ from vinesim.sensors.spec_file import SensorError
 from vinesim.sensors.truth import truth
 
 IMAGES_PER_VINEYARD = 5
-"""So many images are taken in one vineyard before another one is grown."""
+"""Images of one vineyard before the next one is generated."""
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 16, 4096
 """Width and height of pictures [px]."""
 CAMERA_HEIGHT = (0.7, 1.7)
-"""Of the camera above the ground [m]: robots' arms and heads."""
+"""Height of the camera above the ground [m]: robots' arms and heads."""
 BUNCH_DISTANCE = (0.35, 1.8)
-"""From the camera to the bunch it looks at [m]."""
+"""Distance from the camera to the bunch it looks at [m]."""
 MAX_ACTOR_DISTANCE = 2.5
-"""So far from where something activity hangs the bunch that is looked at [m]."""
+"""Horizontal distance [m] from the centre of the activity to the bunch in view, at most."""
 MIN_CLEARANCE = 0.15
-"""What is nearer [m] than this and fills more than a fiftieth of the picture makes it a bad one."""
+"""A picture is rejected if more than a fiftieth of it is nearer than this [m]."""
 LATITUDE = np.radians(41.6)
 """Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
 MIN_ACTOR_SHARE = 0.01
-"""Share of the pixels that show somebody or something else than the vineyard, where something activity."""
+"""Least share of the pixels that show actors or boxes, where there are any."""
 _MAX_TRIES, _TRIES_WITH_ACTORS = 60, 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 
@@ -73,14 +73,14 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
 
 
 class SnapshotSource(Protocol):
-    """What moves in an image and who is there beside the vines; sensors draw it and do not know where it comes from."""
+    """Random scenes with actors and wind; sensors draw the snapshots and do not know how they are made."""
 
     def settings(self) -> dict[str, Any]:
-        """All that decides what activity, as JSON."""
+        """All that decides the scenes, as JSON."""
         ...
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
-        """What there is, near which point [2] m of the ground to look, and a record of it; None if nothing activity.
+        """Snapshot, point [2] m of the ground to look at, and a record of it; None for the vineyard at rest.
 
         It follows from the model and the random numbers alone. ``actors`` of the record are what
         :func:`formats.actors` takes.
@@ -98,7 +98,7 @@ class DatasetPlan:
     size: tuple[int, int] | None = None
     """Width and height [px]; the camera's own unless given."""
     snapshot_source: SnapshotSource | None = None
-    """Without it plants hang at rest and nobody is there."""
+    """Actors and wind; without it all plants hang at rest."""
     renderer: str = "warp"
 
     def settings(self) -> dict[str, Any]:
@@ -198,7 +198,7 @@ class VineyardRenderer:
     ) -> truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 
-        If something activity, the bunch hangs ``near`` there, and somebody of the ``actors`` [m] is seen too, if a
+        If there are actors, the bunch hangs ``near`` them, and one of the ``actors`` [m] is seen too, if a
         place for that is soon found.
         """
         model = self.model
@@ -304,7 +304,7 @@ def _check_same_settings(there: dict[str, Any], wanted: dict[str, Any], folder: 
 
 
 def remove_partial_files(folder: pathlib.Path) -> None:
-    """Take away what a killed run left half-written."""
+    """Remove files that a killed run left unfinished."""
     for part in folder.glob("**/.*.part"):
         part.unlink(missing_ok=True)
 

@@ -29,7 +29,7 @@ from vinesim.sensors.spec_file import Numbers
 MAX_RAYS = 8
 """Of one shot."""
 FOOTPRINT_RANGE = 3.0
-"""All rays leave from one point; beams are as wide as in life at this range [m], thinner nearer, wider beyond."""
+"""All rays leave from one point; beams have their real width at this range [m], less nearer, more beyond."""
 MAX_SHARED_TRANSLATION, MAX_SHARED_ROTATION = 4e-3, 3.5e-3
 """Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place, their middle one.
 
@@ -71,7 +71,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     weak_noise: Annotated[Number, "m", (0.0, 1.0)]
     """The same of the weakest echo; between them it falls with the root of the signal."""
     step: Annotated[Number, "m", (0.0, 1.0)]
-    """Between two ranges that can be told."""
+    """Resolution of the range."""
     weakest: Annotated[Number, "1/m^2", (0.0, 1.0)]
     """Signal from which on an echo is noticed: reflectance, times the cosine, over the square of the range."""
     flicker: Annotated[Number, "1", (0.0, 2.0)]
@@ -137,7 +137,7 @@ class RayGrid(Protocol):
 
 
 class Lidar:
-    """One lidar: a table of firings, and what it reports of one revolution."""
+    """One lidar: a table of firings, and the returns of one revolution."""
 
     def __init__(
         self,
@@ -187,7 +187,7 @@ class Lidar:
         self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
 
     def _footprint(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where in its beam each ray of a shot lies, across and up [ray] rad: one in the middle, the others on a ring.
+        """Offset of each ray of a shot in its beam, across and up [ray] rad: one in the middle, the others on a ring.
 
         Each stands for an equal share of a Gaussian beam's energy.
         """

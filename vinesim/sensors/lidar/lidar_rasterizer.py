@@ -24,7 +24,7 @@ def _as_floats(vectors: wp.array) -> wp.array:
 
 
 class LidarRasterizer:
-    """The rays of one revolution, and what they met when they were fired last."""
+    """The rays of one revolution, and their latest hits."""
 
     def __init__(
         self, elevation: np.ndarray, azimuth: np.ndarray, step: float, columns: int, device: str = "cpu"

@@ -1,7 +1,7 @@
-"""A lidar's head turns while the world moves: each sector is fired when its time has come, from where it then is.
+"""A spinning lidar in a moving world: each sector is fired at its own time, from the pose of the lidar at that time.
 
-What moves is sheared in a scan as it is in life, and so is everything if the robot moves. Poses of the lidar are kept
-and interpolated to each firing, however late it is computed; plants and things are where the newest view has them.
+A scan is therefore sheared by motion, of the world and of the lidar (rolling shutter). Poses of the lidar are kept and
+interpolated to each firing, however late it is computed; plants and objects are as in the latest snapshot.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from vinesim.sensors.scene.primitives import Primitives
 
 
 class PoseHistory:
-    """Where a sensor was lately."""
+    """Recent poses of a sensor."""
 
     def __init__(self) -> None:
         self._times: list[float] = []
         self._poses: list[np.ndarray] = []
 
     def add(self, time: float, pose: np.ndarray) -> None:
-        """The sensor was at ``pose`` [7] at ``time`` [s]; where time was set back, what came later is forgotten."""
+        """Add ``pose`` [7] at ``time`` [s]; poses of later times are removed, as when time was set back."""
         kept = int(np.searchsorted(self._times, time))
         del self._times[kept:], self._poses[kept:]
         self._times.append(time)
         self._poses.append(np.array(pose, float))
 
     def discard_before(self, before: float) -> None:
-        """What is not needed for times from ``before`` on [s]."""
+        """Remove poses that are not needed for times from ``before`` on [s]."""
         old = max(int(np.searchsorted(self._times, before, side="right")) - 1, 0)
         del self._times[:old], self._poses[:old]
 
     def interpolate(self, times: np.ndarray) -> np.ndarray:
-        """Poses [k, 7] at ``times`` [k] s, straight between those that are known; the nearest one beyond them."""
+        """Poses [k, 7] at ``times`` [k] s, linear between known poses (normalised quaternions), constant beyond them."""
         known = np.asarray(self._times)
         poses = np.stack(self._poses)
         after = np.clip(np.searchsorted(known, times), 1, max(len(known) - 1, 1))
@@ -51,30 +51,30 @@ class PoseHistory:
 
 
 class SpinningScan:
-    """One lidar, fired bit by bit."""
+    """Revolutions of one lidar, fired sector by sector."""
 
     def __init__(self, lidar: Lidar, rate: float | None = None) -> None:
-        """``rate``: revolutions a second that are wanted [Hz]; as fast as the head turns unless given, never faster."""
+        """``rate``: revolutions per second to deliver [Hz]; the rate of the lidar unless given, never more."""
         self.lidar = lidar
         self.pose_history = PoseHistory()
         self.dropped = 0
-        """Revolutions that were over before they were begun."""
+        """Revolutions that ended before their first firing could be computed."""
         self._revolution_period = 1.0 / lidar.rate
         self._period = max(self._revolution_period, 1.0 / rate if rate else 0.0)
         self._start: float | None = None
         self._next_column = 0
 
     def cancel(self, now: float) -> None:
-        """Forget the present revolution: at ``now`` [s] nobody wants it."""
+        """Abandon the present revolution at ``now`` [s]."""
         self._start = None
         self.pose_history.discard_before(now)
 
     def is_due(self, now: float) -> bool:
-        """Whether there is something to fire at ``now`` [s]: a head that waits for its next revolution has nothing."""
+        """Whether firings are due at ``now`` [s]; none are while the next revolution has not begun."""
         return self._start is None or now >= self._start - 1e-9 or now < self._start - self._period
 
     def advance(self, primitives: Primitives, now: float) -> Iterator[LidarScan]:
-        """Fire what is due at ``now`` [s] of simulation time; yields the revolutions that are complete with it."""
+        """Fire what is due at simulation time ``now`` [s]; yields the revolutions that this completes."""
         if self._start is None or now < self._start - self._period:
             self._begin(now)
         while self._start is not None:

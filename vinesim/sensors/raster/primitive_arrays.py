@@ -1,4 +1,4 @@
-"""What rasterisers and the scene agree on: kinds of primitives, their arrays, and what draws them."""
+"""Interface between scene and rasterisers: kinds of primitives, their arrays, and the rasteriser protocol."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ RENDERERS = ("warp", "taichi", "taichi-gpu")
 
 
 class RendererUnavailable(ValueError):
-    """The text says which renderer cannot be had, and what to do."""
+    """The renderer is unknown or cannot run here; the text gives the remedy."""
 
     exit_code = 3
 

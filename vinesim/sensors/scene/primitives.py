@@ -1,7 +1,7 @@
-"""Everything a camera or lidar can see, as one structure of analytic primitives that ride on bodies and links.
+"""Everything a camera or lidar can see, as analytic primitives carried by plant bodies and rigid bodies.
 
 :class:`Primitives` is built once from a :class:`~vinesim.scene.model.Model` and follows the world through
-:meth:`Primitives.update`: one Warp launch moves the clusters of the trees and links that moved, and nothing else.
+:meth:`Primitives.update`: one Warp launch moves the clusters of the trees and rigid bodies that moved, and nothing else.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ class Primitives:
         renderer: str = "warp",
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
-        the fruit: all of it is ripe unless given; ``renderer``: who draws (:mod:`~vinesim.sensors.raster.renderers`).
+        the fruit: all of it is ripe unless given; ``renderer``: see :mod:`~vinesim.sensors.raster.renderers`.
         """
         self.model, self.device, self._ripeness = model, device, ripeness
         self.rasterizer = renderers.create_rasterizer(renderer, device)
         """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer` does so itself."""
         bodies = len(model.body_mass)
         self._static_carrier = bodies
-        """Carrier of what stands still; links follow it."""
+        """Carrier of the static scene; those of rigid bodies follow it."""
         spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
         low, high = (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
         trees = len(model.tree_first)
@@ -100,17 +100,17 @@ class Primitives:
         return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
 
     def clusters_shown(self) -> np.ndarray:
-        """Whether each cluster is there at all [cluster]: what has been picked is not."""
+        """Whether each cluster is drawn [cluster]; those of picked bunches are not."""
         return self.ball.numpy()[:, 3] > 0.0
 
     def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
-        """Poses [..., 7] m, 1 of what carries some primitives [...]: a plant's body, a link, or the world."""
+        """Poses [..., 7] m, 1 of the carriers of some primitives [...]: a plant's body, a rigid body, or the world."""
         return self._poses[self._carrier.numpy()[primitive]].astype(float)
 
     # -- building
 
     def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
-        """Lay all primitives out in clusters: plants, what stands still, then links."""
+        """Lay all primitives out in clusters: plants, the static scene, then rigid bodies."""
         moving = rigid_batches(
             self.model, visuals, self._static_carrier + 1, 0, self._picked_bunch_shapes(visuals), self._ripeness
         )
@@ -231,10 +231,10 @@ class Primitives:
     # -- following the world
 
     def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
-        """Take over the poses of ``view``; returns the clusters that moved.
+        """Take over the poses of ``snapshot``; returns the clusters [k] that moved.
 
-        ``moved`` are the trees that may have moved since the last call (default: those of the view and of the view
-        before). Whoever skips views must gather it from all of them.
+        ``moved`` are the trees that may have moved since the last call (default: those of this snapshot and
+        the one before). A caller that skips snapshots must gather them from all of these.
         """
         if snapshot.visuals is not self._visuals:
             self._body_q = snapshot.body_q
@@ -268,7 +268,7 @@ class Primitives:
         return dirty
 
     def _tree_clusters(self, trees: np.ndarray) -> np.ndarray:
-        """Clusters that ride on the given trees, without a loop over trees."""
+        """Clusters that the given trees [k] move."""
         start, size = self._owner_start[trees], self._owner_start[trees + 1] - self._owner_start[trees]
         inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
         return self._by_owner[np.repeat(start, size) + inner]
@@ -293,7 +293,7 @@ class Primitives:
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:
-    """A view of the vineyard at rest, for pictures and tests without physics."""
+    """Snapshot of the vineyard at rest, for pictures and tests without physics."""
     return Snapshot(
         time=0.0,
         tick=0,

@@ -1,4 +1,4 @@
-"""Robots, boxes, people and what was picked as primitives that ride on links."""
+"""Robots, boxes, people and picked bunches as primitives carried by rigid bodies."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAX_MESH_FACES = 4000
 """Most triangles of one mesh; finer ones are simplified."""
 
 _DEFAULT_SURFACE = {Organ.BOX: "plastic", Organ.HUMAN: "cloth"}
-"""What things are made of that do not say so; robots are painted."""
+"""Surfaces of bodies that name none; robots are painted."""
 _MATERIALS = {
     "paint": int(materials.PAINT),
     "plastic": int(materials.PLASTIC),
@@ -46,7 +46,7 @@ def rigid_batches(
     shape: dict[int, np.ndarray],
     ripeness: Ripeness | None = None,
 ) -> list[Batch]:
-    """Shapes of all links; carriers and groups count on from the given numbers.
+    """Shapes of all rigid bodies; carriers and groups count on from the given numbers.
 
     ``shape`` has the poses [piece, 7] of each picked bunch's pieces in its frame.
     """
@@ -74,7 +74,7 @@ def rigid_batches(
 
 
 def _rigid_shape(shape: Shape, common: dict) -> Batch:
-    """One primitive, or the triangles of a mesh, in the frame of its link."""
+    """One primitive, or the triangles of a mesh, in the frame of its body."""
     size, pose = shape.size, np.asarray(shape.pose, float)
     centre, turn = pose[:3], pose[3:]
     if shape.kind in ("capsule", "cylinder", "cone"):

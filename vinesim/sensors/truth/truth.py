@@ -1,4 +1,4 @@
-"""What a picture truly shows: which bunches, how much of each, where, and how every pixel moves.
+"""Ground truth of pictures: which bunches are seen, how much of each, where, and how every pixel moves.
 
 All of it follows from the primitives, not from the picture: noise and range limits of a camera change nothing here.
 Everything is tied to ids that are the same on every client: bunch numbers of the model, and berry numbers as
@@ -83,7 +83,7 @@ class PixelBuffers:
     berries: np.ndarray
     """[height, width] int32, number of the berry in its bunch; -1 where none is seen."""
     carrier_poses: np.ndarray
-    """[primitive, 7] poses of what carries the primitives, for :func:`flow`."""
+    """[primitive, 7] poses of what carries the primitives, for :func:`optical_flow`."""
     layout_version: int
     """:attr:`Primitives.built`: only numbers of the same set of primitives mean the same."""
 
@@ -190,7 +190,7 @@ def bunch_truths(
 ) -> tuple[BunchTruth, ...]:
     """Every bunch of which some pixel would be seen if it were alone, by index.
 
-    ``primitives`` as they were posed by ``view`` when ``seen`` was taken; ``caster`` saves building one.
+    ``primitives`` as posed by ``snapshot`` when ``seen`` was taken; ``caster`` saves building one.
     """
     model, info = primitives.model, seen.info
     alone, lens = CameraRasterizer(info.width, info.height, primitives.device), pinhole(info, seen.pose)
@@ -328,7 +328,7 @@ def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray
 
 
 def _box_of(mask: np.ndarray, window: Box) -> Box | None:
-    """Box in the picture of a mask that lies in a window of it."""
+    """Box in the picture of a mask [rows, columns] of a window of it; None for an empty mask."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return None
