@@ -332,7 +332,7 @@ def test_cameras_and_lidars_see_the_simulation_as_it_moves():
 def test_a_recording_is_read_message_by_message(tmp_path):
     path = tmp_path / "run.mcap"
     hello = messages.encode_hello(messages.Hello(name="ada", kind="spectator", scene="demo", digest="0" * 16, index=1))
-    with mcap_file.Recording(path, {"scene": "demo"}) as file:
+    with mcap_file.RecordingWriter(path, {"scene": "demo"}) as file:
         file.put(1_000_000_000, "live/ada", b"1")
         file.put(1_500_000_000, "hello/ada", hello)
     recording = vinesim.Recording(path)

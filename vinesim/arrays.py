@@ -34,7 +34,14 @@ class ArraySpec:
 
 
 def array(*shape: str | int, unit: str, dtype: Any = np.float32, fill: float | tuple[float, ...] = 0.0) -> Any:
-    """Declare an array field of an :class:`StructOfArrays` struct. ``unit`` is SI, ``"1"`` for pure numbers."""
+    """Declare an array field of a :class:`StructOfArrays`.
+
+    Args:
+        *shape: axes: a name is a count shared by all fields of the struct, a number is fixed.
+        unit: SI unit, ``"1"`` for pure numbers.
+        dtype: type of the elements.
+        fill: default value of an element or of a row.
+    """
     return dataclasses.field(metadata={"dim": ArraySpec(shape, unit, np.dtype(dtype), fill)})
 
 

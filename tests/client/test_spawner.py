@@ -19,7 +19,7 @@ from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
 
-class Later(concurrent.futures.Executor):
+class Deferred(concurrent.futures.Executor):
     """Does what it is asked to when the test says so."""
 
     def __init__(self) -> None:
@@ -61,19 +61,19 @@ def world(description: RobotDescription) -> Physics:
     return physics
 
 
-def test_no_tick_waits_and_then_it_stands_where_it_is_by_now(vinebot):
-    physics, later = world(vinebot), Later()
-    arrivals = RemoteSpawner(physics.rigid, vinebot, later)
-    arrivals.enqueue(greeting(vinebot))
+def test_no_tick_waits_for_a_robot_that_joins(vinebot):
+    physics, deferred = world(vinebot), Deferred()
+    spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
+    spawner.enqueue(greeting(vinebot))
     for tick in range(5):
-        assert arrivals.spawn("guest", standing(vinebot, 0.1 * tick)) is None
+        assert spawner.spawn("guest", standing(vinebot, 0.1 * tick)) is None
         physics.step()
     assert physics.rigid.robots == ("host",)
-    later.work()
-    guest = arrivals.spawn("guest", standing(vinebot, 0.5))
+    deferred.work()
+    guest = spawner.spawn("guest", standing(vinebot, 0.5))
     assert guest is not None
     assert guest.name == "guest"
-    assert "guest" not in arrivals
+    assert "guest" not in spawner
     position, velocity, *_ = physics.rigid.joint_measurements("guest")
     np.testing.assert_allclose(position, standing(vinebot, 0.5).position, atol=1e-12)
     assert not velocity.any()
@@ -100,30 +100,30 @@ def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_c
     assert run(True) == run(False)
 
 
-def test_a_world_that_changed_meanwhile_is_prepared_anew(vinebot):
-    physics, later = world(vinebot), Later()
-    arrivals = RemoteSpawner(physics.rigid, vinebot, later)
-    arrivals.enqueue(greeting(vinebot))
+def test_a_world_that_changed_meanwhile_is_compiled_again(vinebot):
+    physics, deferred = world(vinebot), Deferred()
+    spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
+    spawner.enqueue(greeting(vinebot))
     update = standing(vinebot, 0.0)
-    arrivals.spawn("guest", update)
-    later.work()
+    spawner.spawn("guest", update)
+    deferred.work()
     physics.rigid.add_robot(vinebot.to_spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
-    assert arrivals.spawn("guest", update) is None
+    assert spawner.spawn("guest", update) is None
     assert physics.rigid.robots == ("host", "other")
-    assert arrivals.spawn("guest", update) is None
-    later.work()
-    assert arrivals.spawn("guest", update) is not None
+    assert spawner.spawn("guest", update) is None
+    deferred.work()
+    assert spawner.spawn("guest", update) is not None
     assert physics.rigid.robots == ("host", "other", "guest")
 
 
-def test_who_leaves_before_being_ready_never_comes(vinebot):
-    physics, later = world(vinebot), Later()
-    arrivals = RemoteSpawner(physics.rigid, vinebot, later)
-    arrivals.enqueue(greeting(vinebot))
-    arrivals.spawn("guest", standing(vinebot, 0.0))
-    arrivals.cancel("guest")
-    later.work()
-    assert "guest" not in arrivals
+def test_an_actor_that_leaves_before_being_ready_is_not_spawned(vinebot):
+    physics, deferred = world(vinebot), Deferred()
+    spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
+    spawner.enqueue(greeting(vinebot))
+    spawner.spawn("guest", standing(vinebot, 0.0))
+    spawner.cancel("guest")
+    deferred.work()
+    assert "guest" not in spawner
     assert physics.rigid.robots == ("host",)
 
 
@@ -135,19 +135,19 @@ def test_who_leaves_before_being_ready_never_comes(vinebot):
         ({"urdf": "no xml", "robot": "../../tmp/x"}, "cannot be shown"),
     ],
 )
-def test_a_robot_that_cannot_be_is_named_once_and_the_world_goes_on(vinebot, caplog, change, words):
+def test_a_robot_that_cannot_be_loaded_is_logged_once(vinebot, caplog, change, words):
     physics = world(vinebot)
-    arrivals = RemoteSpawner(physics.rigid, vinebot)
-    arrivals.enqueue(greeting(vinebot, **change))
-    assert arrivals.spawn("guest", standing(vinebot, 0.0)) is None
-    assert "guest" not in arrivals
+    spawner = RemoteSpawner(physics.rigid, vinebot)
+    spawner.enqueue(greeting(vinebot, **change))
+    assert spawner.spawn("guest", standing(vinebot, 0.0)) is None
+    assert "guest" not in spawner
     (record,) = caplog.records
     assert words in record.getMessage()
     physics.step()
     assert physics.rigid.robots == ("host",)
 
 
-def test_a_strangers_word_is_no_path(vinebot, tmp_path, monkeypatch):
+def test_a_name_from_the_network_is_no_path(vinebot, tmp_path, monkeypatch):
     """The name in a greeting names a file; it must stay in the folder made for it."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     text = vinebot.urdf.replace("<robot ", "<!-- another --><robot ", 1)

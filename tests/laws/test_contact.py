@@ -137,7 +137,7 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
             np.testing.assert_allclose(on_plants, -on_robot, atol=1e-9)
             base = rigid.robot("grip").base_v[:2]
             np.testing.assert_allclose(solver.rigid_force[base], on_robot[:2], atol=1e-9)
-        physics._commit()
+        physics._integrate_plants()
         rigid.integrate(solver.rigid_force)
         if solver.count:
             plant_error = max(plant_error, np.abs(realised(physics, start)[solver.bodies] - predicted).max())

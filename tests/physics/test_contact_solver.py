@@ -115,8 +115,8 @@ def test_room_that_runs_out_is_told_in_words_and_the_deepest_stay():
         physics.rigid.command("grip", grasp(0.01 * tick)[0])
         for stage in stages:
             stage()
-        physics._commit()
-        physics._finish()
+        physics._integrate_plants()
+        physics._integrate_rigid()
         assert physics.contact_solver.count <= 2
     assert physics.contact_solver.dropped_contacts > 0
     assert "left out" in physics.contact_solver.overflow_message
@@ -355,8 +355,8 @@ def test_a_bunch_is_touched_as_one_while_coarse_and_cluster_by_cluster_while_fin
             for stage in stages:
                 stage()
             seen |= {c.body for c in physics.contacts}
-            physics._commit()
-            physics._finish()
+            physics._integrate_plants()
+            physics._integrate_rigid()
         met[fine] = seen
     assert bunch in met[False]
     assert met[False].isdisjoint({bunch + 1, bunch + 2})

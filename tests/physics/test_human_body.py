@@ -269,26 +269,43 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
 
 
 def test_nothing_moves_head_trunk_or_legs():
-    """F25, F26: an arm pushes the head; head and legs stay where they were told to be, bit by bit."""
+    """F25, F26: one arm pushes the head, one the left shin, and MuJoCo's own bodies stay where the posture puts them."""
     rigid, spec = RigidWorld(yard()), eva(0.5, heading=np.pi)
     head = frames.pose(np.array([0.5, 0.0, 1.6]), frames.exp(np.array([0.1, 0.2, 3.0])))
     pose = dataclasses.replace(spec.pose, head=head)
-    rigid.add_robot(probe((0.0, 0.0, 1.6), drives=(Drive("along", 2000.0, 100.0, 150.0, 5.0, -5.0, 5.0), PRESS)))
+    drives = (Drive("along", 2000.0, 100.0, 150.0, 5.0, -5.0, 5.0), PRESS)
+    rigid.add_robot(probe((0.0, 0.0, 1.6), drives=drives))
+    rigid.add_robot(probe((0.0, spec.pose.left_foot[1], 0.3), "low", drives=drives))
     rigid.add_human(spec)
     rigid.move_human("eva", pose)
-    links = [link.name for link in rigid.visuals()]
-    pressed = False
+    expected = body_posture(spec.height, pose)
+    human, d = rigid.human("eva"), rigid.mj_data
+    own_measure, drift, pressed = human.measure, 0.0, {"head": 0.0, "left_shank": 0.0}
+
+    def measure(data: mujoco.MjData) -> None:  # first: where MuJoCo's step itself has put the bodies
+        nonlocal drift
+        at = [data.joint(f"eva/{part}").qpos[:3] for part in BODY_PARTS]
+        drift = max(drift, float(np.abs(np.array(at) - expected[:, :3]).max()))
+        own_measure(data)
+
+    step(rigid)  # the head moves there
+    human.measure = measure
     for target in np.linspace(0.0, 1.0, 200):
-        rigid.command("probe", np.array([target, 0.0]))
+        for name in ("probe", "low"):
+            rigid.command(name, np.array([target, 0.0]))
         step(rigid)
-        poses = rigid.visual_q()
-        expected = body_posture(spec.height, pose)
-        for part, told in zip(BODY_PARTS, expected, strict=True):
-            assert poses[links.index(f"eva/{part}")].tobytes() == told.tobytes()
-        assert poses[links.index("eva/head")].tobytes() == head.tobytes()
-        pressed = pressed or rigid.joint_measurements("probe")[3][0] < -100.0
-    assert pressed
-    assert rigid.joint_measurements("probe")[0][0] < 0.5
+        for part in pressed:
+            pressed[part] = max(pressed[part], float(np.linalg.norm(contact_force(rigid, f"eva/{part}"))))
+        rigid.update_kinematics()
+        place, turn = d.xpos[human.part_bodies], frames.from_wxyz(d.xquat[human.part_bodies])
+        np.testing.assert_allclose(place, expected[:, :3], atol=1e-9)
+        np.testing.assert_allclose(np.abs((turn * expected[:, 3:]).sum(1)), 1.0, atol=1e-9)
+    np.testing.assert_array_equal(expected[BODY_PARTS.index("head")], head)
+    assert min(pressed.values()) > 100.0, "both are really pushed"
+    assert drift < 5e-6, "within a step, before it is reset, no force moves a part by more"
+    for name in ("probe", "low"):
+        assert rigid.joint_measurements(name)[3][0] < -100.0
+        assert rigid.joint_measurements(name)[0][0] < 0.5
 
 
 def test_a_base_stops_at_legs():

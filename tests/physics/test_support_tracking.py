@@ -71,7 +71,9 @@ def test_in_a_box_it_lies_in_the_frame_of_the_box_wherever_that_goes():
         run(physics, 1)
     assert physics.support_tracker.moving == [BOX(0)]
     settle(physics)
-    np.testing.assert_allclose(physics.support_tracker.pose_on_support(BUNCH(0))[1][:3], relative[:3], atol=0.05)
+    moved = physics.support_tracker.pose_on_support(BUNCH(0))[1] - relative
+    np.testing.assert_allclose(moved[[0, 1, 3, 4, 5, 6]], 0.0, atol=1e-6)
+    assert abs(moved[2]) < 3e-3  # put elsewhere in each step, it sinks into the bottom otherwise than when it lies
     pose, _ = physics.support_tracker.to_world("box/0", physics.support_tracker.pose_on_support(BUNCH(0))[1])
     np.testing.assert_allclose(pose[:3], physics.support_tracker.object_state(BUNCH(0))[0][:3], atol=1e-9)
 

@@ -1,12 +1,14 @@
 """Parameters of the physics: each documented, each in its range, read from a scene file and used."""
 
 import inspect
+import pathlib
 import re
 
 import msgspec
 import numpy as np
 import pytest
 
+import vinesim
 from tests.physics.test_contact_solver import rows_of_canes
 from vinesim.physics.parameters import ParameterError, PhysicsParameters
 from vinesim.physics.step import Physics
@@ -89,3 +91,11 @@ def test_durations_are_in_seconds_whatever_the_step():
 
 def test_sleep_can_be_switched_off():
     assert ticks_until_asleep(sleep=False) == 0
+
+
+def test_every_parameter_is_used():
+    package = pathlib.Path(vinesim.__file__).parent
+    own = pathlib.Path(physics_parameters.__file__)
+    text = "\n".join(path.read_text() for path in sorted(package.rglob("*.py")) if path != own)
+    unused = [name for name in FIELDS if not re.search(rf"(parameters|\bp)\.{name}\b", text)]
+    assert unused == []

@@ -27,7 +27,7 @@ def fade(
 '''
 
 
-TO_DO = {"contact"}
+TO_DO: set[str] = set()
 """Folders of kernels whose docstrings and arguments are still to be brought to the grammar; empties, never grows."""
 
 

@@ -94,7 +94,7 @@ def vineyard(trees: int = 2, boxes: int = 2, gap: float = 1.0) -> Model:
 
 
 class Server:
-    """What a server does with facts: it keeps the greatest of each thing, and tells them."""
+    """A server of retained records: it keeps the latest record of each object and publishes it."""
 
     CELLS = range(-4, 6)
 
@@ -166,12 +166,12 @@ def pose_of(client: Client, number: int) -> np.ndarray:
 
 
 def apart(a: Client, b: Client, number: int) -> float:
-    """How far two clients see a thing from each other [m]."""
+    """[m] Distance between the positions of an object on two clients."""
     return float(np.linalg.norm(pose_of(a, number)[:3] - pose_of(b, number)[:3]))
 
 
 def sent(client: Client) -> int:
-    """Bytes that left about trees, boxes and bunches: streams, claims and facts."""
+    """Bytes sent about trees, boxes and bunches: streams, ownership events and retained records."""
     counters = client.replicator.counters
     return sum(family.bytes_out for family in (counters.environment, counters.event, counters.retained))
 

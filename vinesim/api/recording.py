@@ -34,35 +34,35 @@ class Recording:
     """A recording that ``vinesim record`` wrote, open for reading."""
 
     def __init__(self, path: str | pathlib.Path) -> None:
-        """Read the file; :class:`~vinesim.net.recording.mcap_file.NotARecording` if it is none."""
-        self._tape = mcap_file.read(pathlib.Path(path))
+        """Read the file; :class:`~vinesim.net.recording.mcap_file.InvalidRecording` if it is none."""
+        self._recording = mcap_file.read(pathlib.Path(path))
 
     @property
     def info(self) -> dict[str, str]:
         """What the recorder knew: release, protocol, world, scene, seed, digest."""
-        return dict(self._tape.metadata)
+        return dict(self._recording.metadata)
 
     @property
     def actors(self) -> list[str]:
         """Names of all actors that were in the world, sorted."""
-        return self._tape.actors
+        return self._recording.actors
 
     @property
     def duration(self) -> float:
         """[s] from the first message to the last."""
-        return self._tape.length if self._tape.messages else 0.0
+        return self._recording.length if self._recording.messages else 0.0
 
     @property
     def damage(self) -> str:
         """Empty, or in one line why the file is shorter than it should be; all messages before that can be read."""
-        return self._tape.damage
+        return self._recording.damage
 
     def __len__(self) -> int:
         """Number of messages."""
-        return len(self._tape.messages)
+        return len(self._recording.messages)
 
     def __iter__(self) -> Iterator[RecordedMessage]:
         """All messages in the order of time."""
-        for entry in self._tape.messages:
+        for entry in self._recording.messages:
             data = mcap_file.describe_message(entry.key, entry.payload)
-            yield RecordedMessage(entry.time - self._tape.start, mcap_file.sender_of(entry.key), entry.key, data)
+            yield RecordedMessage(entry.time - self._recording.start, mcap_file.sender_of(entry.key), entry.key, data)

@@ -104,7 +104,7 @@ class MujocoScene:
         self.world, self.data = world, data
 
     def step(self) -> None:
-        """One tick of everything."""
+        """One step of the whole scene."""
         self.rigid.apply_controls()
         mujoco.mj_step(self.world, self.data)
         self.rigid.invalidate_kinematics()
@@ -129,7 +129,7 @@ class MujocoScene:
         return total
 
     def plant_contact_count(self) -> int:
-        """Contacts of the last tick between plants and robots."""
+        """Contacts of the last step between plants and robots."""
         bodies = self.world.geom_bodyid[self.data.contact.geom]
         is_plant = np.array([self.world.body(i).name.startswith("plant/") for i in range(self.world.nbody)])
         return int((is_plant[bodies].sum(1) == 1).sum())

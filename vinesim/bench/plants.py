@@ -57,30 +57,34 @@ def run_steps(plants: ArticulationSolver, count: int) -> None:
 
 def plant_measurements() -> Iterator[Measurement]:
     """64 canes awake, without contacts, on one thread and on two."""
-    ticks = 40
+    steps = 40
     model = cane_scene(CANE_COUNT)
     whole = warmed_up_solver(model, CANE_COUNT)
     halves = [warmed_up_solver(cane_scene(CANE_COUNT // 2), CANE_COUNT // 2) for _ in range(2)]
-    peer = compile_plants(model)
-    data = mujoco.MjData(peer)
+    mujoco_model = compile_plants(model)
+    data = mujoco.MjData(mujoco_model)
     for _ in range(5):
-        mujoco.mj_step(peer, data)
+        mujoco.mj_step(mujoco_model, data)
 
     def together() -> None:
-        threads = [Thread(target=run_steps, args=(half, ticks)) for half in halves]
+        threads = [Thread(target=run_steps, args=(half, steps)) for half in halves]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
 
     def mujoco_steps() -> None:
-        for _ in range(ticks):
-            mujoco.mj_step(peer, data)
+        for _ in range(steps):
+            mujoco.mj_step(mujoco_model, data)
 
-    one, two, theirs = (
-        1e3 * seconds / ticks
-        for seconds in interleaved_medians(lambda: run_steps(whole, ticks), together, mujoco_steps)
+    one, two, reference = (
+        1e3 * seconds / steps
+        for seconds in interleaved_medians(lambda: run_steps(whole, steps), together, mujoco_steps)
     )
     name = f"MuJoCo {mujoco.mj_versionString()} discrete"
-    yield Measurement("plants", f"{CANE_COUNT} canes awake, one thread", one, "ms/tick", name, theirs, theirs / one)
-    yield Measurement("plants", f"{CANE_COUNT} canes awake, two threads", two, "ms/tick", name, theirs, theirs / two)
+    yield Measurement(
+        "plants", f"{CANE_COUNT} canes awake, one thread", one, "ms/tick", name, reference, reference / one
+    )
+    yield Measurement(
+        "plants", f"{CANE_COUNT} canes awake, two threads", two, "ms/tick", name, reference, reference / two
+    )

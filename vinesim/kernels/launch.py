@@ -1,4 +1,4 @@
-"""A kernel bound to its arrays once, launched many times a second; and a crew of threads that share one launch.
+"""Launches of kernels bound to their arrays once, and a pool of threads that share one launch.
 
 Warp packs a kernel's arguments anew at every CPU launch, recorded or not: 10 us for twenty arguments, more than most of
 our kernels run. :func:`bind_launch` packs them once and then only calls the compiled function: 1 us. That call gives the
@@ -25,11 +25,12 @@ def bind_launch(
     partitions: int = 1,
     block: int = THREADS_PER_BLOCK,
 ) -> Callable[..., None]:
-    """A function that launches ``kernel`` with so many threads, on the arrays named here.
+    """A function that launches ``kernel`` with ``threads`` [first argument] threads on these arrays and structs.
 
-    The arrays must stay alive and where they are; the function keeps Warp's handles of them. With ``over``, the name of
+    The arrays must stay where they are; the function keeps Warp's handles of them. With ``index_list``, the name of
     the list argument of which thread i takes entry i, the CPU function also takes ``first``, the entry of its first
-    thread, and ``share``, a number below ``shares`` that no other thread uses meanwhile. ``block`` is for CUDA.
+    thread, and ``partition``, a number below ``partitions`` that no other Python
+    thread uses meanwhile. ``block`` is for CUDA.
     """
     commands = [
         wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=device, record_cmd=True, block_dim=block)
@@ -44,18 +45,18 @@ def bind_launch(
             bounds, values = command.params[0], command.params[1:]
             fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, values, strict=True)]
             packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
-            dealt = getattr(packed, index_list) if index_list else None
-            calls.append((bounds, bounds.shape, dealt, ctypes.byref(bounds), ctypes.byref(packed)))
+            listed = getattr(packed, index_list) if index_list else None
+            calls.append((bounds, bounds.shape, listed, ctypes.byref(bounds), ctypes.byref(packed)))
         forward = commands[0].hooks.forward
-        start, step = (dealt.data, inputs[at].strides[0]) if index_list else (0, 0)
+        start, step = (listed.data, inputs[at].strides[0]) if index_list else (0, 0)
     except (AttributeError, TypeError, ValueError):  # another Warp: its own way, at its own speed
         return _recorded(commands, inputs, at)
 
-    def launch(threads: int, first: int = 0, share: int = 0) -> None:
+    def launch(threads: int, first: int = 0, partition: int = 0) -> None:
         if threads:
-            bounds, shape, dealt, at_bounds, at_packed = calls[share]
-            if dealt is not None:
-                dealt.data = start + first * step
+            bounds, shape, listed, at_bounds, at_packed = calls[partition]
+            if listed is not None:
+                listed.data = start + first * step
             shape[0] = bounds.size = threads
             forward(at_bounds, at_packed)
 
@@ -66,18 +67,18 @@ def bind_launch(
 def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> Callable[..., None]:
     """Warp's own replay: what CUDA uses, and what can be captured into a graph."""
 
-    def launch(threads: int, first: int = 0, share: int = 0) -> None:
+    def launch(threads: int, first: int = 0, partition: int = 0) -> None:
         if threads:
             if at >= 0:
-                commands[share].set_param_at_index(at, inputs[at][first:])
-            commands[share].set_dim(threads)
-            commands[share].launch()
+                commands[partition].set_param_at_index(at, inputs[at][first:])
+            commands[partition].set_dim(threads)
+            commands[partition].launch()
 
     return launch
 
 
 class ThreadPool:
-    """Threads that wait for work and do it together with whoever brings it.
+    """Threads that wait for work and share it with the caller of :meth:`run`.
 
     A hand-over costs 10 to 30 us: worth it for work of 100 us and more.
     """
@@ -109,7 +110,7 @@ class ThreadPool:
             raise self._failed.pop()
 
     def close(self) -> None:
-        """Send the threads home."""
+        """End the threads."""
         for i in range(1, self.size):
             self._work[i] = None
             self._start[i].release()
@@ -129,7 +130,7 @@ def _wait_and_work(
             return
         try:
             mine()
-        except BaseException as error:  # the one who brought the work hears of it
+        except BaseException as error:  # raised again in the caller of run()
             failed.append(error)
-        del mine  # hold on to nobody's arrays while waiting
+        del mine  # keep no arrays alive while waiting
         done.release()

@@ -1,4 +1,4 @@
-"""Where the files that ship with vinesim lie."""
+"""Finds the data files that ship with vinesim: scenes, robots, cameras, lidars, plants."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pathlib
 
 
 class DataFileNotFound(FileNotFoundError):
-    """A scene, robot, camera or lidar that neither is a file nor ships with vinesim; the text says what there is."""
+    """A scene, robot, camera or lidar that is neither a file nor ships with vinesim; the text lists the known names."""
 
 
 def data_dir() -> pathlib.Path:

@@ -1,7 +1,7 @@
-"""The constants of one generated vineyard: flat arrays, written once, shared by every room.
+"""The constants of one generated vineyard: flat arrays, written once, shared by all packages.
 
 Plants are *trees* of rigid *bodies* (Featherstone's word; a body is a piece of cane, of peduncle, or a bunch).
-The bodies of a tree lie together and in topological order: a parent always stands before its children.
+The bodies of a tree are contiguous and in topological order: a parent comes before its children.
 Every organ grows along its body's +x axis, from the joint at the body's origin.
 
 Body ``b`` hangs on a ball joint. Its joint frame is fixed in the parent: origin ``body_offset``, axes ``body_rest``;
@@ -37,8 +37,8 @@ class Model(StructOfArrays):
     """Pose in the world of the frame on which the root's joint sits."""
     tree_vine: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
     tree_core: np.ndarray = array("tree", unit="1", dtype=np.int32)
-    """How many of its bodies move while nobody is close; the rest are the berry clusters of its bunches, which then
-    ride on their bunch as one *compound*. A tree without clusters is all core."""
+    """How many of its bodies move while no actor is close; the rest are the berry clusters of its bunches, which are then
+    fused to their bunch as one *compound*. A tree without clusters is all core."""
 
     # bodies
     body_tree: np.ndarray = array("body", unit="1", dtype=np.int32)
@@ -68,7 +68,7 @@ class Model(StructOfArrays):
     # bunches: bodies of organ BUNCH, the last of their peduncle; one compound each, filled with berries
     bunch_body: np.ndarray = array("bunch", unit="1", dtype=np.int32)
     bunch_variety: np.ndarray = array("bunch", unit="1", dtype=np.int32)
-    """Index into ``world.berries.VARIETIES``."""
+    """Index into ``vinesim.scene.berries.VARIETIES``."""
     bunch_seed: np.ndarray = array("bunch", unit="1", dtype=np.uint32)
     bunch_length: np.ndarray = array("bunch", unit="m")
     bunch_radius: np.ndarray = array("bunch", unit="m")

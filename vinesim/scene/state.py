@@ -1,4 +1,4 @@
-"""What changes: joint rotations and rates, who is awake, what is attached; poses derived from them."""
+"""The state of the plants: joint rotations and rates, which trees are awake, what is attached; derived poses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class State(StructOfArrays):
 
     @classmethod
     def at_rest(cls, model: Model) -> State:
-        """Everything asleep in the authored shape."""
+        """All trees asleep in the authored shape (``Model.joint_settled``), with zero rates."""
         counts = model.counts()
         state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
         state.joint_q[:] = model.joint_settled

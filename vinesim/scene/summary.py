@@ -1,4 +1,4 @@
-"""What a generated vineyard holds, as a table."""
+"""Summary of a generated vineyard as rows of a table."""
 
 from __future__ import annotations
 

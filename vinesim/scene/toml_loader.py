@@ -1,4 +1,4 @@
-"""TOML files into frozen structs; what is wrong with a file is said in one line: file, place, finding, remedy."""
+"""Loads TOML files into frozen structs; errors are one line: file, place, finding, remedy."""
 
 from __future__ import annotations
 

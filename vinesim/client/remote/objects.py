@@ -1,7 +1,7 @@
-"""Boxes, loose bunches and what was cut: what others say of them is done, and what is to be said of them is found.
+"""Boxes, free bunches and cut branches that several clients share: remote states applied, local changes collected.
 
-What others move is pulled to where they say. What lies by a fact is held there: at rest in its parent's frame, wherever
-that goes, unless it is our own robot that moves it.
+Objects that a remote actor moves are blended towards its states. An object at rest by a retained record is held in the
+frame of what it rests on, wherever that moves, unless an actor of this client moves it.
 """
 
 from __future__ import annotations
@@ -20,113 +20,120 @@ from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name,
 from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 
 BLEND_PER_STEP = 0.2
-"""Share of the way to where its owner says it is by which a copy moves in one tick."""
-ACTIVATION_PERIOD, ACTIVATION_BATCH = 20, 4
-"""So many bunches get their bodies at once, and so many ticks pass between two times: making one costs milliseconds."""
+"""Share of the difference to its owner's state by which a copy is corrected in one step."""
+ACTIVATION_PERIOD = 20
+"""Ticks between two activations of dormant bunches."""
+ACTIVATION_BATCH = 4
+"""Dormant bunches that get bodies at once: making one takes milliseconds."""
 
 
 class ObjectSync:
-    """What one client knows of all that is loose."""
+    """The state of shared objects, and of changes to trees, that one client knows; numbers are ids of :mod:`ids`."""
 
-    def __init__(self, physics: Physics, ours: Collection[str]) -> None:
-        """``ours``: the names of all actors that this client moves."""
-        self.physics, self._local_actors = physics, ours
+    def __init__(self, physics: Physics, local_actors: Collection[str]) -> None:
+        """``local_actors``: the names of all actors that this client simulates."""
+        self.physics, self._local_actors = physics, local_actors
         self._remote_updates: dict[int, ObjectUpdate] = {}
+        """Objects that remote actors move now."""
         self._resting: dict[int, RetainedRecord] = {}
+        """Objects at rest by a retained record."""
         self._supported: dict[str, set[int]] = {}
+        """Objects at rest on each parent frame but the ground."""
         self._changed_trees: set[int] = set()
+        """Trees that picks or cuts have changed."""
         self._cut_bodies: dict[int, list[int]] = {}
+        """Bodies that were cut off each tree, in rising order."""
         self._detachments: tuple[Detachment, ...] = ()
 
-    # ------------------------------------------------------------------ what others say
+    # ------------------------------------------------------------------ received
 
     def receive(self, inbox: Inbox) -> None:
-        """Do what others say is so, every tick before the step."""
-        riding = self.physics.support_tracker
+        """Apply everything that the network brought; once before every step."""
+        tracker = self.physics.support_tracker
         self.physics.remotely_posed = self.physics.remotely_posed[:0]
         self._apply_records(inbox.records)
-        told = {update.object: update for update in inbox.objects}
+        updates = {update.object: update for update in inbox.objects}
         for update in inbox.objects:
             self._clear_resting(update.object)
             self._ensure_body(update.object, update.pose, update.velocity)
-        if told:
-            blend = np.array([BLEND_PER_STEP if number in self._remote_updates else 1.0 for number in told])
+        if updates:
+            blend = np.array([BLEND_PER_STEP if number in self._remote_updates else 1.0 for number in updates])
             poses = np.array([update.pose for update in inbox.objects])
-            riding.blend_towards(list(told), poses, np.array([update.velocity for update in inbox.objects]), blend)
-            riding.set_moving(list(told))
-        self._remote_updates = told
+            tracker.blend_towards(list(updates), poses, np.array([update.velocity for update in inbox.objects]), blend)
+            tracker.set_moving(list(updates))
+        self._remote_updates = updates
         self._hold_resting_objects()
         self._activate_dormant_bunches()
 
-    def _apply_records(self, facts: Iterable[tuple[RetainedRecord, bool]]) -> None:
-        """Take facts over, many at once for whoever comes late; where one says that a thing is counts if it holds."""
-        lie, trees = [], []
-        for fact, holds in facts:
-            if is_tree(fact.object):
-                trees += self._apply_tree_record(fact, holds)
-            elif self._apply_object_record(fact, holds):
-                lie.append(fact)
+    def _apply_records(self, records: Iterable[tuple[RetainedRecord, bool]]) -> None:
+        """Apply retained records, many at once after joining late; the pose in a record counts only if it ``holds``."""
+        dormant, trees = [], []
+        for record, holds in records:
+            if is_tree(record.object):
+                trees += self._apply_tree_record(record, holds)
+            elif self._apply_object_record(record, holds):
+                dormant.append(record)
         if trees:
             self.physics.apply_remote_rest([update.tree for update in trees], [update.joint_q for update in trees])
-        if lie:
-            bunches = [split_object_id(fact.object)[1] for fact in lie]
+        if dormant:
+            bunches = [split_object_id(record.object)[1] for record in dormant]
             self._changed_trees.update(self._tree_of(bunch) for bunch in bunches)
             self.physics.dormant_bunches.add(
-                bunches, [fact.parent for fact in lie], np.array([fact.pose for fact in lie])
+                bunches, [record.parent for record in dormant], np.array([record.pose for record in dormant])
             )
 
-    def _apply_object_record(self, fact: RetainedRecord, holds: bool) -> bool:
-        """Let a box or a bunch be where a fact says; True if it is a bunch that has no body here and needs none yet."""
-        number = fact.object
+    def _apply_object_record(self, record: RetainedRecord, holds: bool) -> bool:
+        """Put a box or a bunch where a record says; True if it is a bunch that has no body here and needs none yet."""
+        number = record.object
         kind, bunch = split_object_id(number)
         bodiless = kind == ObjectKind.BUNCH and number not in self.physics.support_tracker
         if not (holds or (bodiless and bunch not in self.physics.dormant_bunches)):
             return False
         self._remote_updates.pop(number, None)
-        if fact.moving:
+        if record.moving:
             self._clear_resting(number)
-            pose = np.array(fact.pose)
+            pose = np.array(record.pose)
             self._ensure_body(
-                number, *(self.physics.support_tracker.to_world(fact.parent, pose) or (pose, np.zeros(6)))
+                number, *(self.physics.support_tracker.to_world(record.parent, pose) or (pose, np.zeros(6)))
             )
             self.physics.support_tracker.set_moving([number])
             return False
-        self._set_resting(number, fact)
+        self._set_resting(number, record)
         if not bodiless:
             self._place_on_support([number])
         return bodiless
 
-    def _apply_tree_record(self, fact: RetainedRecord, holds: bool) -> list[TreeUpdate]:
-        """Cut of a tree what a fact says; the state in which it rests, if the fact says that and ``holds``."""
-        for body in fact.cut:
-            if self.physics.model.body_tree[body] == fact.object and not self.physics.state.body_cut[body]:
+    def _apply_tree_record(self, record: RetainedRecord, holds: bool) -> list[TreeUpdate]:
+        """Cut off the bodies that a record names; the tree's state of rest if the record has one and ``holds``."""
+        for body in record.cut:
+            if self.physics.model.body_tree[body] == record.object and not self.physics.state.body_cut[body]:
                 self.apply_remote_cut(body)
-        if not (holds and fact.trees):
+        if not (holds and record.trees):
             return []
-        self._changed_trees.add(fact.object)
-        (update,) = messages.decode_trees(fact.trees, self.physics.model.tree_size).updates(fact.author)
+        self._changed_trees.add(record.object)
+        (update,) = messages.decode_trees(record.trees, self.physics.model.tree_size).updates(record.author)
         self.blend_tree(update, 1.0)
-        return [] if fact.moving else [update]
+        return [] if record.moving else [update]
 
     def _activate_dormant_bunches(self) -> None:
-        """Give bunches that lie near an actor their bodies, a few now and then."""
-        lying = self.physics.dormant_bunches
-        if len(lying) and self.physics.tick % ACTIVATION_PERIOD == 0:
+        """Give dormant bunches near an actor their bodies, a few at a time."""
+        dormant = self.physics.dormant_bunches
+        if len(dormant) and self.physics.tick % ACTIVATION_PERIOD == 0:
             rigid = self.physics.rigid
             actors = [rigid.base_state(name)[0][:3] for name in rigid.robots]
             actors += [rigid.human(name).part_poses[0, :3] for name in rigid.humans]
-            bunches = lying.nearest(np.array(actors), ACTIVATION_BATCH)
-            lying.activate(bunches)
+            bunches = dormant.nearest(np.array(actors), ACTIVATION_BATCH)
+            dormant.activate(bunches)
             for bunch in bunches:
                 self._place_on_support([object_id(ObjectKind.BUNCH, bunch)])
 
     def apply_remote_cut(self, body: int) -> None:
-        """Cut a body off because others have."""
+        """Cut off a body that a remote actor has cut off."""
         self.physics.apply_remote_cut(body)
         self._record_cut(body)
 
     def _ensure_body(self, number: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Of a bunch that hangs here still, or has no body: take it off, give it one."""
+        """Detach a bunch that still hangs here, or activate it if it is dormant; boxes always have bodies."""
         kind, bunch = split_object_id(number)
         if kind == ObjectKind.BUNCH and bunch in self.physics.dormant_bunches:
             self.physics.dormant_bunches.activate([bunch])
@@ -135,7 +142,7 @@ class ObjectSync:
             self._changed_trees.add(self._tree_of(bunch))
 
     def _hold_resting_objects(self) -> None:
-        """What lies in a frame that others move goes with it; what was pushed by copies only goes back."""
+        """Move objects with the remote frames that they rest in; put back those that only remote copies have pushed."""
         moving = set(self.physics.support_tracker.moving)
         pushed = {
             number
@@ -146,25 +153,25 @@ class ObjectSync:
             pushed -= self.physics.support_tracker.objects_moved_by(name)
         for number in sorted(pushed):
             self._place_on_support([number])
-        for parent, riders in self._supported.items():
-            if riders and self._is_moved_remotely(parent):
-                self._place_on_support(sorted(riders))
+        for parent, objects in self._supported.items():
+            if objects and self._is_moved_remotely(parent):
+                self._place_on_support(sorted(objects))
 
-    def _set_resting(self, number: int, fact: RetainedRecord) -> None:
-        """From now on a thing lies where a fact says."""
+    def _set_resting(self, number: int, record: RetainedRecord) -> None:
+        """From now on an object rests where a record says."""
         self._clear_resting(number)
-        self._resting[number] = fact
-        if fact.parent != GROUND:
-            self._supported.setdefault(fact.parent, set()).add(number)
+        self._resting[number] = record
+        if record.parent != GROUND:
+            self._supported.setdefault(record.parent, set()).add(number)
 
     def _clear_resting(self, number: int) -> None:
-        """A thing does not lie any more."""
-        fact = self._resting.pop(number, None)
-        if fact is not None and fact.parent != GROUND:
-            self._supported[fact.parent].discard(number)
+        """An object does not rest by a record any more."""
+        record = self._resting.pop(number, None)
+        if record is not None and record.parent != GROUND:
+            self._supported[record.parent].discard(number)
 
     def _is_moved_remotely(self, parent: str) -> bool:
-        """Whether a parent goes where somebody else says."""
+        """Whether a remote actor moves a parent frame, itself or by what it rests on."""
         if parent == GROUND:
             return False
         box = parse_object_name(parent)
@@ -175,21 +182,21 @@ class ObjectSync:
         )
 
     def _place_on_support(self, numbers: list[int]) -> None:
-        """Put things of one parent where they lie, as far as they have bodies."""
-        riding = self.physics.support_tracker
-        numbers = [number for number in numbers if number in riding]
+        """Put objects of one parent, as far as they have bodies, where they rest in its frame."""
+        tracker = self.physics.support_tracker
+        numbers = [number for number in numbers if number in tracker]
         if not numbers:
             return
         parent = self._resting[numbers[0]].parent
         relative = np.array([self._resting[number].pose for number in numbers])
-        there = riding.to_world(parent, relative)
+        there = tracker.to_world(parent, relative)
         if there is not None:
-            riding.set_states(numbers, *there)
+            tracker.set_states(numbers, *there)
             for number, pose in zip(numbers, relative, strict=True):
-                riding.set_at_rest(number, parent, pose)
+                tracker.set_at_rest(number, parent, pose)
 
     def blend_tree(self, update: TreeUpdate, blend: float) -> None:
-        """Move a tree towards what its owner says, and what was cut off it."""
+        """Move a tree, and what was cut off it, towards its owner's state by the share ``blend`` (0 to 1)."""
         plants, state = self.physics.plants, self.physics.state
         first = int(self.physics.model.tree_first[update.tree])
         for body, x, xd in zip((first + update.root).tolist(), update.root_x, update.root_xd, strict=True):
@@ -200,65 +207,65 @@ class ObjectSync:
             state.joint_xd[body] = xd
         plants.blend_towards(update.tree, update.joint_q, update.joint_qd, blend)
 
-    # ------------------------------------------------------------------ what is to be said
+    # ------------------------------------------------------------------ to send
 
     def collect(self) -> None:
-        """After the step: note what parted and what moves."""
+        """After the step: note detachments and update what moves."""
         self.physics.support_tracker.update()
         self._detachments = self.physics.detachments
-        for parting in self._detachments:
-            self._changed_trees.add(parting.tree)
-            if parting.bunch < 0:
-                self._record_cut(parting.body)
+        for detachment in self._detachments:
+            self._changed_trees.add(detachment.tree)
+            if detachment.bunch < 0:
+                self._record_cut(detachment.body)
 
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
-        """What left its plant in the last tick by the doing of an actor of ours, or by nobody's if ``all_others``."""
+        """Objects that actor ``name`` detached in the last step; and those of no local actor if ``all_others``."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
         return [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
 
-    def with_trees(self, parted: Iterable[int]) -> list[int]:
-        """What was parted and the trees that it was parted from."""
-        trees = [number if is_tree(number) else self._tree_of(split_object_id(number)[1]) for number in parted]
-        return [*parted, *trees]
+    def with_trees(self, detached: Iterable[int]) -> list[int]:
+        """Detached objects and the trees that they were detached from."""
+        trees = [number if is_tree(number) else self._tree_of(split_object_id(number)[1]) for number in detached]
+        return [*detached, *trees]
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
-        """Everything that moves and that an actor of ours touches, or what it moves; and what slips off it."""
-        riding = self.physics.support_tracker
+        """All that moves and that a local actor touches, itself or by an object of ``mine``, or that slips off it."""
+        tracker = self.physics.support_tracker
         found = {
-            number for number in riding.moving if self._supporting_actor(number) == name
-        } | riding.objects_moved_by(name)
-        for number, actor in (*riding.touched, *self.physics.touched):
+            number for number in tracker.moving if self._supporting_actor(number) == name
+        } | tracker.objects_moved_by(name)
+        for number, actor in (*tracker.touched, *self.physics.touched):
             other = parse_object_name(actor)
-            if other in mine or (actor == name and is_tree(number)):
+            if (other is not None and other in mine) or (actor == name and is_tree(number)):
                 found.add(number)
         for number in found:
             self._clear_resting(number)
         return sorted(found)
 
     def _supporting_actor(self, number: int) -> str:
-        """Who bears what a thing is said to lie on: whose link it is, or who put the box down; of the ground nobody."""
-        fact = self._resting.get(number)
-        if fact is None or fact.parent == GROUND:
+        """The actor whose link an object rests on, or who put down the box that it rests in; empty on the ground."""
+        record = self._resting.get(number)
+        if record is None or record.parent == GROUND:
             return ""
-        box = parse_object_name(fact.parent)
+        box = parse_object_name(record.parent)
         if box is None:
-            return fact.parent.partition("/")[0]
+            return record.parent.partition("/")[0]
         return (self._supporting_actor(box) or self._resting[box].author) if box in self._resting else ""
 
     @property
     def moving(self) -> list[int]:
-        """All that moves: trees that are not asleep, and what does not rest in its parent's frame."""
+        """All that moves: trees that are not asleep, and objects that do not rest in their parent's frame."""
         return [*self.physics.sleep_monitor.restless.tolist(), *self.physics.support_tracker.moving]
 
     def read_state(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """State of a thing, as :meth:`Exchange.send` wants it."""
+        """State of an object, as :meth:`Replicator.send` takes it."""
         if not is_tree(number):
             return self.physics.support_tracker.object_state(number)
         here, state = self.physics.model.bodies_of(number), self.physics.state
         return state.joint_q[here], state.joint_qd[here]
 
     def cut_roots(self, tree: int) -> DetachedRoots:
-        """What was cut off a tree, as :meth:`Exchange.send` wants it."""
+        """Bodies that were cut off a tree, as :meth:`Replicator.send` takes them."""
         bodies = self._cut_bodies.get(tree)
         if not bodies:
             return NO_ROOTS
@@ -266,20 +273,20 @@ class ObjectSync:
         return np.array(bodies) - first, state.joint_x[bodies].astype(float), state.joint_xd[bodies].astype(float)
 
     def is_changed(self, tree: int) -> bool:
-        """Whether picks or cuts have changed a tree for good."""
+        """Whether picks or cuts have changed a tree permanently."""
         return tree in self._changed_trees
 
     def supported_by(self, name: str) -> list[int]:
-        """What lies, as everybody knows, on the links of an actor."""
+        """Objects at rest, by their records, on the links of an actor."""
         return sorted(
-            number for parent, riders in self._supported.items() if parent.startswith(f"{name}/") for number in riders
+            number for parent, objects in self._supported.items() if parent.startswith(f"{name}/") for number in objects
         )  # fmt: skip
 
-    def mark_resting(self, fact: RetainedRecord | None) -> None:
-        """We have said that a thing of ours lies still: from now on it does, as for everybody else."""
-        if fact is not None and not fact.moving and not is_tree(fact.object):
-            self._set_resting(fact.object, fact)
-            self.physics.support_tracker.set_at_rest(fact.object, fact.parent, np.array(fact.pose))
+    def mark_resting(self, record: RetainedRecord | None) -> None:
+        """A record of an object at rest was sent: from now on it rests here as for all other clients."""
+        if record is not None and not record.moving and not is_tree(record.object):
+            self._set_resting(record.object, record)
+            self.physics.support_tracker.set_at_rest(record.object, record.parent, np.array(record.pose))
 
     # ------------------------------------------------------------------ inside
 

@@ -1,4 +1,4 @@
-"""Robots and people of other clients on their way in: a thread reads and compiles them, and no tick waits for it."""
+"""Adds the robots and humans of other clients: an executor loads and compiles them, and no step waits for it."""
 
 from __future__ import annotations
 
@@ -21,51 +21,51 @@ from vinesim.scene.values import HumanUpdate, RobotUpdate
 log = logging.getLogger(__name__)
 
 Prepared = tuple[RobotDescription | None, CompiledWorld]
-"""A robot's description, or None for a person, and the world with it."""
+"""A robot's description, or None for a human, and the compiled rigid world with it."""
 
 
 class RemoteSpawner:
-    """Who is expected, and how far that is."""
+    """Remote actors that have joined but have no body here yet."""
 
     def __init__(
         self, rigid: RigidWorld, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
     ) -> None:
-        """``own``: a description that needs not be read again, if any; without ``executor`` all is done at once."""
+        """``own``: a description that is loaded already, if any; without ``executor`` actors are compiled at once."""
         self.rigid, self.own = rigid, own
         self._executor = executor
-        self._expected: dict[str, Hello] = {}
-        self._coming: dict[str, concurrent.futures.Future[Prepared]] = {}
+        self._enqueued: dict[str, Hello] = {}
+        self._compiling: dict[str, concurrent.futures.Future[Prepared]] = {}
 
     def __contains__(self, name: str) -> bool:
-        return name in self._expected
+        return name in self._enqueued
 
     def enqueue(self, hello: Hello) -> None:
-        """Somebody has introduced itself; where it is will be known with its first pose."""
-        self._expected[hello.name] = hello
+        """Add an actor that has joined; it is spawned at its first pose."""
+        self._enqueued[hello.name] = hello
 
     def cancel(self, name: str) -> None:
-        """It has gone again."""
-        self._expected.pop(name, None)
-        self._coming.pop(name, None)
+        """Remove an actor that has left."""
+        self._enqueued.pop(name, None)
+        self._compiling.pop(name, None)
 
     def spawn(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemoteHuman | None:
-        """The copy of whoever is expected, standing where ``update`` says; None as long as it is not ready.
+        """The body of an enqueued actor at the pose of ``update``; None until it is compiled.
 
-        Who cannot be shown is named in the log and no more expected.
+        An actor that cannot be shown is logged and removed.
         """
-        hello = self._expected[name]
-        if name not in self._coming:
-            self._coming[name] = self._start(lambda: self._prepare(hello, update))
-        if not self._coming[name].done():
+        hello = self._enqueued[name]
+        if name not in self._compiling:
+            self._compiling[name] = self._submit(lambda: self._prepare(hello, update))
+        if not self._compiling[name].done():
             return None
         try:
-            description, draft = self._coming.pop(name).result()
+            description, draft = self._compiling.pop(name).result()
         except ValueError as error:
             log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
             self.cancel(name)
             return None
         if not self.rigid.adopt(draft):
-            return None  # somebody else came or went meanwhile: once more, from the next tick on
+            return None  # another actor joined or left meanwhile: compiled again from the next step on
         self.cancel(name)
         if description is None or not isinstance(update, RobotUpdate):
             return RemoteHuman(self.rigid, name)
@@ -73,7 +73,7 @@ class RemoteSpawner:
         self.rigid.place_robot(name, update.base_q, update.position)
         return other
 
-    def _start(self, work: Callable[[], Prepared]) -> concurrent.futures.Future[Prepared]:
+    def _submit(self, work: Callable[[], Prepared]) -> concurrent.futures.Future[Prepared]:
         if self._executor is not None:
             return self._executor.submit(work)
         done: concurrent.futures.Future[Prepared] = concurrent.futures.Future()
@@ -93,10 +93,10 @@ class RemoteSpawner:
 
 
 def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDescription:
-    """The robot another client introduced: one that is known here by the same text, or read from the text it sent."""
+    """The robot of another client: an installed one with the same URDF text, or one loaded from the text it sent."""
     if own is not None and hello.urdf == own.urdf:
         return own
-    name = hello.robot if is_valid_name(hello.robot) else "robot"  # a stranger's word, and it becomes a file's name
+    name = hello.robot if is_valid_name(hello.robot) else "robot"  # untrusted, and it becomes a file's name
     try:
         known = load_description(name)
         if known.urdf == hello.urdf:

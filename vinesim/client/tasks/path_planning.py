@@ -17,17 +17,17 @@ MARGIN = 3.0
 Cell = tuple[int, int]
 
 
-def find_path(model: Model, start: np.ndarray, goal: np.ndarray, room: float) -> np.ndarray | None:
-    """Waypoints [n, 2] m of a short path with ``room`` [m] on either side, ends included; None if there is none.
+def find_path(model: Model, start: np.ndarray, goal: np.ndarray, clearance: float) -> np.ndarray | None:
+    """Waypoints [n, 2] m of a short path with ``clearance`` [m] on either side, ends included; None if there is none.
 
     Every waypoint of the grid is dropped that a straight line can replace.
     """
     low = np.minimum(start, goal) - MARGIN
     shape = tuple((np.ceil((np.maximum(start, goal) + MARGIN - low) / GRID_SIZE)).astype(int))
     at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
-    free = (ground_clearance(model, low + GRID_SIZE * at) > room).reshape(shape)
+    free = (ground_clearance(model, low + GRID_SIZE * at) > clearance).reshape(shape)
     first, last = (_cell(np.round((p - low) / GRID_SIZE)) for p in (start, goal))
-    if not free[last] or float(ground_clearance(model, np.array([start]))[0]) < room:
+    if not free[last] or float(ground_clearance(model, np.array([start]))[0]) < clearance:
         return None
     cells = search_grid(free, first, last)
     if cells is None:
@@ -36,7 +36,9 @@ def find_path(model: Model, start: np.ndarray, goal: np.ndarray, room: float) ->
     kept, i = [points[0]], 0
     while i < len(points) - 1:
         i = next(
-            j for j in range(len(points) - 1, i, -1) if j == i + 1 or _is_line_free(model, points[i], points[j], room)
+            j
+            for j in range(len(points) - 1, i, -1)
+            if j == i + 1 or _is_line_free(model, points[i], points[j], clearance)
         )
         kept.append(points[i])
     return np.array(kept)
@@ -77,8 +79,8 @@ def _cell(index: np.ndarray) -> Cell:
     return int(index[0]), int(index[1])
 
 
-def _is_line_free(model: Model, start: np.ndarray, end: np.ndarray, room: float) -> bool:
-    """Whether the straight line from ``start`` to ``end`` [2] m has ``room`` [m] on either side."""
+def _is_line_free(model: Model, start: np.ndarray, end: np.ndarray, clearance: float) -> bool:
+    """Whether the straight line from ``start`` to ``end`` [2] m has ``clearance`` [m] on either side."""
     count = max(int(np.linalg.norm(end - start) / (0.5 * GRID_SIZE)), 2)
     line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-    return bool((ground_clearance(model, line) > room - 0.5 * GRID_SIZE).all())
+    return bool((ground_clearance(model, line) > clearance - 0.5 * GRID_SIZE).all())

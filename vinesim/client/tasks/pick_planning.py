@@ -67,7 +67,7 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
                 break
     if not found:
         raise PlacementError(
-            "no bunch hangs free enough for a hand with a way for a robot to a box; choose another seed"
+            "no bunch hangs free enough for a hand and a path for a robot to a box; choose another seed"
         )
 
 

@@ -100,16 +100,18 @@ def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> 
     ``without``: number of a box that is left out.
     """
     solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
-    room = np.full(len(points), np.inf)
+    clearance = np.full(len(points), np.inf)
     if solid.any():
         middles, radii = model.fixed_start[solid, :2], model.fixed_radius[solid].max(1)
-        room = (np.linalg.norm(points[:, None] - middles, axis=-1) - radii).min(1)
+        clearance = (np.linalg.norm(points[:, None] - middles, axis=-1) - radii).min(1)
     for box, pose in enumerate(model.box_pose.astype(float)):
         if box != without:
             beside = np.pad(points - pose[:2], ((0, 0), (0, 1)))
             local = np.abs(frames.rotate(frames.conjugate(pose[3:]), beside))[:, :2]
-            room = np.minimum(room, np.linalg.norm(np.maximum(local - 0.5 * model.box_size[box, :2], 0.0), axis=1))
-    return room
+            clearance = np.minimum(
+                clearance, np.linalg.norm(np.maximum(local - 0.5 * model.box_size[box, :2], 0.0), axis=1)
+            )
+    return clearance
 
 
 def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
@@ -143,10 +145,10 @@ def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.nda
         goal = place[:2] + 1.6 * np.array([np.cos(side), np.sin(side)])
         for angle in heading:
             back = np.array([np.cos(angle), np.sin(angle)])
-            way = goal - np.linspace(0.0, length, 40)[:, None] * back
-            room = min(
-                float(ground_clearance(model, way).min()), float(np.linalg.norm(way - place[:2], axis=1).min()) - 0.6
+            line = goal - np.linspace(0.0, length, 40)[:, None] * back
+            clearance = min(
+                float(ground_clearance(model, line).min()), float(np.linalg.norm(line - place[:2], axis=1).min()) - 0.6
             )
-            if room > most:
-                best, most = frames.pose(np.append(goal, 0.0), frames.from_yaw(angle)), room
+            if clearance > most:
+                best, most = frames.pose(np.append(goal, 0.0), frames.from_yaw(angle)), clearance
     return best

@@ -73,7 +73,7 @@ def fill_box(physics: Physics, box: int, count: int = 6) -> None:
         column, row = place % columns, place // columns
         x = (column - 0.5 * (columns - 1)) * (size[0] - 0.04) / columns
         y = (row - 0.5) * 0.5 * (size[1] - 0.04)
-        # each lies along y, its middle at (x, y)
+        # along y, centred at (x, y)
         start = np.array([x, y - 0.5 * float(model.bunch_length[bunch]), 0.10 + 0.14 * layer])
         physics.pick(bunch)
         turned = frames.pose(start, frames.from_yaw(0.5 * np.pi))

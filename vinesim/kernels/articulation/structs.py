@@ -6,7 +6,14 @@ numbered as :mod:`vinesim.physics.plants.device_buffers` places them: those of a
 inertia and of its factors are about the body's origin; see :mod:`vinesim.kernels.articulation`.
 """
 
+from typing import Any
+
 import warp as wp
+
+
+def fields(struct: Any) -> dict[str, Any]:
+    """Names of a struct's fields, and Warp's variables with their types."""
+    return struct.vars
 
 
 @wp.struct

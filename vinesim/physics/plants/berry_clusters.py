@@ -27,7 +27,7 @@ class BerryClusters:
     """Locks and unlocks the clusters of the bunches of one solver; see :meth:`ArticulationSolver.refine`."""
 
     def __init__(self, solver: ArticulationSolver) -> None:
-        self._solver: ArticulationSolver = weakref.proxy(solver)  # no cycle: a solver that nobody holds goes at once
+        self._solver: ArticulationSolver = weakref.proxy(solver)  # no cycle of references
         model = solver.model
         clustered = np.flatnonzero(model.bunch_clusters > 0)
         tree = model.body_tree[model.bunch_body[clustered]]

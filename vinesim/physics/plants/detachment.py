@@ -1,4 +1,4 @@
-"""What leaves its vine: a bunch pulled or bent off its peduncle, or whatever a blade closes on.
+"""Detachment: bunches pulled or bent off their peduncles, and what a closing blade cuts.
 
 A bunch becomes a free body of the rigid world in the same tick, with its pose, velocity and weight; on the tree stay
 its peduncle and a stub of a gram, so the tree's numbering never changes. A cane that is cut falls with all that grows
@@ -37,12 +37,12 @@ class Blade:
     closing: bool = False
 
     def close(self) -> None:
-        """Shut, and open again: what is in the mouth at the end of the coming tick is cut."""
+        """Shut, and open again: what is in the mouth at the end of the coming step is cut."""
         self.closing = True
 
 
 class DetachmentMonitor:
-    """Watches the peduncles of awake trees and the blades that close, and takes off what parts."""
+    """Watches the peduncles of awake trees and the blades that close, and detaches what breaks or is cut."""
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class DetachmentMonitor:
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
-        """Hands that hold plants, as contacts; who holds a bunch may be the one who pulled it off."""
+        """Hands that hold plants, as contacts: the actor that holds a bunch may have pulled it off."""
         model = plants.model
         self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
         self._bunch_of = model.bunch_of_body()
@@ -81,7 +81,7 @@ class DetachmentMonitor:
         return told
 
     def _detach_overloaded(self) -> None:
-        """Part the bunches whose peduncles have been strained for long enough, where that is ours to judge."""
+        """Detach the bunches whose peduncles have been overloaded for long enough, on trees that this client simulates."""
         model = self.plants.model
         bunches = self._attached_bunches()
         if self.contact_solver.remote_trees.any():
@@ -116,7 +116,7 @@ class DetachmentMonitor:
         return self._awake_bunches if attached.all() else self._awake_bunches[attached]
 
     def _cut_with_blades(self) -> None:
-        """Cut what lies in the mouths that are closing."""
+        """Cut what is in the mouths that are closing."""
         self.plants.forward_kinematics()
         for blade in self.blades:
             if blade.closing:
@@ -161,7 +161,7 @@ class DetachmentMonitor:
     # ------------------------------------------------------------------ one at a time
 
     def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
-        """Take one bunch off where it hangs; it keeps its pose and velocity. Call it between ticks."""
+        """Detach one bunch; it keeps its pose and velocity. Call it between steps. :class:`ValueError` if it cannot be."""
         if not 0 <= bunch < len(self._overloaded_steps):
             raise ValueError(f"no bunch {bunch}; there are 0 to {len(self._overloaded_steps) - 1}")
         if not self.plants.state.bunch_attached[bunch]:
@@ -197,7 +197,7 @@ class DetachmentMonitor:
         self._record(body, bunch, cause, actor, carried)
 
     def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
-        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between ticks."""
+        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between steps."""
         plants = self.plants
         if not 0 <= body < len(self._wood) or plants.model.body_organ[body] == int(Organ.BUNCH):
             raise ValueError(f"body {body} is no piece of wood that can be cut")
@@ -214,15 +214,16 @@ class DetachmentMonitor:
         self._record(body, -1, cause, actor, carried)
 
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Take one bunch off its vine because somebody else has, and put it where they say: ``pose`` [7], ``velocity``
-        [6]. It is no parting of ours: nobody is told of it.
+        """Detach one bunch because another client has, and place it: ``pose`` [7] m, xyzw, ``velocity`` [6] m/s, rad/s.
+
+        It is not among this client's detachments.
         """
         self._pick(bunch, "told", "", np.zeros(6))
         self._detachments.pop()
         self.rigid.place_bunch(bunch, pose, velocity)
 
     def apply_remote_cut(self, body: int) -> None:
-        """Cut a body off its parent because somebody else has."""
+        """Cut a body off its parent because another client has."""
         if not self.plants.state.body_cut[body]:
             tree = int(self.plants.model.body_tree[body])
             self.plants.wake(tree)
@@ -234,7 +235,7 @@ class DetachmentMonitor:
         self._detachments.append(Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
 
     def _hardest_pressing_actor(self, bunch: int) -> str:
-        """Who presses hardest on a bunch, nobody if none does."""
+        """The actor that presses hardest on a bunch; empty if none does."""
         pushes: dict[str, float] = {}
         for contact in self.contact_solver.contacts + self.hand_contacts:
             if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):

@@ -1,4 +1,4 @@
-"""Where arrays live that NumPy and kernels both use: once on a CPU, twice with a GPU.
+"""Device buffers: arrays that NumPy and kernels both use, once on a CPU, twice with a GPU.
 
 A kernel walks a tree from parent to child and back. Were its arrays in the host's memory, every step would wait for the
 bus. So with a GPU the host keeps its arrays in pinned memory that the device can reach, the device has a copy of all
@@ -20,7 +20,7 @@ from vinesim.kernels.articulation.gather_scatter import copy_rows
 from vinesim.kernels.launch import bind_launch
 
 WARP_SIZE = 32
-"""Threads of a GPU that go in step."""
+"""Threads of a GPU that run in step: a warp."""
 
 
 class DeviceUnavailable(ValueError):
@@ -100,7 +100,7 @@ class DeviceBuffers:
         return pinned
 
     def add_constant(self, name: str, data: np.ndarray, dtype: type) -> None:
-        """An array that nobody will write."""
+        """An array that is never written."""
         self.arrays[name], self.host[name] = wp.array(data, dtype=dtype, device=self.device), data
 
     def add_shared(self, name: str, data: np.ndarray, dtype: type) -> None:
@@ -159,6 +159,6 @@ class DeviceBuffers:
         return lambda count: launch(count * threads)
 
     def synchronize(self) -> None:
-        """Until the device has done all that was asked of it."""
+        """Wait until the device has done all its work."""
         if self.device.is_cuda:
             wp.synchronize_stream(self.device.stream)

@@ -1,7 +1,7 @@
-"""A tree that goes wrong is stopped, put to rest and reported; the rest of the world goes on.
+"""Faults: a tree whose motion is not finite or too fast is stopped, put to sleep and reported; the others go on.
 
 ``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or beyond ``ArticulationSolver.fault_rate``: its joints stay
-where they were when the tick began, the last state that was sound. Here such trees are found after the commit.
+where they were when the tick began, the last state that was sound. Here such trees are found after the integration.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Fault:
 
 
 class FaultGuard:
-    """Finds trees that a commit refused to integrate and lays them to rest in their last sound pose."""
+    """Finds trees that the solver refused to integrate and puts them to sleep in their last sound pose."""
 
     def __init__(self, plants: ArticulationSolver) -> None:
         self.plants = plants
@@ -39,7 +39,7 @@ class FaultGuard:
         self._faults: list[Fault] = []
 
     def stop_faulty_trees(self) -> np.ndarray:
-        """After a commit: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
+        """After an integration: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
         plants, state = self.plants, self.plants.state
         awake = plants.awake
         rate = plants.tree_rate[awake]
@@ -52,7 +52,7 @@ class FaultGuard:
         self._faults += [Fault(plants.tick, *what) for what in zip(stopped.tolist(), rates, strict=True)][:room]
         bodies = plants.bodies_of(stopped)
         length = np.square(state.joint_q[bodies], dtype=float).sum(-1)
-        unsound = bodies[~(abs(length - 1.0) < 0.01)]  # somebody wrote a bad pose: no good one is left
+        unsound = bodies[~(abs(length - 1.0) < 0.01)]  # a bad pose was written: no good one is left
         state.joint_q[unsound] = plants.model.joint_settled[unsound]
         cut = bodies[state.body_cut[bodies]]
         state.joint_xd[cut] = 0.0

@@ -93,7 +93,7 @@ class KernelLaunches:
         """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named so."""
         filled, arrays = struct(), self.buffers.arrays
         values = {"pitch": self.buffers.pitch} | values
-        for field in struct.vars:
+        for field in structs.fields(struct):
             value = values.get(field, field)
             setattr(filled, field, arrays[value] if isinstance(value, str) else value)
         return filled
@@ -181,7 +181,7 @@ class KernelLaunches:
         matrix: Any = wp.mat33
         columns = {
             name: wp.empty(capacity * stride, dtype=matrix, device=buffers.device)
-            for name in structs.ResponseColumns.vars
+            for name in structs.fields(structs.ResponseColumns)
         }
         self._respond = self.record(
             impulse_response, self._model, stride, "response_bodies", self._factors,

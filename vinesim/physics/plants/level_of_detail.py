@@ -21,7 +21,7 @@ class LevelOfDetail:
         p = parameters
         self.plants, self.rest_rate = plants, p.detail_rate
         self.fine_steps, self.rest_steps = p.steps(p.detail_duration), p.steps(p.detail_rest_duration)
-        """Steps that a tree stays fine with nobody near, and that its clusters must be at rest."""
+        """Steps that a tree stays fine with no actor near, and that its clusters must be at rest."""
         model = plants.model
         trees = len(model.tree_first)
         self._clustered = np.flatnonzero(model.bunch_clusters > 0)

@@ -250,8 +250,8 @@ class Rollout:
 
     def _record(self) -> None:
         """Arrays for every step of a segment, and the launches that work on them, there and back."""
-        self._states = tuple(structs.JointState.vars)
-        for name, field in structs.JointState.vars.items():
+        self._states = tuple(structs.fields(structs.JointState))
+        for name, field in structs.fields(structs.JointState).items():
             self._stacks[name] = self._zeros(name, field.type.dtype, self._slots + 1)
         self._stacks[_COUNTER] = self._zeros(_COUNTER, wp.int32, self._slots + 1)
         self._steps = [(self._launch(_PREDICT, slot), self._launch(_INTEGRATE, slot)) for slot in range(self._slots)]
@@ -272,7 +272,7 @@ class Rollout:
         if not isinstance(arg.type, _STRUCT):
             return self._value(kernel, name, arg.type, written, slot, end)
         filled = arg.type()
-        for field, var in arg.type.vars.items():
+        for field, var in structs.fields(arg.type).items():
             setattr(filled, field, self._value(kernel, field, var.type, written, slot, end))
         return filled
 
@@ -333,7 +333,8 @@ class Rollout:
     def _seed(self, grad: wp.array, rows: np.ndarray) -> None:
         """Write the loss's derivatives of some ticks by the watched bodies, zero by all others."""
         seed = np.zeros((*grad.shape, rows.shape[-1]), np.float32)
-        np.add.at(seed.reshape(-1, *seed.shape[-2:]), (slice(0, len(rows)), self.watched), rows)
+        rows_of: Any = (slice(0, len(rows)), self.watched)
+        np.add.at(seed.reshape(-1, *seed.shape[-2:]), rows_of, rows)
         _fill(grad, seed)
 
     def _set(self, name: str, value: np.ndarray) -> None:

@@ -17,7 +17,7 @@ from vinesim.scene.values import HandSample
 class HandBody:
     """State of one hand and its indices in MuJoCo's arrays.
 
-    A hand follows its controller freely until it touches something. From then on it is pulled to its controller by a
+    A hand follows its controller until it touches something. From then on it is pulled to its controller by a
     spring, until it has touched nothing for ``hand_contact_duration``. A hand that holds something touches nothing.
     """
 
@@ -43,7 +43,7 @@ class HandBody:
         """[7] of the hand in the frame of what it holds."""
         self.on_plant = False
         """It holds a plant and is placed on it: see :mod:`vinesim.physics.rigid.hand_grasp`."""
-        self.collision_bits = 0, 0
+        self.collision_bits: tuple[int, int] = (0, 0)
         """MuJoCo's contype and conaffinity while the hand can touch something."""
         self.body = self.weld = -1
         self.qpos = self.dofs = slice(0)

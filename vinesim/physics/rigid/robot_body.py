@@ -16,7 +16,7 @@ from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import recompile
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction
-from vinesim.physics.rigid.urdf import RobotError, check, shapes_of, touchable
+from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, shapes_of
 from vinesim.scene.values import RobotSpec
 
 _PLANAR = ("x", "y", "yaw")
@@ -253,7 +253,7 @@ class RobotBody:
 
 def _parse(given: RobotSpec, bit: int, friction: float) -> mujoco.MjSpec:
     """A robot without base and servos from its URDF; its shapes carry the collision ``bit``."""
-    child = mujoco.MjSpec.from_string(touchable(given.urdf, frozenset(drive.joint for drive in given.drives)))
+    child = mujoco.MjSpec.from_string(collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives)))
     for geom in child.geoms:
         geom.contype, geom.conaffinity = bit, ALL_BITS & ~bit & ~GROUND & ~REMOTE_HAND
         geom.friction = contact_friction(friction)

@@ -34,7 +34,7 @@ _NONE = -1
 class SupportTracker:
     """Poses, velocities and supports of all boxes and free bunches, and which of them are at rest.
 
-    Objects are named by :func:`vinesim.scene.ids.thing`. Per object, the tracker counts the steps for which it has stayed
+    Objects are named by :func:`vinesim.scene.ids.object_id`. Per object, the tracker counts the steps for which it has stayed
     within its band about an anchor pose in its support's frame.
     """
 

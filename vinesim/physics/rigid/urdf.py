@@ -1,4 +1,4 @@
-"""URDF as the rigid world reads it: what is wrong with one, what of it can touch, what of it is seen."""
+"""URDF for the rigid world: checks, the text that MuJoCo compiles, and the shapes that sensors see."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vinesim.scene.values import RobotSpec, Shape
 
 
 class RobotError(ValueError):
-    """A robot that cannot join: the text says which one, what is wrong with it and what helps."""
+    """A robot that cannot be added; the text gives its name, the finding and a remedy."""
 
 
 def check(spec: RobotSpec) -> None:
-    """Raise :class:`RobotError` for what MuJoCo would not notice or would say in other words."""
+    """Raise :class:`RobotError` for faults that MuJoCo does not notice, or reports less clearly."""
     count = len(spec.drives)
     if np.shape(spec.home) != (count,):
         raise RobotError(f"robot {spec.name!r} has {count} drives and a home position of shape {np.shape(spec.home)}")
@@ -25,9 +25,9 @@ def check(spec: RobotSpec) -> None:
         root = ElementTree.fromstring(spec.urdf)
     except ElementTree.ParseError as error:
         raise RobotError(f"robot {spec.name!r}: its URDF is not XML: {error}") from error
-    links = {link.get("name") for link in root.findall("link")}
-    joints = {joint.get("name"): joint for joint in root.findall("joint")}
-    roots = links - {joint.find("child").get("link") for joint in joints.values()}
+    links = {link.get("name", "") for link in root.findall("link")}
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    roots = links - {child.get("link", "") for joint in joints.values() for child in joint.findall("child")}
     if roots != {spec.base}:
         raise RobotError(f"robot {spec.name!r}: base {spec.base!r} must be its URDF's root, which is {sorted(roots)}")
     for drive in spec.drives:
@@ -43,8 +43,8 @@ def check(spec: RobotSpec) -> None:
 
 
 @functools.lru_cache(16)  # robots of one kind share it
-def touchable(urdf: str, driven: frozenset[str]) -> str:
-    """The URDF as physics needs it: no pictures; joints that nobody drives and that copy nobody are fixed."""
+def collision_urdf(urdf: str, driven: frozenset[str]) -> str:
+    """The URDF that MuJoCo compiles: without visuals; joints that are neither ``driven`` nor mimic another are fixed."""
     root = ElementTree.fromstring(urdf)
     for link in root.iter("link"):
         for visual in link.findall("visual"):
@@ -63,7 +63,7 @@ def touchable(urdf: str, driven: frozenset[str]) -> str:
 
 @functools.lru_cache(16)
 def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
-    """What sensors see of each link of a URDF: its visual shapes, or its collision shapes if it has none."""
+    """Shapes of each link of a URDF for sensors: its visual shapes, or its collision shapes if it has none."""
     root = ElementTree.fromstring(urdf)
     paints = {m.get("name"): m for m in root.findall("material")}
     shapes = {}
@@ -74,7 +74,7 @@ def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
 
 
 _SURFACES = {name: name for name in SURFACES} | {"steel": "metal", "aluminium": "metal", "lens": "glass"}
-"""What a material of a URDF is made of, by a word of its name: ``rubber``, ``dark_rubber``, ``lamp_green``."""
+"""Surface of a URDF's material, by a word of its name: ``rubber``, ``dark_rubber``, ``lamp_green``."""
 
 
 def _numbers(element: ElementTree.Element | None, key: str, default: str) -> np.ndarray:

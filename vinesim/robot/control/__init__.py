@@ -1,1 +1,1 @@
-"""Controllers: joint trajectories, Cartesian motion, way points, admittance."""
+"""Controllers: joint trajectories, Cartesian motion, waypoints, admittance."""

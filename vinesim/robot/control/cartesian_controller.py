@@ -150,8 +150,8 @@ class CartesianController:
 
     def _advance_reference(self, goal: np.ndarray, speed: float, dt: float) -> np.ndarray:
         """Advance the reference by a step of a trapezoidal velocity profile; its velocity [3] m/s."""
-        way = goal - self._reference
-        left = float(np.linalg.norm(way))
+        offset = goal - self._reference
+        left = float(np.linalg.norm(offset))
         if left < 1e-9:
             self._reference_speed = 0.0
             return np.zeros(3)
@@ -159,8 +159,8 @@ class CartesianController:
         braking = np.sqrt(2.0 * self.acceleration * left)
         self._reference_speed = min(self._reference_speed + self.acceleration * dt, speed, braking)
         step = min(self._reference_speed * dt, left)
-        self._reference = self._reference + way * (step / left)
-        return way * (step / left / dt)
+        self._reference = self._reference + offset * (step / left)
+        return offset * (step / left / dt)
 
 
 def _pointing_error(axis: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
     controller = TrajectoryController(robot, robot.description.groups["arm_left"].joints)
     goal = controller.start(Trajectory(joints, times, positions), time)
     ...
-    controller(time)              # each tick, before robot.control(time)
+    controller(time)              # each step, before robot.control(time)
     if goal.outcome is Outcome.PATH_TOLERANCE_VIOLATED: ...
 
 Between waypoints the splines are cubic if velocities are given, else linear. Where the drives cannot follow, the limits
@@ -269,11 +269,11 @@ class TrajectoryController:
             return points[-1], np.zeros(points.shape[1])
         i = max(int(np.searchsorted(knots, elapsed, side="right")) - 1, 0)
         span = knots[i + 1] - knots[i]
-        s, way = (elapsed - knots[i]) / span, points[i + 1] - points[i]
+        s, change = (elapsed - knots[i]) / span, points[i + 1] - points[i]
         if self._knot_velocities is None:
-            return points[i] + s * way, way / span
+            return points[i] + s * change, change / span
         first, last = span * self._knot_velocities[i], span * self._knot_velocities[i + 1]
-        square, cube = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
+        square, cube = 3.0 * change - 2.0 * first - last, first + last - 2.0 * change
         place = points[i] + s * (first + s * (square + s * cube))
         return place, (first + s * (2.0 * square + 3.0 * s * cube)) / span
 

@@ -15,7 +15,7 @@ from vinesim.scene.values import Drive, RobotSpec
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class RobotDescription:
-    """A robot as every room needs it; constant."""
+    """A robot as loaded from its URDF and TOML file; constant."""
 
     name: str
     """The robot's name in the URDF."""
@@ -45,7 +45,7 @@ class RobotDescription:
     mass: float
     """[kg]"""
     notes: tuple[str, ...]
-    """What was changed or guessed, one line each."""
+    """What was changed or derived at loading, one line each."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -53,12 +53,12 @@ class RobotDescription:
         return tuple(drive.joint for drive in self.drives)
 
     def joint_indices(self, group: str) -> np.ndarray:
-        """Positions of a group's joints in joint arrays."""
+        """Indices of a group's joints in joint arrays; KeyError if there is no such group."""
         order = {name: i for i, name in enumerate(self.joints)}
         return np.array([order[name] for name in self.groups[group].joints], int)
 
     def link_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
-        """Pose [7] of every link in the root for drive positions; walks the tree, so not for the tick."""
+        """Pose [7] of every link in the root for drive positions; walks the tree: not for the real-time loop."""
         parents = dict(
             zip([child for _, child in self.moving_joints.frames], range(len(self.moving_joints.frames)), strict=True)
         )
@@ -80,7 +80,7 @@ class RobotDescription:
         return found
 
     def to_spec(self, name: str, index: int = 0, pose: np.ndarray | None = None) -> RobotSpec:
-        """The robot as physics needs it: called ``name``, standing at ``pose`` [7]."""
+        """The robot as physics needs it, under ``name``, with its base at ``pose`` [7] (the origin unless given)."""
         pose = frames.pose([0.0, 0.0, 0.0]) if pose is None else np.asarray(pose, float)
         return RobotSpec(
             name, index, self.urdf, self.base, pose, self.drives, self.home.copy(), self.base_limits.effort

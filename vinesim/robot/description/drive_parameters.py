@@ -34,7 +34,7 @@ def home_positions(driven: list[yourdfpy.Joint], groups: dict[str, JointGroup]) 
 
 
 def _default_home(joint: yourdfpy.Joint) -> float:
-    """Middle of the range: away from limits, and elbows bent the way they bend. Zero if that is near or endless."""
+    """Middle of the range [rad or m], so elbows are bent the way they bend; zero if near to it or continuous."""
     if joint.type == "continuous":
         return 0.0
     limits = joint_limits(joint)

@@ -6,13 +6,16 @@ import math
 import re
 from collections.abc import Container
 
-from lxml import etree
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.sidecar import JointGroup, SensorMount
 
 
 def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGroup]:
-    """Groups from names in PAL style: ``arm_left_3_joint`` is of ``arm_left``, ``gripper_left_...`` of its gripper."""
+    """Groups from joint names in the style of PAL Robotics: ``arm_left_3_joint`` belongs to ``arm_left``.
+
+    ``links``: names of all links, among which the tool of an arm is looked for.
+    """
 
     def tool(group: str) -> str:
         names = (group.replace("arm", "gripper") + "_grasping_link", group + "_tool_link")
@@ -27,7 +30,10 @@ def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGro
 
 
 def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
-    """A D435 in the first optical frame (colour before others), else in front of the first link called a camera."""
+    """A D435 in the first optical frame (colour before others), else in the first link named a camera; adds to ``notes``.
+
+    If there is no optical frame, one is added to ``root``.
+    """
     links = [link.get("name", "") for link in root.iterfind("link")]
     optical = [link for link in links if link.endswith("optical_frame")]
     colour = [link for link in optical if re.search(r"rgb|color|colour", link)]
@@ -50,7 +56,7 @@ def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, 
 
 
 def guess_lidars(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
-    """A VLP-16 in the first link called a lidar or laser, one in front before others."""
+    """A VLP-16 in the first link named a lidar or laser, one in front before others; adds to ``notes``."""
     links = [link.get("name", "") for link in root.iterfind("link")]
     found = sorted((link for link in links if re.search(r"lidar|laser|velodyne", link)), key=lambda n: "front" not in n)
     if not found:

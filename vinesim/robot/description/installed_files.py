@@ -8,7 +8,7 @@ import sys
 
 
 def find_installed(path: str) -> pathlib.Path | None:
-    """A file that a wheel of cmeel (example-robot-data and others) installed below ``share``."""
+    """A file that a wheel of cmeel (example-robot-data and others) installed below ``share``; None if missing."""
     roots = [pathlib.Path(sys.prefix) / "share"]
     cmeel = importlib.util.find_spec("cmeel")
     if cmeel is not None and cmeel.origin:

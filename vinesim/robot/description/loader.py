@@ -18,7 +18,7 @@ import pathlib
 import msgspec
 import numpy as np
 import yourdfpy
-from lxml import etree
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
@@ -69,6 +69,7 @@ def load_description(name: str | pathlib.Path) -> RobotDescription:
 
 
 def _locate(name: str) -> pathlib.Path:
+    """The URDF of that name; :class:`DescriptionError` if there is none."""
     if name == "tiago_pro":
         found = find_installed("example-robot-data/robots/tiago_pro_description/robots/tiago_pro.urdf")
         if found is None:

@@ -6,17 +6,17 @@ import pathlib
 
 import numpy as np
 import yourdfpy
-from lxml import etree
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.errors import description_error
 from vinesim.robot.description.installed_files import find_installed
 
 MESH_FORMATS = (".stl", ".obj", ".msh")
-"""What MuJoCo reads; other meshes are replaced (Collada cannot be read by it)."""
+"""File formats that MuJoCo reads; meshes of others, such as Collada, are replaced."""
 
 
 def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
-    """The file a mesh URI means: beside the URDF, in a folder above it that has the package's name, or in a wheel."""
+    """The file of a mesh URI: beside the URDF, in its package above it, or installed with a wheel; None if missing."""
     path = uri.removeprefix("file://")
     if not path.startswith("package://"):
         found = file.parent / path
@@ -31,7 +31,11 @@ def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
 
 
 def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
-    """Name meshes by absolute path; give shapes of unreadable format the link's touchable shapes instead."""
+    """Name meshes by absolute path, and replace those of unreadable formats.
+
+    Collision meshes become their bounding boxes, visual meshes the collision shapes of their link, which is added to
+    ``notes``. Raises :class:`DescriptionError` for a missing or broken file.
+    """
     for mesh in root.iterfind("link//geometry/mesh"):
         uri = mesh.get("filename", "")
         found = find_mesh(uri, file)
@@ -79,8 +83,9 @@ def _replace_by_box(shape: etree._Element, file: pathlib.Path) -> None:
         ) from error
     origin = shape.find("origin")
     values = dict(origin.attrib) if origin is not None else {}
-    turn = yourdfpy.URDF._parse_origin(etree.Element("origin", values))
-    centre = turn[:3, :3] @ (0.5 * (lower + upper)) + turn[:3, 3]
+    transform = yourdfpy.URDF._parse_origin(etree.Element("origin", values))
+    assert transform is not None, "an element has an origin"
+    centre = transform[:3, :3] @ (0.5 * (lower + upper)) + transform[:3, 3]
     if origin is None:
         origin = etree.SubElement(shape, "origin")
     origin.set("xyz", " ".join(f"{value:.9g}" for value in centre))

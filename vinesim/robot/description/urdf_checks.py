@@ -14,15 +14,15 @@ from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
 
 
 def check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Joint]:
-    """The joints from the root outwards, or an error if they are not one tree."""
+    """The joints from the root outwards; :class:`DescriptionError` if they are not one tree."""
     links = {link.name for link in robot.links}
-    for kind, things in (("link", robot.links), ("joint", robot.joints)):
-        names = [thing.name for thing in things]
+    for kind, elements in (("link", robot.links), ("joint", robot.joints)):
+        names = [element.name for element in elements]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise description_error(file, f"{kind} {twice[0]!r} is there twice", "rename one")
     if "world" in links:
-        raise description_error(file, "a link is called 'world', which is the name of everybody's world", "rename it")
+        raise description_error(file, "a link is called 'world', which is the name of the world frame", "rename it")
     if not robot.joints:
         raise description_error(file, "no joints", "give a robot with at least one joint that moves")
     parent_of: dict[str, yourdfpy.Joint] = {}
@@ -63,6 +63,7 @@ def check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Joint
 
 
 def check_joints(robot: yourdfpy.Robot, file: pathlib.Path) -> None:
+    """Raise :class:`DescriptionError` unless types, axes, limits and mimics of all joints can be simulated."""
     names = {joint.name: joint for joint in robot.joints}
     for joint in robot.joints:
         where = f"joint {joint.name!r}"
@@ -100,7 +101,10 @@ def check_joints(robot: yourdfpy.Robot, file: pathlib.Path) -> None:
 
 
 def check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: pathlib.Path, notes: list[str]) -> None:
-    """Whatever moves has a mass, and no inertia contradicts itself."""
+    """Raise :class:`DescriptionError` unless all that moves has mass and inertia, and every inertia is positive definite.
+
+    Inertias that violate the triangle inequality are added to ``notes``.
+    """
     carried: dict[str, float] = {}
     turning: dict[str, float] = {}
     anchors = link_anchors(order[0].parent, order)

@@ -6,7 +6,7 @@ import math
 import pathlib
 import re
 
-from lxml import etree
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.errors import description_error
 
@@ -14,6 +14,7 @@ MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 """Types of URDF joints that move about or along one axis."""
 
 SOLIDS = ("box", "sphere", "cylinder", "capsule", "mesh")
+"""Elements of a geometry."""
 NUMBER_COUNTS = {
     ("origin", "xyz"): 3, ("origin", "rpy"): 3, ("axis", "xyz"): 3, ("mass", "value"): 1,
     **{("inertia", key): 1 for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")},
@@ -21,10 +22,11 @@ NUMBER_COUNTS = {
     ("mimic", "multiplier"): 1, ("mimic", "offset"): 1, ("box", "size"): 3, ("sphere", "radius"): 1,
     **{(solid, key): 1 for solid in ("cylinder", "capsule") for key in ("radius", "length")}, ("mesh", "scale"): 3,
 }  # fmt: skip
-"""How many numbers an attribute has."""
+"""Count of numbers in each attribute, by element and attribute."""
 
 
 def read_xml(file: pathlib.Path) -> etree._Element:
+    """The root element; :class:`DescriptionError` if the file is not XML or its root is not ``<robot>``."""
     try:
         root = etree.fromstring(file.read_bytes(), etree.XMLParser(remove_comments=True, resolve_entities=False))
     except etree.XMLSyntaxError as error:
@@ -39,7 +41,7 @@ def read_xml(file: pathlib.Path) -> etree._Element:
 
 
 def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
-    """Every number is one, finite, as many as there must be, and every size is above zero."""
+    """Raise :class:`DescriptionError` unless all numbers are complete and finite, and all sizes above 0."""
     for element in root.iter(*{tag for tag, _ in NUMBER_COUNTS}):
         for (tag, key), count in NUMBER_COUNTS.items():
             text = element.get(key) if element.tag == tag else None
@@ -62,7 +64,7 @@ def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
 
 
 def fix_wheels(root: etree._Element, notes: list[str]) -> None:
-    """Make wheels and casters fixed: the base is driven as one body."""
+    """Make the joints of wheels and casters fixed, because the base is driven as one body; adds to ``notes``."""
     wheels = [
         joint
         for joint in root.iterfind("joint")

@@ -144,9 +144,9 @@ class PushBunch:
         self.phase, self._started = phase, time
         fast = phase in (Phase.APPROACH, Phase.RETREAT)
         self._phase_speed = self.speed if fast else self.touch_speed
-        way = np.linalg.norm(self.goal - self.arm.reference)
+        distance = np.linalg.norm(self.goal - self.arm.reference)
         # a bunch that resists may keep the tip from arriving; then the timeout ends the phase
-        self._phase_timeout = 2.0 * way / self._phase_speed + 2.0 * self._phase_speed / self.arm.acceleration + 3.0
+        self._phase_timeout = 2.0 * distance / self._phase_speed + 2.0 * self._phase_speed / self.arm.acceleration + 3.0
 
     def _is_phase_over(self, time: float) -> bool:
         elapsed = time - self._started

@@ -21,39 +21,89 @@ from vinesim.scene.generation.slots import (
     peduncle_slots,
 )
 from vinesim.scene.ids import Organ
+from vinesim.scene.plant_parameters import Cane as CaneParameters
+from vinesim.scene.plant_parameters import Peduncle as PeduncleParameters
 from vinesim.scene.plant_parameters import VineParameters
 
 
 @dataclasses.dataclass
 class Bodies:
-    """[shoot, slot]: the table that becomes the model's bodies."""
+    """The table of bodies [shoot, slot] that becomes the model's, poses in the world as drawn."""
 
     present: np.ndarray
+    """[shoot, slot] bool: the shoot has this body."""
     parent: np.ndarray
-    """Slot, -1 for the root."""
+    """[shoot, slot] slot of the parent, -1 for the root."""
     organ: np.ndarray
+    """[shoot, slot] :class:`Organ`."""
     origin: np.ndarray
+    """[shoot, slot, 3] m"""
     turn: np.ndarray
-    """World pose as drawn."""
+    """[shoot, slot, 4] quaternion."""
     length: np.ndarray
+    """[shoot, slot] m"""
     radius: np.ndarray
+    """[shoot, slot, 2] m, where the body begins and ends."""
     mass: np.ndarray
+    """[shoot, slot] kg"""
     com: np.ndarray
+    """[shoot, slot, 3] m, in the body's frame."""
     inertia: np.ndarray
+    """[shoot, slot, 3] kg m^2"""
     stiffness: np.ndarray
+    """[shoot, slot, 3] N m/rad"""
     half: np.ndarray
-    """Spring of what of a piece of wood lies behind its middle."""
+    """[shoot, slot, 3] N m/rad: spring of the half of a segment beyond its middle."""
     damping: np.ndarray
+    """[shoot, slot, 3] N m s/rad"""
     drag: np.ndarray
-    """Drag area Cd A [m^2]."""
+    """[shoot, slot] m^2, drag area Cd A."""
     head: dict[str, np.ndarray]
-    """[shoot, MAX_BUNCHES] mass, com, inertia of what of a bunch is no cluster."""
+    """[shoot, MAX_BUNCHES, ...] mass, com, inertia of the head of each bunch: what is no cluster."""
 
 
 def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
-    count = len(shoots.vine)
+    """Bodies of main axes, laterals, peduncles and bunches, with the drag of wood and bunches."""
+    count, cane, peduncle = len(shoots.vine), parameters.cane, parameters.peduncle
+    bodies = _allocate(count)
+    tip = 0.5 * cane.tip_diameter.value
+    share = np.linspace(0.0, 1.0, AXIS_SEGMENTS + 1)
+    radius = shoots.base[:, None] + (tip - shoots.base[:, None]) * share
+    green = np.clip((share[:-1] - cane.woody_share.value) / 0.2 + 0.5, 0.0, 1.0)
+    modulus = np.exp(np.log(cane.woody_modulus.value) * (1.0 - green) + np.log(cane.green_modulus.value) * green)
+    parent = np.broadcast_to(np.arange(-1, AXIS_SEGMENTS - 1), (count, AXIS_SEGMENTS))
+    _fill_rod(bodies, slice(0, AXIS_SEGMENTS), shoots.points, radius, modulus, cane, shoots.up, parent)
+
+    thin = 0.5 * cane.lateral_diameter.value
+    radius = np.broadcast_to(np.linspace(thin, 0.6 * thin, LATERAL_SEGMENTS + 1), (count, LATERAL_SEGMENTS + 1))
+    chain = np.arange(AXIS_SEGMENTS, AXIS_SEGMENTS + LATERAL_SEGMENTS - 1)
+    parent = _chain_parents(shoots.lateral_at, chain)
+    modulus = np.full(LATERAL_SEGMENTS, cane.green_modulus.value)
+    _fill_rod(bodies, LATERAL_SLOTS, shoots.lateral_points, radius, modulus, cane, shoots.up, parent)
+    bodies.present[:, LATERAL_SLOTS] = shoots.has_lateral[:, None]
+
+    for k in range(MAX_BUNCHES):
+        slots = peduncle_slots(k)
+        segments = slice(slots.start, slots.stop - 1)
+        thick = shoots.fruit["thick"][:, k]
+        radius = np.broadcast_to(thick[:, None], (count, PEDUNCLE_SEGMENTS + 1))
+        parent = _chain_parents(shoots.bunch_at[:, k], np.arange(slots.start, slots.stop - 2))
+        modulus = np.full(PEDUNCLE_SEGMENTS, peduncle.modulus.value)
+        _fill_rod(bodies, segments, shoots.peduncle[:, k], radius, modulus, peduncle, shoots.bunch_up[:, k], parent)
+        bodies.organ[:, segments] = int(Organ.PEDUNCLE)
+
+        _fill_bunch(parameters, shoots, bodies, k)
+        bodies.present[:, slots] = shoots.has_bunch[:, k, None]
+    across = bodies.radius.sum(-1) * bodies.length  # of wood seen from the side
+    wood = np.where(bodies.organ == int(Organ.BUNCH), 0.0, cane.drag.value * across)
+    bodies.drag[:, :CORE_SLOTS] += wood[:, :CORE_SLOTS]
+    return bodies
+
+
+def _allocate(count: int) -> Bodies:
+    """The table of ``count`` shoots, all of whose bodies are present, with zeros."""
     shape = (count, SLOT_COUNT)
-    bodies = Bodies(
+    return Bodies(
         present=np.ones(shape, bool), parent=np.zeros(shape, int), organ=np.full(shape, int(Organ.CANE)),
         origin=np.zeros((*shape, 3)), turn=np.zeros((*shape, 4)), length=np.zeros(shape), radius=np.zeros((*shape, 2)),
         mass=np.zeros(shape), com=np.zeros((*shape, 3)), inertia=np.zeros((*shape, 3)),
@@ -62,83 +112,15 @@ def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
         head={"mass": np.zeros((count, MAX_BUNCHES)), "com": np.zeros((count, MAX_BUNCHES, 3)),
               "inertia": np.zeros((count, MAX_BUNCHES, 3))},
     )  # fmt: skip
-    cane, peduncle = parameters.cane, parameters.peduncle
 
-    tip = 0.5 * cane.tip_diameter.value
-    share = np.linspace(0.0, 1.0, AXIS_SEGMENTS + 1)
-    radius = shoots.base[:, None] + (tip - shoots.base[:, None]) * share
-    green = np.clip((share[:-1] - cane.woody_share.value) / 0.2 + 0.5, 0.0, 1.0)
-    modulus = np.exp(np.log(cane.woody_modulus.value) * (1.0 - green) + np.log(cane.green_modulus.value) * green)
-    parent = np.broadcast_to(np.arange(-1, AXIS_SEGMENTS - 1), (count, AXIS_SEGMENTS))
-    _fill_rod(
-        bodies,
-        slice(0, AXIS_SEGMENTS),
-        shoots.points,
-        radius,
-        modulus,
-        cane.density.value,
-        cane.damping.value,
-        shoots.up,
-        parent,
-    )
 
-    thin = 0.5 * cane.lateral_diameter.value
-    radius = np.broadcast_to(np.linspace(thin, 0.6 * thin, LATERAL_SEGMENTS + 1), (count, LATERAL_SEGMENTS + 1))
-    parent = np.concatenate(
-        [
-            shoots.lateral_at[:, None],
-            np.broadcast_to(
-                np.arange(AXIS_SEGMENTS, AXIS_SEGMENTS + LATERAL_SEGMENTS - 1), (count, LATERAL_SEGMENTS - 1)
-            ),
-        ],
-        1,
-    )
-    modulus = np.full(LATERAL_SEGMENTS, cane.green_modulus.value)
-    _fill_rod(
-        bodies,
-        LATERAL_SLOTS,
-        shoots.lateral_points,
-        radius,
-        modulus,
-        cane.density.value,
-        cane.damping.value,
-        shoots.up,
-        parent,
-    )
-    bodies.present[:, LATERAL_SLOTS] = shoots.has_lateral[:, None]
-
-    for k in range(MAX_BUNCHES):
-        slots = peduncle_slots(k)
-        pieces = slice(slots.start, slots.stop - 1)
-        thick = shoots.fruit["thick"][:, k]
-        radius = np.broadcast_to(thick[:, None], (count, PEDUNCLE_SEGMENTS + 1))
-        chain = np.broadcast_to(np.arange(slots.start, slots.stop - 2), (count, PEDUNCLE_SEGMENTS - 1))
-        parent = np.concatenate([shoots.bunch_at[:, k, None], chain], 1)
-        modulus = np.full(PEDUNCLE_SEGMENTS, peduncle.modulus.value)
-        _fill_rod(
-            bodies,
-            pieces,
-            shoots.peduncle[:, k],
-            radius,
-            modulus,
-            peduncle.density.value,
-            peduncle.damping.value,
-            shoots.bunch_up[:, k],
-            parent,
-        )
-        bodies.organ[:, pieces] = int(Organ.PEDUNCLE)
-
-        _fill_bunch(parameters, shoots, bodies, k)
-        bodies.present[:, slots] = shoots.has_bunch[:, k, None]
-    across = bodies.radius.sum(-1) * bodies.length  # of wood seen from the side
-    bodies.drag[:, :CORE_SLOTS] += np.where(bodies.organ == int(Organ.BUNCH), 0.0, cane.drag.value * across)[
-        :, :CORE_SLOTS
-    ]
-    return bodies
+def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
+    """Parents [shoot, segment] of a rod that grows on slot ``first`` [shoot]; ``chain`` [segment - 1] are its own slots."""
+    return np.concatenate([first[:, None], np.broadcast_to(chain, (len(first), len(chain)))], 1)
 
 
 def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: int) -> None:
-    """Fill the slots of the bunch at the end of stalk ``k`` and of its clusters."""
+    """Fill the slots of the bunch at the end of peduncle ``k`` and of its clusters."""
     bunch, clusters = peduncle_slots(k).stop - 1, cluster_slots(k)
     bodies.present[:, clusters] = False
     has = np.flatnonzero(shoots.has_bunch[:, k])
@@ -178,17 +160,27 @@ def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: i
 
 
 def _fill_rod(
-    bodies: Bodies, slots: slice, points: np.ndarray, radius: np.ndarray, modulus: np.ndarray, density: float,
-    damping: float, up: np.ndarray, parent: np.ndarray,
+    bodies: Bodies, slots: slice, points: np.ndarray, radius: np.ndarray, modulus: np.ndarray,
+    wood: CaneParameters | PeduncleParameters, up: np.ndarray, parent: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill the slots of one axis: points [shoot, piece + 1, 3], radius [shoot, piece + 1], modulus [piece].
+    """Fill the slots of one axis of every shoot. It is a root, or grows on the tip of its parent.
 
-    It is a root, or grows on its parent's tip.
+    Args:
+        bodies: the table.
+        slots: of its segments.
+        points: [shoot, segment + 1, 3] m.
+        radius: [shoot, segment + 1] m.
+        modulus: [segment] Pa.
+        wood: gives density and damping.
+        up: [shoot, 3] direction that the z axes lean to.
+        parent: [shoot, segment] slots.
     """
     along = np.diff(points, axis=1)
     length = np.linalg.norm(along, axis=-1)
     start, end = radius[:, :-1], radius[:, 1:]
-    mass, inertia, near, bodies.half[:, slots] = builder.segment_properties(length, start, end, modulus, density)
+    mass, inertia, near, bodies.half[:, slots] = builder.segment_properties(
+        length, start, end, modulus, wood.density.value
+    )
     bodies.parent[:, slots] = parent
     bodies.origin[:, slots] = points[:, :-1]
     bodies.turn[:, slots] = turn = frames.from_x_axis(along, up[:, None])
@@ -205,4 +197,4 @@ def _fill_rod(
     bodies.com[:, slots, 0] = 0.5 * length
     bodies.inertia[:, slots] = inertia
     bodies.stiffness[:, slots] = stiffness
-    bodies.damping[:, slots] = damping * stiffness
+    bodies.damping[:, slots] = wood.damping.value * stiffness

@@ -1,0 +1,42 @@
+"""Values that packages exchange: small frozen dataclasses, so that sibling packages never import each other.
+
+Times are simulation seconds. Arrays are numpy, poses and velocities as in :mod:`vinesim.frames`.
+A value that leaves the physics thread owns its arrays: they are never written afterwards.
+"""
+
+from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec
+from vinesim.scene.values.measurement import Measurement
+from vinesim.scene.values.network import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
+from vinesim.scene.values.robot import Drive, ElasticSample, Imu, JointSample, RobotSample, RobotSpec, Wrench
+from vinesim.scene.values.sensors import CameraFrame, CameraInfo, LidarScan
+from vinesim.scene.values.world import Contact, Detachment, Snapshot
+
+__all__ = [
+    "POINT_NAMES",
+    "CameraFrame",
+    "CameraInfo",
+    "Contact",
+    "Detachment",
+    "Drive",
+    "ElasticSample",
+    "HandSample",
+    "Haptic",
+    "HumanPose",
+    "HumanSpec",
+    "HumanUpdate",
+    "Imu",
+    "JointSample",
+    "LidarScan",
+    "Measurement",
+    "Mesh",
+    "ObjectUpdate",
+    "RigidVisual",
+    "RobotSample",
+    "RobotSpec",
+    "RobotUpdate",
+    "Shape",
+    "Snapshot",
+    "TreeUpdate",
+    "Wrench",
+]

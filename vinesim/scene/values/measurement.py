@@ -1,0 +1,19 @@
+"""One line of a benchmark."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Measurement:
+    """One line of ``vinesim bench``: ours beside a peer that ran in the same process on the same scene."""
+
+    bench: str
+    case: str
+    value: float
+    unit: str
+    peer: str = ""
+    peer_value: float | None = None
+    ratio: float | None = None
+    """How many times better than the peer (above 1 is better), whatever the unit."""

@@ -1,0 +1,140 @@
+"""Robots: what physics needs of them, and what they measure of themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.scene.values.world import Contact
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Drive:
+    """One actuated joint of a robot: a servo with limits."""
+
+    joint: str
+    stiffness: float
+    """Position gain [N m/rad or N/m]."""
+    damping: float
+    """Velocity gain [N m s/rad or N s/m]."""
+    effort: float
+    """Largest effort [N m or N]."""
+    velocity: float
+    """Largest speed [rad/s or m/s]."""
+    lower: float
+    upper: float
+    """Limits of the joint [rad or m]."""
+    armature: float = 0.0
+    """Inertia of motor and gear seen from the joint [kg m2 or kg]: the gear ratio squared makes it the larger part.
+
+    A stiff servo at its effort limit needs it: a bare hand of 0.02 kg m2 under 40 N m gains 20 rad/s in a tick.
+    """
+    series_stiffness: float = 0.0
+    """Stiffness of the spring between gear and joint [N m/rad or N/m]; 0: the position gain stands for it."""
+    series_damping: float = 0.0
+    """Damping of that spring [N m s/rad or N s/m]; of no meaning if ``series_stiffness`` is 0."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RobotSpec:
+    """A robot as physics needs it. ``robot/description/description.py`` makes one from a URDF."""
+
+    name: str
+    """The actor's name: prefix of everything it owns."""
+    index: int
+    """Index of its label."""
+    urdf: str
+    """URDF as text, every mesh by absolute path."""
+    base: str
+    """Name of the root link, whose origin stands on the ground (base_footprint)."""
+    pose: np.ndarray
+    """[7] start pose of the base in the world."""
+    drives: tuple[Drive, ...]
+    """In the order of joint arrays everywhere else (commands, samples, updates)."""
+    home: np.ndarray
+    """[joint] start position."""
+    base_effort: tuple[float, float] = (800.0, 400.0)
+    """Largest force [N] and moment [N m] with which the tracks hold or drive the base."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class JointSample:
+    """Joints of one robot at one instant, in the order of ``names``."""
+
+    time: float
+    names: tuple[str, ...]
+    position: np.ndarray
+    """[joint] rad or m"""
+    velocity: np.ndarray
+    """[joint] rad/s or m/s"""
+    effort: np.ndarray
+    """[joint] N m or N: what the drive transmits; at rest gravity load minus J^T f of the contacts."""
+    contact: np.ndarray
+    """[joint] N m or N: J^T f of the contacts alone."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ElasticSample:
+    """The series elastic element of every joint at one instant (D6.4 section 3.1): a spring between motor and link."""
+
+    time: float
+    names: tuple[str, ...]
+    stiffness: np.ndarray
+    """[joint] N m/rad or N/m"""
+    motor: np.ndarray
+    """[joint] rad or m: the motor, seen from behind its gear; the link is at ``motor - deflection``."""
+    deflection: np.ndarray
+    """[joint] rad or m"""
+    torque: np.ndarray
+    """[joint] N m or N: stiffness times deflection, all that the joint carries."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Wrench:
+    """What a force-torque sensor measures: the pull of all that lies beyond it, weight and inertia included."""
+
+    time: float
+    name: str
+    frame: str
+    force: np.ndarray
+    """[3] N on the sensor, in its frame: a hand at rest weighs down."""
+    torque: np.ndarray
+    """[3] N m about the frame's origin."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Imu:
+    """What an inertial measurement unit measures (sensor_msgs/Imu), without noise."""
+
+    time: float
+    name: str
+    frame: str
+    orientation: np.ndarray
+    """[4] of the frame in the world."""
+    angular_velocity: np.ndarray
+    """[3] rad/s in the frame."""
+    linear_acceleration: np.ndarray
+    """[3] m/s2 in the frame; at rest it reads 9.81 upwards (REP-145)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RobotSample:
+    """What a robot knows of itself at one instant."""
+
+    actor: str
+    joints: JointSample
+    base_q: np.ndarray
+    """[7] base_footprint in the world (= ``map``)."""
+    base_qd: np.ndarray
+    """[6] its velocity, world axes."""
+    odom_q: np.ndarray
+    """[7] base_footprint as odometry believes it, in ``odom``."""
+    transforms: tuple[tuple[str, str], ...]
+    """(parent frame, child frame) of every moving joint, the same tuple object every tick."""
+    transform_q: np.ndarray
+    """[transform, 7] child in parent."""
+    contacts: tuple[Contact, ...] = ()
+    elements: ElasticSample | None = None
+    wrenches: tuple[Wrench, ...] = ()
+    imus: tuple[Imu, ...] = ()

@@ -1,0 +1,81 @@
+"""What cameras and lidars measure."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.scene.ids import LABEL_STRIDE
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """Pinhole intrinsics (sensor_msgs/CameraInfo; plumb_bob with zero distortion)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    frame_id: str
+    """Optical frame: z forward, x right, y down."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """One RGB-D picture."""
+
+    time: float
+    name: str
+    info: CameraInfo
+    pose: np.ndarray
+    """[7] optical frame in the world when the picture was taken."""
+    rgb: np.ndarray
+    """[height, width, 3] uint8"""
+    depth: np.ndarray
+    """[height, width] float32 m along z; NaN no return, -Inf too near, +Inf too far (REP-118)."""
+    labels: np.ndarray
+    """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
+    exact_depth: np.ndarray | None = None
+    """[height, width] float32 m along z, whatever the sensor can measure: no noise, no gaps; +Inf for the sky."""
+
+    @property
+    def organs(self) -> np.ndarray:
+        """[height, width] :class:`~vinesim.scene.ids.Organ` of each pixel; 0 is nothing."""
+        return self.labels // LABEL_STRIDE
+
+    @property
+    def instances(self) -> np.ndarray:
+        """[height, width] index of the bunch, box, tree or actor of each pixel, counted for each organ from 0."""
+        return self.labels % LABEL_STRIDE
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class LidarScan:
+    """One revolution of a lidar; shots that returned nothing are left out."""
+
+    time: float
+    """Time of the first firing [s]."""
+    name: str
+    frame_id: str
+    pose: np.ndarray
+    """[7] of the lidar in the world at ``time``."""
+    xyz: np.ndarray
+    """[point, 3] float32 m, in the lidar's frame (x forward, z up) at the firing of each point."""
+    intensity: np.ndarray
+    """[point] float32 0..255"""
+    ring: np.ndarray
+    """[point] uint16"""
+    offset: np.ndarray
+    """[point] float32 s after ``time``."""
+    labels: np.ndarray
+    """[point] int32"""
+    returned: np.ndarray | None = None
+    """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
+
+    @property
+    def organs(self) -> np.ndarray:
+        """[point] :class:`~vinesim.scene.ids.Organ` that each point lies on."""
+        return self.labels // LABEL_STRIDE

@@ -1,0 +1,64 @@
+"""The world at one instant or in one step: snapshots for sensors, contacts, detachments."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.scene.values.rigid import RigidVisual
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
+
+    time: float
+    """[s]"""
+    tick: int
+    body_q: np.ndarray
+    """Plant bodies [body, 7] m, 1."""
+    bunch_attached: np.ndarray
+    """[bunch] bool"""
+    visuals: tuple[RigidVisual, ...]
+    """Rigid bodies; the same tuple object as long as no actor comes or goes."""
+    visual_q: np.ndarray
+    """Their poses [link, 7] m, 1."""
+    moved_trees: np.ndarray
+    """Indices of the trees that are awake [k]: only these have moved since they fell asleep."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Contact:
+    """One contact of a rigid body with a plant, as solved in one tick."""
+
+    actor: str
+    link: str
+    body: int
+    """Plant body in the model."""
+    position: np.ndarray
+    """[3] m, world"""
+    force: np.ndarray
+    """[3] N on the rigid body, world axes; the plant feels the opposite."""
+    distance: float
+    """Gap [m], negative when they overlap."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Detachment:
+    """Something left its plant: a bunch its peduncle, or a cane the rest of its tree."""
+
+    tick: int
+    tree: int
+    body: int
+    """The body that left; what grows on it went with it."""
+    bunch: int
+    """Which bunch, -1 for a cane."""
+    cause: str
+    """``"pull"`` (too much force), ``"bend"`` (too much moment), ``"blade"`` (a cutter closed on it), ``"command"``."""
+    actor: str
+    """Whose doing it was, as far as is known; empty otherwise."""
+    force: np.ndarray
+    """[3] N that the joint carried at the end, world axes, on what left."""
+    moment: np.ndarray
+    """[3] N m about the joint."""
