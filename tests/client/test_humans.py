@@ -16,7 +16,7 @@ from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, start_pose
 from vinesim.net.codec import human as poses
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
 from vinesim.robot.description.description import RobotDescription

@@ -16,7 +16,7 @@ from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.recording.mcap_file import Recording, RecordingWriter, read
 from vinesim.net.replication.exchange import WorldMismatch
 from vinesim.net.replication.interest import INTEREST_RADIUS
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 
 EPOCH = 1.7e9
@@ -88,7 +88,9 @@ def test_what_was_said_is_on_the_tape(tmp_path):
     # all that bob heard of trees and events is there, in the same order and to the bit
     heard = [messages.decode_trees(e.payload) for e in tape.messages if e.key == "c/0/0/ada"]
     assert len(heard) > 90
-    last = [e for e in tape.messages if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.TREES][-1]
+    last = [
+        e for e in tape.messages if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.MessageKind.TREES
+    ][-1]
     rest = messages.decode_trees(last.payload)
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.ada.read(0)[0])
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.bob.read(0)[0])

@@ -14,7 +14,8 @@ from vinesim.client.recording.replay import Replay, ReplayBus
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.recording.mcap_file import Recording, read
-from vinesim.net.transport.bus import KEEP_ALL, MemoryHub, NameTaken
+from vinesim.net.transport.bus import KEEP_ALL, NameTaken
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 
 
@@ -50,7 +51,9 @@ def watch(tape: Recording, **span: float) -> tuple[Light, list[bytes], list[tupl
 
 def recorded_trees(tape: Recording) -> list[messages.TreeStates]:
     kinds = (entry.payload for entry in tape.messages if entry.key in ("c/0/0/ada", "own/0/0/ada"))
-    return [messages.decode_trees(payload) for payload in kinds if messages.kind_of(payload) == messages.TREES]
+    return [
+        messages.decode_trees(payload) for payload in kinds if messages.kind_of(payload) == messages.MessageKind.TREES
+    ]
 
 
 def test_a_viewer_sees_what_was_recorded(tape):

@@ -21,7 +21,7 @@ from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_file import InvalidRecording, Recording, RecordingWriter, read
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene

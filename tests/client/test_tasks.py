@@ -11,7 +11,7 @@ from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.tasks import UnknownTask, plan_task
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.drives.robot import Robot

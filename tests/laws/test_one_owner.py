@@ -12,7 +12,7 @@ from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.exchange import Replicator
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import is_tree
 from vinesim.scene.values import RobotUpdate
 

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vinesim import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec import control, messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.exchange import Inbox, Replicator, WorldMismatch
-from vinesim.net.transport.bus import MemoryBus, MemoryHub
+from vinesim.net.transport.memory_bus import MemoryBus, MemoryHub
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -198,7 +198,7 @@ def test_the_protocols_of_both_are_named():
     hub = MemoryHub()
     old = hub.bus("old")
     old.declare_queryable(
-        "hello/old", lambda _: messages._pack(messages.HELLO, Hello("old", digest="same", protocol=7))
+        "hello/old", lambda _: control._pack(messages.MessageKind.HELLO, Hello("old", digest="same", protocol=7))
     )
     new = Client(hub, "new", 1.0)
     with pytest.raises(WorldMismatch, match=r"'old' speaks protocol version 7, 'new' version 1"):

@@ -17,7 +17,7 @@ from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate

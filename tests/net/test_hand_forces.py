@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vinesim.net.replication.hand_forces import MAX_AGE, WrenchSync
-from vinesim.net.transport.bus import MemoryBus, MemoryHub
+from vinesim.net.transport.memory_bus import MemoryBus, MemoryHub
 
 PUSH = np.array([10.0, 0.0, -5.0, 0.1, 0.2, 0.3])
 TICK = 0.01

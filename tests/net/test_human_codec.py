@@ -12,16 +12,14 @@ from hypothesis import strategies as st
 from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import (
-    WrenchMessage,
     decode_human,
     decode_pose,
-    decode_wrenches,
     encode_human,
     encode_pose,
-    encode_wrenches,
     quantise_pose,
 )  # fmt: skip
 from vinesim.net.codec.messages import MessageError
+from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
@@ -89,14 +87,16 @@ def test_a_pose_that_cannot_be_does_not_leave(point, wrong):
         encode_human(dataclasses.replace(told, pose=told.pose.with_points(points)))
 
 
-def test_pushes_arrive_as_they_left():
-    push = WrenchMessage(3.0, {"arm_left_3_link": np.array([1.0, -2.5, 30.0, 0.5, 0.0, -0.25]), "chassis": np.zeros(6)})
-    payload = encode_wrenches(push)
+def test_messagees_arrive_as_they_left():
+    message = WrenchMessage(
+        3.0, {"arm_left_3_link": np.array([1.0, -2.5, 30.0, 0.5, 0.0, -0.25]), "chassis": np.zeros(6)}
+    )
+    payload = encode_wrenches(message)
     assert len(payload) == 14 + 25 + 15 + 25 + 7
     heard = decode_wrenches(payload)
     assert heard.time == 3.0
-    assert heard.wrenches.keys() == push.wrenches.keys()
-    for link, wrench in push.wrenches.items():
+    assert heard.wrenches.keys() == message.wrenches.keys()
+    for link, wrench in message.wrenches.items():
         np.testing.assert_array_equal(heard.wrenches[link], wrench)
     assert decode_wrenches(encode_wrenches(WrenchMessage(4.0, {}))).wrenches == {}
     with pytest.raises(MessageError, match="too strong"):
@@ -130,7 +130,11 @@ def test_whatever_arrives_is_read_or_refused_in_words(payload, data):
 
 @pytest.mark.parametrize("payload", MESSAGES)
 def test_a_message_that_is_cut_off_is_refused(payload):
-    read = decode_wrenches if messages.kind_of(payload) == messages.FORCE else lambda raw: decode_human(raw, "eva")
+    read = (
+        decode_wrenches
+        if messages.kind_of(payload) == messages.MessageKind.WRENCHES
+        else lambda raw: decode_human(raw, "eva")
+    )
     for length in range(len(payload)):
         with pytest.raises(MessageError):
             read(payload[:length])

@@ -16,7 +16,7 @@ from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.exchange import Replicator
 from vinesim.net.replication.jitter_buffer import MAX_DELAY, MAX_SAMPLES, JitterBuffer
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.values import RobotUpdate
 
 times = st.lists(st.integers(0, 200), min_size=1, max_size=40, unique=True).map(

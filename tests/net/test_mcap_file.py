@@ -19,7 +19,8 @@ from mcap.writer import Writer
 
 from tests.support.waiting import TIMEOUT
 from vinesim.net.codec import messages
-from vinesim.net.codec.human import WrenchMessage, encode_human, encode_wrenches
+from vinesim.net.codec.human import encode_human
+from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
 from vinesim.net.recording import mcap_file
 from vinesim.net.recording.mcap_file import InvalidRecording, RecordingStopped, RecordingWriter, free_path, read
 from vinesim.physics.rigid.human_posture import standing_pose

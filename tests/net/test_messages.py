@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vinesim import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec import messages, rotation
 from vinesim.net.codec.messages import Hello, MessageError, TreeStates, WrongVersion
 from vinesim.net.replication.authority import Claim
 from vinesim.scene import ids
@@ -128,10 +128,10 @@ def test_owner_and_copies_agree_to_the_bit_in_messages_of_a_datagram(seed, sizes
 @given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3))
 def test_lean_rotations_are_those_of_frames(vector):
     v = np.array(vector)
-    np.testing.assert_allclose(messages.quaternion(v), frames.exp(v), atol=1e-12)
+    np.testing.assert_allclose(rotation.quaternion(v), frames.exp(v), atol=1e-12)
     q = frames.exp(v)
     # at half a turn both signs of the axis are right: compare the rotations, not the vectors
-    assert between(frames.exp(messages.rotation_vector(q)), q) < 1e-6
+    assert between(frames.exp(rotation.rotation_vector(q)), q) < 1e-6
 
 
 def test_one_update_per_tree_with_its_own_joints():
@@ -201,9 +201,9 @@ def test_records_are_held_against_the_vineyard():
     batch = dataclasses.replace(trees(np.random.default_rng(0), [4, 6]), tree=np.array([1, 2]))
     payload = one_message(batch)
     messages.decode_trees(payload, np.array([9, 4, 6]))
-    with pytest.raises(MessageError, match="tree 2, this vineyard has 2"):
+    with pytest.raises(MessageError, match="tree 2, this scene has 2"):
         messages.decode_trees(payload, np.array([9, 4]))
-    with pytest.raises(MessageError, match="tree 2 with 6 bodies, this vineyard's has 5"):
+    with pytest.raises(MessageError, match="tree 2 with 6 bodies, in this scene it has 5"):
         messages.decode_trees(payload, np.array([9, 4, 5]))
 
 
@@ -323,7 +323,7 @@ def test_a_thing_that_is_none_is_refused(number):
     (payload,), _ = messages.encode_objects(dataclasses.replace(batch, object=np.array([number])), (0, 0))
     with pytest.raises(MessageError, match="of no kind"):
         messages.decode_objects(payload, (0, 0))
-    with pytest.raises(MessageError, match="bunch 17, this vineyard has 17"):
+    with pytest.raises(MessageError, match="bunch 17, this scene has 17"):
         messages.check_object_id(ids.object_id(ids.ObjectKind.BUNCH, 17), (100, 17, 2))
 
 
@@ -357,7 +357,7 @@ def test_facts_come_back_as_they_were_said():
     assert heard == told
     assert heard[0].claim == Claim(3, 65535, "picker")
     assert ids.split_object_id(heard[0].object) == (ids.ObjectKind.BUNCH, 17)
-    assert messages.kind_of(messages.encode_records(told)) == messages.FACTS
+    assert messages.kind_of(messages.encode_records(told)) == messages.MessageKind.RETAINED
 
 
 @pytest.mark.parametrize(
@@ -366,12 +366,12 @@ def test_facts_come_back_as_they_were_said():
         ({"object": 3 * ids.OBJECT_STRIDE}, "of no kind"),
         ({"object": -1}, "of no kind"),
         ({"authority": 65536}, "with claim"),
-        ({"author": "a/b"}, "fact by 'a/b'"),
+        ({"author": "a/b"}, "record by 'a/b'"),
         ({"pose": (np.nan, 0, 0, 0, 0, 0, 1.0)}, "not finite"),
         ({"pose": (0, 0, 2e5, 0, 0, 0, 1.0)}, "too far away"),
         ({"pose": (0, 0, 0, 0, 0, 0, 0.5)}, "no unit quaternion"),
-        ({"cut": (-1,)}, "cannot be"),
-        ({"parent": "x" * 201}, "cannot be"),
+        ({"cut": (-1,)}, "impossible"),
+        ({"parent": "x" * 201}, "impossible"),
     ],
 )
 def test_a_fact_that_cannot_be_is_refused_in_words(change, words):

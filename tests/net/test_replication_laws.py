@@ -1,4 +1,4 @@
-"""Laws of the network, on any network: whatever is delayed, lost, doubled or overtaken, and whoever comes and goes."""
+"""Laws of the network, on any network: whatever is delayed, lost, duplicated or overtaken, and whoever comes and goes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.support.shared_vineyard import Server
 from vinesim.bench.support.fake_client import FakeClient, row
 from vinesim.net.codec import messages
 from vinesim.net.replication import interest
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 
 TICK = 0.01
@@ -102,8 +102,8 @@ def play(world: World, name: str, act: str, number: int, picked: set[int]) -> No
 
 @given(stories, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]), st.sampled_from([0.0, 0.3]))
 @settings(max_examples=4, deadline=None)
-def test_after_any_story_all_agree_and_nothing_picked_hangs_again(story, seed, loss, doubled):
-    world = World("ada", "bob", "cleo", delay=0.03, jitter=0.02, loss=loss, doubled=doubled, seed=seed)
+def test_after_any_story_all_agree_and_nothing_picked_hangs_again(story, seed, loss, duplicated):
+    world = World("ada", "bob", "cleo", delay=0.03, jitter=0.02, loss=loss, duplicated=duplicated, seed=seed)
     world.run(0.4)
     picked: set[int] = set()
     for (name, act, number), ticks in story:

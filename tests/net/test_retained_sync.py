@@ -6,7 +6,8 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.counters import Counters
 from vinesim.net.replication.retained_sync import RetainedSync
-from vinesim.net.transport.bus import KEEP_ALL, MemoryHub
+from vinesim.net.transport.bus import KEEP_ALL
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 
 HERE, THERE = (0, 0), (7, 7)

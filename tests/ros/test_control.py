@@ -24,7 +24,7 @@ from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.client import Client
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.ros.node import Node
 from vinesim.scene.builder import assemble

@@ -10,7 +10,7 @@ from tests.support.contact_forces import pressed_on_ground
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import pick_planning, start_poses
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.scene.generation.vineyard import generate

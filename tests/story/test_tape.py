@@ -120,7 +120,9 @@ def story(tmp_path_factory) -> Iterator[tuple[str, pathlib.Path, float]]:
 def rests(path: pathlib.Path) -> list[messages.TreeStates]:
     tape = tape_of(path)
     events = [entry.payload for entry in tape.messages if entry.key == "own/0/0/ada"] if tape else []
-    trees = [messages.decode_trees(payload) for payload in events if messages.kind_of(payload) == messages.TREES]
+    trees = [
+        messages.decode_trees(payload) for payload in events if messages.kind_of(payload) == messages.MessageKind.TREES
+    ]
     return [batch for batch in trees if batch.flags[0] & messages.RESTING]
 
 

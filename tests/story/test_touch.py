@@ -6,7 +6,7 @@ import pytest
 from vinesim.client.client import Client
 from vinesim.client.recording.trace import Trace, remote_error, touch_to_motion
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate

@@ -14,7 +14,8 @@ from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.net.codec import messages
 from vinesim.net.replication.retained import RetainedState
-from vinesim.net.transport.bus import KEEP_ALL, MemoryBus, MemoryHub
+from vinesim.net.transport.bus import KEEP_ALL
+from vinesim.net.transport.memory_bus import MemoryBus, MemoryHub
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble

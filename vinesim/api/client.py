@@ -21,7 +21,7 @@ import numpy as np
 from vinesim.api.simulation import base_pose
 from vinesim.client.client import Client as RobotClient
 from vinesim.client.tasks.start_poses import start_pose
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.robot import Robot

@@ -16,11 +16,12 @@ import numpy as np
 from vinesim import frames
 from vinesim.bench.support.fake_client import FakeClient, row, swung
 from vinesim.net.codec import messages
-from vinesim.net.codec.human import WrenchMessage, encode_pose, encode_wrenches
+from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
 from vinesim.scene.values import Measurement

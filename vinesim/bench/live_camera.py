@@ -13,7 +13,7 @@ from vinesim.client.recording.trace import Trace
 from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, start_pose
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate

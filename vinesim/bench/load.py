@@ -40,11 +40,11 @@ APART = 8.0
 PROBE = """
 import json, struct, sys, threading, time
 from vinesim.net.transport.zenoh_bus import ZenohBus
-from vinesim.net.transport.bus import EVERY
+from vinesim.net.transport.bus import KEEP_ALL
 
 here, there, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])
 with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", connect=there, world="probe") as b:
-    b.subscribe("a/probe_a", EVERY)
+    b.subscribe("a/probe_a", KEEP_ALL)
     publisher = a.publisher("a/probe_a")
     end = time.monotonic() + 10.0
     while not publisher.matching and time.monotonic() < end:
@@ -54,7 +54,7 @@ with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", 
     def listen():
         while not over.is_set():
             now = time.monotonic()
-            ages.extend(now - struct.unpack_from("d", payload)[0] for _, payload in b.drain())
+            ages.extend(now - struct.unpack_from("d", payload)[0] for _, payload in b.poll())
             time.sleep(0.0005)
 
     over = threading.Event()

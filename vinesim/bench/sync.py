@@ -27,7 +27,8 @@ from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.exchange import Inbox
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.peers import ACTOR_PERIOD
-from vinesim.net.transport.bus import KEEP_ALL, MemoryHub
+from vinesim.net.transport.bus import KEEP_ALL
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description as load_robot

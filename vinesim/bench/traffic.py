@@ -17,7 +17,7 @@ import numpy as np
 from vinesim.bench.support.fake_client import FakeClient
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import encode_pose
-from vinesim.net.transport.bus import MemoryHub
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene

@@ -20,7 +20,8 @@ from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
-from vinesim.net.transport.bus import Bus, MemoryHub
+from vinesim.net.transport.bus import Bus
+from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model

@@ -231,7 +231,7 @@ class Recorder:
             self.malformed += 1
         if family == "a" and "poses" not in self._only:
             return
-        if family == "c" and self._only.isdisjoint({"trees"} if kind == messages.TREES else {"things"}):
+        if family == "c" and self._only.isdisjoint({"trees"} if kind == messages.MessageKind.TREES else {"things"}):
             return
         self._put(key, payload)
 

@@ -1,59 +1,61 @@
-"""Poses of people, and the wrenches that hands give to robots, byte by byte; and poses of whoever it may be.
+"""Wire format of a person's pose, and encoding of any actor's pose.
 
-Of a person cross the network: the root, the three inputs (head, two hands), hips and feet (CANOPIES D6.4, section 5.3),
-how the fingers are bent, and how fast all that moves. All but the root is told from the root: positions in steps of
-0.2 mm, up to 6.5 m away. Velocities are i8 of the message's own scales. 161 bytes, whatever the person does.
+A person is transmitted as the root, the tracked points (head, two hands; CANOPIES D6.4, section 5.3), hips and feet, the
+flexion of ten fingers, four flags and the velocities of all points: always 161 bytes. Positions except the root are
+relative to the root in steps of 0.2 mm, up to 6.5 m; rotations are rotation vectors of 3 i16; velocities are i8 of two
+scales of the message.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import struct
 
 import numpy as np
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import FORCE, HUMAN, MAX_COORDINATE, TURN_LSB, MessageError, quaternion, rotation_vector
+from vinesim.net.codec import robot
+from vinesim.net.codec.header import (
+    HEADER,
+    MAX_COORDINATE,
+    MessageError,
+    MessageKind,
+    kind_of,
+    pack_header,
+    unpack_header,
+)
+from vinesim.net.codec.rotation import TURN_LSB, quaternion, rotation_vector
 from vinesim.scene.values import POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
 POSITION_LSB = 2e-4
-"""Unit of a point's place from the root [m]; what is farther than 6.5 m is clipped."""
+"""Quantisation step of a position relative to the root [m]; clipped at 6.5 m."""
 
 VELOCITY_LSB = 1e-5
-"""Unit of a message's scales of velocity [m/s, rad/s]: 83 at most, faster ones are clipped."""
+"""Quantisation step of the two velocity scales [m/s, rad/s]; velocities are clipped at 83."""
 
 FINGER_SCALE = 255.0
-"""Steps of a finger from straight to bent all the way."""
-
-MAX_WRENCH = 2000.0
-"""No wrench is greater [N, N m]: it is refused."""
-
-MAX_LINKS = 64
-"""Links of one robot that one person may push at once."""
+"""Quantisation steps from a straight finger (0) to a fully bent one (1)."""
 
 _POINTS = len(POINT_NAMES)
+
 _HUMAN = struct.Struct(f"<3f{6 * _POINTS - 3}h2H{6 * _POINTS}bB10B")
+
 _FLAGS = ("left_closed", "right_closed", "left_busy", "right_busy")
-_WRENCH = struct.Struct("<6f")
 
 
 def encode_pose(update: RobotUpdate | HumanUpdate) -> bytes:
-    """An actor's pose, as :func:`decode_pose` reads it."""
-    return encode_human(update) if isinstance(update, HumanUpdate) else messages.encode_robot(update)
+    """Encode the pose of any actor; inverse of :func:`decode_pose`."""
+    return encode_human(update) if isinstance(update, HumanUpdate) else robot.encode_robot(update)
 
 
 def decode_pose(payload: bytes, actor: str) -> RobotUpdate | HumanUpdate:
-    """The pose that ``actor`` (known from the key, never from the payload) sent."""
-    human = messages.kind_of(payload) == HUMAN
-    return decode_human(payload, actor) if human else messages.decode_robot(payload, actor)
-
-
-# ---------------------------------------------------------------- people
+    """Decode the pose of ``actor``, a name that is taken from the key, never from the payload."""
+    human = kind_of(payload) == MessageKind.HUMAN
+    return decode_human(payload, actor) if human else robot.decode_robot(payload, actor)
 
 
 def encode_human(update: HumanUpdate) -> bytes:
-    """A person's pose."""
+    """Encode a person's pose; :class:`MessageError` for wrong shapes, values that are not finite, or no unit
+    quaternion."""
     points, velocity = update.pose.points, np.asarray(update.velocity, float)
     fingers = (*update.pose.left_fingers, *update.pose.right_fingers)
     if velocity.shape != (_POINTS, 6) or len(fingers) != 10:
@@ -65,30 +67,31 @@ def encode_human(update: HumanUpdate) -> bytes:
     if not np.allclose(np.linalg.norm(points[:, 3:], axis=1), 1.0, atol=0.05):
         raise MessageError(f"pose of {update.actor!r} has an orientation that is no unit quaternion")
     root = points[0, :3].astype(np.float32)
-    places = _whole((points[1:, :3] - root) / POSITION_LSB, 32767)
-    turns = _whole(rotation_vector(points[:, 3:]) / TURN_LSB, 32767)
+    places = _to_integers((points[1:, :3] - root) / POSITION_LSB, 32767)
+    turns = _to_integers(rotation_vector(points[:, 3:]) / TURN_LSB, 32767)
     kinds = velocity.reshape(_POINTS, 2, 3)
     scales = np.minimum(np.ceil(np.abs(kinds).max(axis=(0, 2)) / (127.0 * VELOCITY_LSB)), 65535.0)
-    speeds = _whole(kinds / np.maximum(scales * VELOCITY_LSB, VELOCITY_LSB)[:, None], 127)
+    speeds = _to_integers(kinds / np.maximum(scales * VELOCITY_LSB, VELOCITY_LSB)[:, None], 127)
     flags = sum(bool(getattr(update.pose, name)) << bit for bit, name in enumerate(_FLAGS))
     bends = (round(FINGER_SCALE * min(max(bend, 0.0), 1.0)) for bend in fingers)
-    return messages.head(HUMAN, _POINTS, update.time) + _HUMAN.pack(
+    return pack_header(MessageKind.HUMAN, _POINTS, update.time) + _HUMAN.pack(
         *root.tolist(), *places, *turns, *scales.astype(int).tolist(), *speeds, flags, *bends
     )
 
 
 def decode_human(payload: bytes, actor: str) -> HumanUpdate:
-    """The pose that a person sent."""
-    count, time = messages.opened(payload, HUMAN, "human pose")
-    if count != _POINTS or len(payload) != messages.HEAD + _HUMAN.size:
+    """Decode a person's pose; :class:`MessageError` if that is impossible."""
+    count, time = unpack_header(payload, MessageKind.HUMAN, "human pose")
+    if count != _POINTS or len(payload) != HEADER.size + _HUMAN.size:
         raise MessageError(
-            f"human pose of {count} points ({_POINTS}) in {len(payload)} B ({messages.HEAD + _HUMAN.size})"
+            f"human pose of {count} points ({_POINTS}) in {len(payload)} B ({HEADER.size + _HUMAN.size})"
         )
-    told = _HUMAN.unpack_from(payload, messages.HEAD)
-    root, told = np.array(told[:3]), told[3:]
+    fields = _HUMAN.unpack_from(payload, HEADER.size)
+    root, fields = np.array(fields[:3]), fields[3:]
     if not (np.abs(root) < MAX_COORDINATE).all():
         raise MessageError(f"human pose with a root at {root}, not finite or too far away")
-    places, turns, scales = told[: 3 * _POINTS - 3], told[3 * _POINTS - 3 : 6 * _POINTS - 3], told[6 * _POINTS - 3 :]
+    places, turns = fields[: 3 * _POINTS - 3], fields[3 * _POINTS - 3 : 6 * _POINTS - 3]
+    scales = fields[6 * _POINTS - 3 :]
     turn = np.array(turns, float).reshape(_POINTS, 3) * TURN_LSB
     if (turn * turn).sum(1).max() > (np.pi + 2.0 * TURN_LSB) ** 2:
         raise MessageError("human pose with a rotation of more than half a turn")
@@ -100,66 +103,19 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
     flags, bends = rest[0], [bend / FINGER_SCALE for bend in rest[1:]]
     if flags >= 1 << len(_FLAGS):
         raise MessageError("human pose with unknown flags")
+    left_closed, right_closed, left_busy, right_busy = (bool(flags >> bit & 1) for bit in range(len(_FLAGS)))
     pose = HumanPose(
-        *points, left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]),
-        **{name: bool(flags >> bit & 1) for bit, name in enumerate(_FLAGS)},
+        *points, left_closed=left_closed, right_closed=right_closed, left_busy=left_busy, right_busy=right_busy,
+        left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]),
     )  # fmt: skip
     return HumanUpdate(actor, time, pose, velocity.reshape(_POINTS, 6))
 
 
 def quantise_pose(pose: HumanPose) -> HumanPose:
-    """A pose as every copy will hold it, to the bit: places off by at most 0.1 mm, turns by 0.003 degrees."""
+    """A pose as every copy decodes it, bit by bit. Errors: positions 0.1 mm, rotations 0.003 degrees."""
     return decode_human(encode_human(HumanUpdate("", 0.0, pose, np.zeros((_POINTS, 6)))), "").pose
 
 
-def _whole(values: np.ndarray, most: int) -> list[int]:
-    return np.clip(np.rint(values), -most, most).astype(int).ravel().tolist()
-
-
-# ---------------------------------------------------------------- forces
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class WrenchMessage:
-    """With what wrenches one person pushes links of one robot, mean of a sixtieth of a second."""
-
-    time: float
-    """Network time [s]."""
-    wrenches: dict[str, np.ndarray]
-    """Link: force [N] and moment about its centre of mass [N m], world axes [6]. Empty: the touch is over."""
-
-
-def encode_wrenches(push: WrenchMessage) -> bytes:
-    """A push: 14 bytes, and 25 and its name for each link."""
-    if len(push.wrenches) > MAX_LINKS:
-        raise MessageError(f"push on {len(push.wrenches)} links, at most {MAX_LINKS}")
-    payload = [messages.head(FORCE, len(push.wrenches), push.time)]
-    for link, wrench in sorted(push.wrenches.items()):
-        name = link.encode()
-        if len(name) > 255 or not (np.abs(wrench) <= MAX_WRENCH).all():
-            raise MessageError(f"push on {link[:60]!r} with {wrench}: not finite, too strong, or too long a name")
-        payload += [bytes((len(name),)), name, _WRENCH.pack(*wrench)]
-    return b"".join(payload)
-
-
-def decode_wrenches(payload: bytes) -> WrenchMessage:
-    """A push, each number checked; which links there are is for the reader to know."""
-    count, time = messages.opened(payload, FORCE, "push")
-    if count > MAX_LINKS:
-        raise MessageError(f"push on {count} links, at most {MAX_LINKS}")
-    at, wrenches = messages.HEAD, {}
-    for _ in range(count):
-        end = at + 1 + (payload[at] if at < len(payload) else 0)
-        if end + _WRENCH.size > len(payload):
-            raise MessageError(f"push on {count} links is cut off at {len(payload)} B")
-        wrench = np.array(_WRENCH.unpack_from(payload, end))
-        if not (np.abs(wrench) <= MAX_WRENCH).all():
-            raise MessageError(f"push with {wrench}: not finite or stronger than {MAX_WRENCH} N")
-        try:
-            wrenches[payload[at + 1 : end].decode()] = wrench
-        except UnicodeDecodeError as error:
-            raise MessageError(f"push on a link whose name is no text: {error}") from error
-        at = end + _WRENCH.size
-    if at != len(payload):
-        raise MessageError(f"push of {len(payload)} B, {count} links take {at} B")
-    return WrenchMessage(time, wrenches)
+def _to_integers(values: np.ndarray, limit: int) -> list[int]:
+    """Values rounded and clipped to whole numbers from ``-limit`` to ``limit``, flattened."""
+    return np.clip(np.rint(values), -limit, limit).astype(int).ravel().tolist()

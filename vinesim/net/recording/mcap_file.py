@@ -28,8 +28,9 @@ from mcap.writer import Writer
 
 from vinesim import __version__
 from vinesim.net.codec import messages
-from vinesim.net.codec.human import decode_pose, decode_wrenches
+from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import MessageError
+from vinesim.net.codec.wrenches import decode_wrenches
 from vinesim.scene.ids import ObjectKind, split_object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 
@@ -163,14 +164,14 @@ def _describe_hello(payload: bytes, _: str) -> dict[str, Any]:
 
 
 _DESCRIBE: dict[int, Callable[[bytes, str], dict[str, Any]]] = {
-    messages.ROBOT: _describe_pose,
-    messages.TREES: _describe_trees,
-    messages.CLAIMS: _describe_claims,
-    messages.FACTS: _describe_records,
-    messages.THINGS: _describe_objects,
-    messages.HUMAN: _describe_pose,
-    messages.FORCE: _describe_wrenches,
-    messages.HELLO: _describe_hello,
+    messages.MessageKind.ROBOT: _describe_pose,
+    messages.MessageKind.TREES: _describe_trees,
+    messages.MessageKind.CLAIMS: _describe_claims,
+    messages.MessageKind.RETAINED: _describe_records,
+    messages.MessageKind.OBJECTS: _describe_objects,
+    messages.MessageKind.HUMAN: _describe_pose,
+    messages.MessageKind.WRENCHES: _describe_wrenches,
+    messages.MessageKind.HELLO: _describe_hello,
 }
 
 

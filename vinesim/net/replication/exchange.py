@@ -224,10 +224,10 @@ class Replicator:
                     if fact.author != sender:
                         raise MessageError(f"fact by {fact.author!r} said by {sender!r}")
                     self._receive_record(cell, fact, time, inbox, told=sender not in self.local_actors)
-            elif kind == messages.CLAIMS:
+            elif kind == messages.MessageKind.CLAIMS:
                 for thing, claim, touching in messages.decode_claims(payload, self._counts):
                     self._ownership.receive_claim(thing, claim, touching, sender, time)
-            elif kind == messages.THINGS:
+            elif kind == messages.MessageKind.OBJECTS:
                 self._receive_objects(messages.decode_objects(payload, cell), cell, sender, time)
             else:
                 self._receive_trees(messages.decode_trees(payload, self.model.tree_size), sender, time, news)

@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.net.codec.human import WrenchMessage, decode_wrenches, encode_wrenches
+from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
 from vinesim.net.transport.bus import KEEP_LAST_1, Bus, Publisher
 
 SEND_PERIOD = 1.0 / 60.0

@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import zenoh
 
+from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.replication.interest import Cell
@@ -22,7 +23,7 @@ from vinesim.net.server.admission import AdmissionControl, SceneId
 from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.net.transport import endpoints
 from vinesim.net.transport.access_control import SERVER, acl_config, tls_config
-from vinesim.net.transport.bus import BusError, WrongUse
+from vinesim.net.transport.bus import BusError
 from vinesim.net.transport.zenoh_bus import ROOT, WORLD, close_session, config, open_session
 
 log = logging.getLogger(__name__)
@@ -67,14 +68,14 @@ class Server:
         ``plan``: the only scene allowed. ``most``: actors at a time. ``certificates``: folder of a server, see
         :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, and in it only who has a certificate.
 
-        :class:`PortTaken` if an endpoint is taken, :class:`WrongUse` if it is none,
+        :class:`PortTaken` if an endpoint is taken, :class:`UsageError` if it is none,
         :class:`vinesim.net.server.journal.NotKept` and :class:`vinesim.net.transport.access_control.NoCertificate` in words.
         """
         listen = (listen,) if isinstance(listen, str) else listen
         safe = certificates is not None
         linked = [endpoints.parse(text, secured=safe) for text in connect]
         if linked and (keep is not None or plan is not None or most is not None):
-            raise WrongUse(
+            raise UsageError(
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene and --max-clients "
                 "to the one server that connects to nobody"
             )

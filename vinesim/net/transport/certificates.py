@@ -14,9 +14,9 @@ import pathlib
 import socket
 from collections.abc import Sequence
 
+from vinesim.errors import UsageError
 from vinesim.net.codec.messages import is_valid_name
 from vinesim.net.transport.access_control import CA_NAME, SERVER, CertificateError, Role
-from vinesim.net.transport.bus import WrongUse
 
 try:
     from cryptography import x509
@@ -54,11 +54,11 @@ def create(
     if _missing is not None:
         raise CryptographyMissing from _missing
     if not is_valid_name(name) or name == CA_NAME:
-        raise WrongUse(f"actor name {name!r}: use 1 to 48 letters, digits, '_', '-' or '.', and not {CA_NAME!r}")
+        raise UsageError(f"actor name {name!r}: use 1 to 48 letters, digits, '_', '-' or '.', and not {CA_NAME!r}")
     if (name == SERVER) != (role == Role.SERVER):
-        raise WrongUse(f"{name!r} as {role}: only the server is called {SERVER!r}")
+        raise UsageError(f"{name!r} as {role}: only the server is called {SERVER!r}")
     if hosts and role != Role.SERVER:
-        raise WrongUse(f"hosts {', '.join(hosts)} for {name!r}: only the server's certificate names hosts")
+        raise UsageError(f"hosts {', '.join(hosts)} for {name!r}: only the server's certificate names hosts")
     if name != SERVER and (folder / f"{name}.pem").exists():
         raise CertificateError(f"{folder / name}.pem is there already: remove it and its key first, if that is meant")
     try:

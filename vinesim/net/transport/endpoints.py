@@ -11,7 +11,7 @@ import socket
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from vinesim.net.transport.bus import WrongUse
+from vinesim.errors import UsageError
 
 PORT = 7447
 """Zenoh's."""
@@ -61,18 +61,18 @@ class Endpoint(NamedTuple):
 
 
 def parse(text: str, *, secured: bool = False) -> Endpoint:
-    """``PROTOCOL/HOST:PORT``; :class:`WrongUse` in words for anything else, or if it is not as safe as asked."""
+    """``PROTOCOL/HOST:PORT``; :class:`UsageError` in words for anything else, or if it is not as safe as asked."""
     allowed = ("tls", "quic") if secured else ("tcp", "udp")
     protocol, _, address = text.partition("/")
     host, colon, port = address.rpartition(":")
     example = f"expected {allowed[0]}/HOST:PORT or {allowed[1]}/HOST:PORT, e.g. {allowed[0]}/192.168.1.5:{PORT}"
     if protocol in _COUNTERPART and protocol not in allowed:
         remedy = "use tls/ or quic/ where certificates are given" if secured else "give the certificates with --tls DIR"
-        raise WrongUse(f"endpoint {text!r}: {remedy}; {example}")
+        raise UsageError(f"endpoint {text!r}: {remedy}; {example}")
     if protocol not in allowed or not colon or not host or any(c in host for c in "?#;/ "):
-        raise WrongUse(f"endpoint {text!r}: {example}")
+        raise UsageError(f"endpoint {text!r}: {example}")
     if not port.isascii() or not port.isdigit() or int(port) > 65535:
-        raise WrongUse(f"endpoint {text!r}: port {port!r} is not from 0 to 65535; {example}")
+        raise UsageError(f"endpoint {text!r}: port {port!r} is not from 0 to 65535; {example}")
     return Endpoint(protocol, host, int(port))
 
 
@@ -102,7 +102,7 @@ def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endp
     """Endpoints to listen at, port 0 replaced by one number that is free for streams and datagrams alike."""
     wanted = [parse(text, secured=secured) for text in listen]
     if not wanted:
-        raise WrongUse("a server that listens nowhere: give --listen at least once")
+        raise UsageError("a server that listens nowhere: give --listen at least once")
     free: int | None = None
     found = []
     for endpoint in wanted:

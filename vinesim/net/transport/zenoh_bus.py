@@ -24,6 +24,7 @@ from typing import Any, Self
 
 import zenoh
 
+from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.transport.access_control import tls_config
 from vinesim.net.transport.bus import (
@@ -34,7 +35,6 @@ from vinesim.net.transport.bus import (
     NameTaken,
     Reply,
     SampleStore,
-    WrongUse,
 )
 from vinesim.net.transport.endpoints import Endpoint, client_links
 
@@ -215,11 +215,11 @@ class ZenohBus:
 
         ``certificates``: folder with ``ca.pem`` and this actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then
         ``tls/`` or ``quic/``. :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the
-        name is live, :class:`WrongUse` if name or world cannot be part of a key or the endpoint is none.
+        name is live, :class:`UsageError` if name or world cannot be part of a key or the endpoint is none.
         """
         for what, text in (("actor name", name), ("world", world)):
             if not messages.is_valid_name(text):
-                raise WrongUse(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
+                raise UsageError(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
         way = client_links(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else tls_config(certificates, name)
         self.name, self.world, self.endpoint = name, world, str(way.bulk)
@@ -432,7 +432,7 @@ class ZenohBus:
 
     def publisher(self, key: str, reliable: bool = False) -> _Publisher:
         if "*" in key:
-            raise WrongUse(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
+            raise UsageError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
 
         def declare(session: zenoh.Session) -> zenoh.Publisher:
             return session.declare_publisher(

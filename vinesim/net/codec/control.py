@@ -1,0 +1,215 @@
+"""Wire format of rare messages in msgpack: hello, welcome, claims, retained records, clock."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+
+from vinesim.net.codec.header import (
+    MAGIC,
+    MAX_COORDINATE,
+    MAX_MESSAGE,
+    PROTOCOL,
+    MessageError,
+    MessageKind,
+    WrongVersion,
+    is_valid_name,
+    kind_of,
+)
+from vinesim.net.codec.objects import check_object_id
+from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
+from vinesim.net.replication.authority import Claim
+
+MAX_RECORDS = 4096
+"""Retained records in one message."""
+
+
+class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Self-description of an actor, sent to the server and to every peer."""
+
+    name: str
+    """Name of the actor, unique in its world: see :func:`vinesim.net.codec.header.is_valid_name`."""
+    kind: str = "robot"
+    """``robot``, ``human`` or ``spectator``."""
+    robot: str = ""
+    """Name of the robot description."""
+    urdf: str = ""
+    """The URDF as text."""
+    scene: str = ""
+    """Name of its scene."""
+    digest: str = ""
+    """``Model.digest()`` of its scene: equal digests mean equal object ids."""
+    protocol: int = PROTOCOL
+    index: int = 0
+    """Instance index of its label in label images."""
+    joints: int = -1
+    """Number of joints in its poses; -1: that of its first pose."""
+    seed: int = -1
+    """Seed of its scene, from which others can generate the same; -1: not given."""
+    height: float = 1.75
+    """Height of a person [m]."""
+
+
+class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The server's reply to a :class:`Hello`."""
+
+    refused: str = ""
+    """Empty, or the reason of the rejection and its remedy."""
+    scene: str = ""
+    """Name of the world's scene."""
+    digest: str = ""
+    """``Model.digest()`` of that scene."""
+    protocol: int = PROTOCOL
+
+
+class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """Lasting state of one object, valid when its author has left: a pose at rest, or which bodies were cut off a tree.
+
+    Records travel once, reliably. The server keeps, for each object, the record with the greatest claim
+    (:mod:`vinesim.net.replication.retained`) for clients that join later. An array on the wire: field names are not sent.
+    """
+
+    object: int
+    """Object id, :func:`vinesim.scene.ids.object_id`."""
+    ownership: int
+    authority: int
+    """The author's claim when the record was published, two u16 sequences."""
+    author: str
+    pose: tuple[float, float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    """Pose of a bunch or a box [m, 1] in the frame of ``parent``."""
+    parent: str = ""
+    """Frame of ``pose``: ``box/3`` or ``actor/link`` of a robot; empty: the world."""
+    cut: tuple[int, ...] = ()
+    """Bodies of the tree that were cut off their parents, in increasing order."""
+    trees: bytes = b""
+    """State of the tree as a message of one tree (:func:`vinesim.net.codec.trees.encode_trees`)."""
+    moving: bool = False
+    """The object was falling or carried when this was published; states follow for clients nearby."""
+
+    @property
+    def claim(self) -> Claim:
+        """The claim by which records of one object are ordered."""
+        return Claim(self.ownership, self.authority, self.author)
+
+
+def _pack(kind: int, value: Any) -> bytes:
+    return MAGIC + bytes((PROTOCOL, kind)) + _encoder.encode(value)
+
+
+def _unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decoder) -> Any:
+    if (found := kind_of(payload)) != kind:
+        raise MessageError(f"message of kind {found} where {name} (kind {kind}) was expected")
+    try:
+        return decoder.decode(payload[4:])
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise MessageError(f"{name}: {error}") from error
+
+
+def encode_hello(hello: Hello) -> bytes:
+    """Encode a hello; :class:`MessageError` if its name cannot be part of a key or it is too large."""
+    if not is_valid_name(hello.name):
+        raise MessageError(f"actor name {hello.name!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
+    payload = _pack(MessageKind.HELLO, hello)
+    if len(payload) > MAX_MESSAGE:
+        raise MessageError(f"greeting of {len(payload)} B, at most {MAX_MESSAGE} B: the URDF is too long")
+    return payload
+
+
+def decode_hello(payload: bytes) -> Hello:
+    """Decode a hello; :class:`MessageError`, or :class:`WrongVersion` for another protocol version."""
+    hello = _unpack(payload, MessageKind.HELLO, "greeting", _hello_decoder)
+    if not is_valid_name(hello.name):
+        raise MessageError(f"greeting of an actor named {hello.name[:60]!r}")
+    if hello.protocol != PROTOCOL:
+        raise WrongVersion(hello.protocol)
+    return hello
+
+
+def encode_welcome(welcome: Welcome) -> bytes:
+    """Encode a welcome."""
+    return _pack(MessageKind.WELCOME, welcome)
+
+
+def decode_welcome(payload: bytes) -> Welcome:
+    """Decode a welcome; :class:`WrongVersion` from a server of another protocol version."""
+    return _unpack(payload, MessageKind.WELCOME, "welcome", _welcome_decoder)
+
+
+def encode_claims(claims: list[tuple[int, Claim, bool]]) -> bytes:
+    """Encode claims: (object id, claim, whether the owner is in contact with the object)."""
+    return _pack(MessageKind.CLAIMS, [(int(object_id), *claim, touching) for object_id, claim, touching in claims])
+
+
+def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list[tuple[int, Claim, bool]]:
+    """Decode claims and check each: object id, u16 sequences, a valid owner name or none.
+
+    ``counts``: number of objects of each kind in the scene.
+    """
+    rows = _unpack(payload, MessageKind.CLAIMS, "claims", _claims_decoder)
+    if len(rows) > MAX_TREES:
+        raise MessageError(f"{len(rows)} claims in one message, at most {MAX_TREES}")
+    for object_id, ownership, authority, owner, _ in rows:
+        check_object_id(object_id, counts)
+        if not (0 <= ownership < 1 << 16 and 0 <= authority < 1 << 16) or (owner and not is_valid_name(owner)):
+            raise MessageError(f"claim ({ownership}, {authority}, {owner[:60]!r}) on object {object_id} is impossible")
+    return [
+        (object_id, Claim(ownership, authority, owner), touching)
+        for object_id, ownership, authority, owner, touching in rows
+    ]
+
+
+def encode_records(records: list[RetainedRecord]) -> bytes:
+    """Encode retained records."""
+    return _pack(MessageKind.RETAINED, records)
+
+
+def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> list[RetainedRecord]:
+    """Decode retained records and check ids, sequences, names, poses and sizes.
+
+    ``counts``: number of objects of each kind in the scene, if known. Records of trees are not checked against the model.
+    """
+    records = _unpack(payload, MessageKind.RETAINED, "retained records", _records_decoder)
+    if len(records) > MAX_RECORDS:
+        raise MessageError(f"{len(records)} records in one message, at most {MAX_RECORDS}")
+    for record in records:
+        check_object_id(record.object, counts)
+        if not (0 <= record.ownership < 1 << 16 and 0 <= record.authority < 1 << 16 and is_valid_name(record.author)):
+            raise MessageError(f"record by {record.author[:60]!r} with claim ({record.ownership}, {record.authority})")
+        if not all(-MAX_COORDINATE < number < MAX_COORDINATE for number in record.pose):
+            raise MessageError(f"record of object {record.object} at {record.pose}, not finite or too far away")
+        if not 0.95 < math.hypot(*record.pose[3:]) < 1.05:
+            raise MessageError(
+                f"record of object {record.object} with orientation {record.pose[3:]}, no unit quaternion"
+            )
+        if len(record.parent) > 200 or len(record.cut) > MAX_BODIES or any(body < 0 for body in record.cut):
+            raise MessageError(f"record of object {record.object} with an impossible parent or list of cut bodies")
+    return records
+
+
+def encode_time(asked: float, server: float = 0.0) -> bytes:
+    """Encode a clock query (own time ``asked`` [s]) or its reply, which repeats ``asked`` and adds the ``server``'s
+    time [s]."""
+    return _pack(MessageKind.CLOCK, (float(asked), float(server)))
+
+
+def decode_time(payload: bytes) -> tuple[float, float]:
+    """Own time of the query [s] and the server's time of the reply [s], both finite."""
+    asked, server = _unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
+    if not (math.isfinite(asked) and math.isfinite(server)):
+        raise MessageError(f"clock message ({asked}, {server}) that is not finite")
+    return asked, server
+
+
+_encoder = msgspec.msgpack.Encoder()
+
+_hello_decoder = msgspec.msgpack.Decoder(Hello)
+
+_welcome_decoder = msgspec.msgpack.Decoder(Welcome)
+
+_claims_decoder = msgspec.msgpack.Decoder(list[tuple[int, int, int, str, bool]])
+
+_records_decoder = msgspec.msgpack.Decoder(list[RetainedRecord])
+
+_time_decoder = msgspec.msgpack.Decoder(tuple[float, float])

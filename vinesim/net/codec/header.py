@@ -1,0 +1,121 @@
+"""Header of every network message: protocol version and kind, and for frequent kinds a count and a time; errors.
+
+Every message starts with four bytes: ``VS``, the protocol version, the kind (:class:`MessageKind`). Kinds that are sent
+often go on with a u16 count and the network time as f64, little-endian (:data:`HEADER`); rare kinds continue in msgpack.
+A decoder raises :class:`MessageError` and nothing else for a message that is malformed, truncated, too large, of another
+version or not finite.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import struct
+
+PROTOCOL = 1
+"""Version of the wire format. Messages of any other version are refused."""
+
+MAGIC = b"VS"
+
+
+class MessageKind(enum.IntEnum):
+    """Fourth byte of every message."""
+
+    ROBOT = 1
+    TREES = 2
+    CLAIMS = 3
+    RETAINED = 4
+    OBJECTS = 5
+    HUMAN = 6
+    WRENCHES = 7
+    HELLO = 16
+    CLOCK = 17
+    WELCOME = 18
+
+
+TIMESTAMPED = frozenset(
+    (MessageKind.ROBOT, MessageKind.TREES, MessageKind.OBJECTS, MessageKind.HUMAN, MessageKind.WRENCHES)
+)
+"""Kinds whose header holds the network time [s] at which the content was sampled."""
+
+MAX_DATAGRAM = 1100
+"""Largest message of an unreliable stream [B], so that it fits one UDP datagram; a single large tree may exceed it."""
+
+MAX_MESSAGE = 1 << 20
+"""Largest message that is decoded [B]; a larger one is refused unread."""
+
+MAX_COORDINATE = 1e5
+"""Largest magnitude of a position [m]."""
+
+HEADER = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
+"""Magic, version, kind, count, time [s]: 14 bytes."""
+
+
+class MessageError(ValueError):
+    """A message cannot be encoded or decoded; the text says why."""
+
+
+class WrongVersion(MessageError):
+    """The message has another protocol version, ``theirs``."""
+
+    def __init__(self, theirs: int) -> None:
+        super().__init__(f"message of protocol version {theirs}, this program speaks {PROTOCOL}: use the same release")
+        self.theirs = theirs
+
+
+def pack_header(kind: int, count: int, time: float) -> bytes:
+    """Header of a timestamped message; :class:`MessageError` if ``time`` [s] is not finite."""
+    if not math.isfinite(time):
+        raise MessageError(f"time {time} is not finite")
+    return HEADER.pack(MAGIC, PROTOCOL, kind, count, time)
+
+
+def kind_of(payload: bytes) -> int:
+    """Check the size and the first four bytes of a message and return its kind (perhaps one that is unknown).
+
+    Raises :class:`MessageError`, or :class:`WrongVersion` for another protocol version.
+    """
+    if len(payload) > MAX_MESSAGE:
+        raise MessageError(f"message of {len(payload)} B, at most {MAX_MESSAGE} B are read")
+    if len(payload) < 4:
+        raise MessageError(f"message of {len(payload)} B is cut off before its kind")
+    if payload[:2] != MAGIC:
+        raise MessageError(f"message starts with {payload[:2]!r} instead of {MAGIC!r}: not from vinesim")
+    if payload[2] != PROTOCOL:
+        raise WrongVersion(payload[2])
+    return payload[3]
+
+
+def time_of(payload: bytes) -> float | None:
+    """Network time [s] in the header of a message; None if its kind has none."""
+    if kind_of(payload) not in TIMESTAMPED or len(payload) < HEADER.size:
+        return None
+    time = HEADER.unpack_from(payload)[4]
+    return time if math.isfinite(time) else None
+
+
+def shift_time(payload: bytes, shift: float) -> bytes:
+    """Copy of a message with ``shift`` [s] added to its time; the message itself if its kind has no time."""
+    time = time_of(payload)
+    return (
+        payload
+        if time is None
+        else payload[: HEADER.size - 8] + struct.pack("<d", time + shift) + payload[HEADER.size :]
+    )
+
+
+def unpack_header(payload: bytes, kind: int, name: str) -> tuple[int, float]:
+    """Count and time [s] of a timestamped message; :class:`MessageError` if it is not of ``kind`` (called ``name``)."""
+    if (found := kind_of(payload)) != kind:
+        raise MessageError(f"message of kind {found} where {name} (kind {kind}) was expected")
+    if len(payload) < HEADER.size:
+        raise MessageError(f"{name} of {len(payload)} B is cut off in its header")
+    _, _, _, count, time = HEADER.unpack_from(payload)
+    if not math.isfinite(time):
+        raise MessageError(f"{name} with time {time}")
+    return count, time
+
+
+def is_valid_name(name: str) -> bool:
+    """Whether a name can be one chunk of a Zenoh key: 1 to 48 ASCII letters, digits, ``_``, ``-`` or ``.``."""
+    return 1 <= len(name) <= 48 and all(c.isascii() and (c.isalnum() or c in "_-.") for c in name)

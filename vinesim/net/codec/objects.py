@@ -1,0 +1,131 @@
+"""Wire format of moving rigid objects: boxes and free bunches, 26 bytes each, with positions relative to a cell.
+
+Position: 3 i16 in steps of 0.1 mm from the middle of the interest cell in the key. Rotation: 32 bits (error 0.28 degrees).
+Linear and angular velocity: i8 with an exponent of two for each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.net.codec.header import HEADER, MAX_DATAGRAM, MessageError, MessageKind, pack_header, unpack_header
+from vinesim.net.codec.rotation import pack_quaternions, unpack_quaternions
+from vinesim.net.codec.trees import MAX_TREES, TOUCHED
+from vinesim.net.replication.interest import CELL_SIZE, Cell
+from vinesim.scene.ids import OBJECT_STRIDE, ObjectKind
+from vinesim.scene.values import ObjectUpdate
+
+POSITION_LSB = 1e-4
+"""Quantisation step of a position in its cell [m]; beyond 3.2 m from :data:`CELL_ORIGIN_OFFSET` it is clipped."""
+
+CELL_ORIGIN_OFFSET = np.array([0.5 * CELL_SIZE, 0.5 * CELL_SIZE, 2.5])
+"""From a cell's lower corner on the ground to the origin of its quantised positions [3] m."""
+
+MIN_VELOCITY_LSB = np.array([2.0**-10, 2.0**-8])
+"""Smallest quantisation steps of velocity [m/s] and angular velocity [rad/s]; a record scales them by powers of two."""
+
+_OBJECT = np.dtype(
+    [("object", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
+     ("position", "<i2", 3), ("turn", "<u4"), ("velocity", "i1", 3), ("spin", "i1", 3)]
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ObjectStates:
+    """States of several boxes and free bunches of one owner at one instant; object ids strictly increase."""
+
+    time: float
+    """Network time [s]."""
+    object: np.ndarray
+    """[k] :func:`vinesim.scene.ids.thing`"""
+    ownership: np.ndarray
+    """[k] u16 sequences"""
+    authority: np.ndarray
+    """[k] u16 sequences"""
+    flags: np.ndarray
+    """[k] :data:`TOUCHED` or 0"""
+    pose: np.ndarray
+    """[k, 7] m, 1; world"""
+    velocity: np.ndarray
+    """[k, 6] m/s, rad/s; of the origin, world axes"""
+
+    def updates(self, owner: str) -> list[ObjectUpdate]:
+        """One update per object; its arrays are views of this batch."""
+        columns = (self.object, self.ownership, self.authority)
+        rows = zip(*(column.tolist() for column in columns), self.pose, self.velocity, strict=True)
+        return [
+            ObjectUpdate(object_id, owner, ownership, authority, self.time, pose, velocity)
+            for object_id, ownership, authority, pose, velocity in rows
+        ]
+
+
+def encode_objects(objects: ObjectStates, cell: Cell) -> tuple[list[bytes], ObjectStates]:
+    """Encode objects that are published under ``cell``; return the messages and the batch as receivers decode it.
+
+    A message has at most :data:`MAX_DATAGRAM` bytes. Raises :class:`MessageError` if ids do not increase or a value is not
+    finite.
+    """
+    ids = objects.object
+    if not len(ids) or (len(ids) > 1 and not (ids[1:] > ids[:-1]).all()):
+        raise MessageError("objects of a batch must be at least one, in strictly increasing order")
+    if not (np.isfinite(objects.pose).all() and np.isfinite(objects.velocity).all()):
+        raise MessageError("state of an object is not finite")
+    records = np.empty(len(ids), _OBJECT)
+    for name in ("object", "ownership", "authority", "flags"):
+        records[name] = getattr(objects, name)
+    records["position"] = np.clip(np.rint((objects.pose[:, :3] - _cell_origin(cell)) / POSITION_LSB), -32767, 32767)
+    records["turn"] = pack_quaternions(objects.pose[:, 3:])
+    velocity = objects.velocity.reshape(-1, 2, 3)
+    fastest = np.maximum(np.abs(velocity).max(2) / (127.0 * MIN_VELOCITY_LSB), 1.0)
+    exponent = np.minimum(np.ceil(np.log2(fastest)), 15.0)
+    steps = np.clip(np.rint(velocity / (MIN_VELOCITY_LSB * 2.0**exponent)[:, :, None]), -127.0, 127.0)
+    records["velocity"], records["spin"] = steps[:, 0], steps[:, 1]
+    records["scale"] = exponent[:, 0] + 16.0 * exponent[:, 1]
+    count = (MAX_DATAGRAM - HEADER.size) // _OBJECT.itemsize
+    parts = [records[first : first + count] for first in range(0, len(records), count)]
+    payloads = [pack_header(MessageKind.OBJECTS, len(part), objects.time) + part.tobytes() for part in parts]
+    return payloads, _read_objects(objects.time, records, cell)
+
+
+def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
+    """Decode objects that were published under ``cell``; :class:`MessageError` if that is impossible.
+
+    Whether the scene has such objects is for the caller to check (:func:`check_object_id`).
+    """
+    count, time = unpack_header(payload, MessageKind.OBJECTS, "objects")
+    if not 1 <= count <= MAX_TREES or len(payload) != HEADER.size + count * _OBJECT.itemsize:
+        raise MessageError(f"{count} objects announced (1 to {MAX_TREES}) in {len(payload)} B")
+    records = np.frombuffer(payload, _OBJECT, count, HEADER.size)
+    ids = records["object"].astype(np.int64)
+    if (ids[1:] <= ids[:-1]).any() or ids[0] < OBJECT_STRIDE or ids[-1] >= len(ObjectKind) * OBJECT_STRIDE:
+        raise MessageError("objects that are trees, of no kind, or in an order that does not increase")
+    if (records["flags"] > TOUCHED).any():
+        raise MessageError("objects with unknown flags")
+    return _read_objects(time, records, cell)
+
+
+def _read_objects(time: float, records: np.ndarray, cell: Cell) -> ObjectStates:
+    pose = np.empty((len(records), 7))
+    pose[:, :3] = records["position"] * POSITION_LSB + _cell_origin(cell)
+    pose[:, 3:] = unpack_quaternions(records["turn"])
+    exponent = np.stack([records["scale"] % 16, records["scale"] // 16], -1).astype(float)
+    unit = np.repeat(MIN_VELOCITY_LSB * 2.0**exponent, 3, axis=1)
+    velocity = np.concatenate([records["velocity"], records["spin"]], -1) * unit
+    ids = records["object"].astype(np.int64)
+    return ObjectStates(time, ids, records["ownership"], records["authority"], records["flags"], pose, velocity)
+
+
+def _cell_origin(cell: Cell) -> np.ndarray:
+    """Origin of the quantised positions of a cell [3] m, world."""
+    return np.array([cell[0] * CELL_SIZE, cell[1] * CELL_SIZE, 0.0]) + CELL_ORIGIN_OFFSET
+
+
+def check_object_id(object_id: int, counts: tuple[int, ...] | None = None) -> None:
+    """Raise :class:`MessageError` unless an object of this id can exist; ``counts``: number of objects of each kind."""
+    kind, index = divmod(object_id, OBJECT_STRIDE)
+    if not 0 <= kind < len(ObjectKind):
+        raise MessageError(f"object {object_id} is of no kind")
+    if counts is not None and index >= counts[kind]:
+        raise MessageError(f"{ObjectKind(kind).name.lower()} {index}, this scene has {counts[kind]}")

@@ -1,0 +1,230 @@
+"""A network in memory with a clock of its own: deterministic delay, jitter, loss and partition for tests and
+benchmarks."""
+
+from __future__ import annotations
+
+import functools
+import heapq
+import random
+from collections.abc import Callable
+from typing import Self
+
+from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Reply, SampleStore, matches
+
+
+class MemoryHub:
+    """Carries samples between buses in memory; :meth:`advance` moves its clock. All randomness comes from ``seed``.
+
+    ``delay`` and ``jitter`` [s] are one way: uniform from delay - jitter to delay + jitter, so that samples overtake each
+    other. ``loss`` and ``duplicated`` are the probabilities that an unreliable sample is lost or arrives twice. Reliable
+    samples arrive once and in order.
+    """
+
+    def __init__(
+        self, *, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0, duplicated: float = 0.0, seed: int = 0
+    ) -> None:
+        if delay < 0.0 or jitter < 0.0 or not 0.0 <= loss <= 1.0:
+            raise ValueError(f"delay {delay} s and jitter {jitter} s must not be negative, loss {loss} from 0 to 1")
+        self.time = 0.0
+        self.delay, self.jitter, self.loss, self.duplicated = delay, jitter, loss, duplicated
+        self.down = False
+        """True: partitioned. Nothing passes, and every member sees only itself."""
+        self.rejection_reason: Callable[[bytes], str] = lambda greeting: ""
+        """Why the emulated server rejects a hello; empty: it admits the actor."""
+        self._random = random.Random(seed)
+        self._order = 0
+        self._pending: list[tuple[float, int, Callable[[], None]]] = []
+        self._members: dict[str, MemoryBus] = {}
+        self._visible_names: dict[str, set[str]] = {}
+        self._hidden: set[str] = set()
+        self._last_arrival: dict[tuple[str, str], float] = {}
+
+    def bus(self, name: str, *, live: bool = True) -> MemoryBus:
+        """Add a member; :class:`NameTaken` if the name is live. Not ``live``: it has no liveliness token."""
+        if name in self._members:
+            raise NameTaken(name, "memory")
+        bus = MemoryBus(self, name)
+        self._visible_names[name] = {name, *self._members.keys() - self._hidden}
+        if live:
+            for other in sorted(self._members):
+                self._schedule(functools.partial(self._update_liveliness, other, name, True), ("live", other))
+        else:
+            self._visible_names[name].discard(name)
+            self._hidden.add(name)
+        self._members[name] = bus
+        return bus
+
+    def advance(self, dt: float) -> None:
+        """Advance the clock by ``dt`` [s] and deliver in order what arrives until then."""
+        end = self.time + dt
+        while self._pending and self._pending[0][0] <= end + 1e-12:
+            self.time, _, action = heapq.heappop(self._pending)
+            action()
+        self.time = end
+
+    def _schedule(self, action: Callable[[], None], order_key: tuple[str, str] | None = None) -> None:
+        """Call ``action`` after one random delay; actions with the same ``order_key`` stay in order."""
+        at = self.time + max(0.0, self.delay + self._random.uniform(-self.jitter, self.jitter))
+        if order_key is not None:
+            at = self._last_arrival[order_key] = max(at, self._last_arrival.get(order_key, 0.0))
+        self._order += 1
+        heapq.heappush(self._pending, (at, self._order, action))
+
+    def has_subscriber(self, sender: str, key: str) -> bool:
+        """Whether another member subscribes to this key."""
+        return not self.down and any(bus.is_subscribed(key) for name, bus in self._members.items() if name != sender)
+
+    def send(self, sender: str, key: str, payload: bytes, reliable: bool) -> None:
+        """Send a sample to every other member that is subscribed now; a closed subscription ignores it on arrival."""
+        for name in sorted(self._members):
+            bus = self._members[name]
+            if name == sender or not bus.is_subscribed(key):
+                continue
+            if reliable:
+                self._schedule(functools.partial(self._deliver, bus, key, payload), (sender, name))
+            elif self._random.random() >= self.loss:
+                for _ in range(1 + (self.duplicated > 0.0 and self._random.random() < self.duplicated)):
+                    self._schedule(functools.partial(self._deliver, bus, key, payload))
+
+    def query(self, sender: MemoryBus, key: str, payload: bytes) -> None:
+        """Send a query to every other member with a matching queryable, and its reply back."""
+
+        def respond(bus: MemoryBus, served_key: str) -> None:
+            if not self.down and served_key in bus.queryables:
+                answer = bus.queryables[served_key](payload)
+                self._schedule(functools.partial(reply, served_key, answer))
+
+        def reply(served_key: str, answer: bytes) -> None:
+            if not self.down:
+                sender.pending_replies.append((served_key, answer, self.time))
+
+        for name in sorted(self._members):
+            for served_key in sorted(self._members[name].queryables):
+                if matches(key, served_key) and name != sender.name:
+                    self._schedule(functools.partial(respond, self._members[name], served_key))
+
+    def visible_names(self, name: str) -> frozenset[str]:
+        """Names that a member sees as live."""
+        return frozenset((name,)) if self.down else frozenset(self._visible_names.get(name, ()))
+
+    def remove(self, name: str) -> None:
+        """Remove a member; the others notice after one delay."""
+        self._members.pop(name, None)
+        self._visible_names.pop(name, None)
+        self._hidden.discard(name)
+        for other in sorted(self._members):
+            self._schedule(functools.partial(self._update_liveliness, other, name, False), ("live", other))
+
+    def _update_liveliness(self, observer: str, name: str, there: bool) -> None:
+        if observer in self._visible_names:
+            (self._visible_names[observer].add if there else self._visible_names[observer].discard)(name)
+
+    def _deliver(self, bus: MemoryBus, key: str, payload: bytes) -> None:
+        if not self.down:
+            bus.deliver(key, payload)
+
+
+class MemoryPublisher:
+    """See :class:`vinesim.net.transport.bus.Publisher`."""
+
+    def __init__(self, bus: MemoryBus, key: str, reliable: bool) -> None:
+        self._bus, self._key, self._reliable = bus, key, reliable
+
+    @property
+    def matching(self) -> bool:
+        return self._bus.hub.has_subscriber(self._bus.name, self._key)
+
+    def put(self, payload: bytes) -> bool:
+        if not self.matching:
+            return False
+        self._bus.bytes_out += len(payload)
+        self._bus.hub.send(self._bus.name, self._key, payload, self._reliable)
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+class MemorySubscription:
+    """See :class:`vinesim.net.transport.bus.Subscription`."""
+
+    def __init__(self, bus: MemoryBus, pattern: str, depth: int) -> None:
+        self._bus, self.pattern, self.depth = bus, pattern, depth
+
+    def close(self) -> None:
+        self._bus.unsubscribe(self)
+
+
+class MemoryBus:
+    """See :class:`vinesim.net.transport.bus.Bus`; created by :meth:`MemoryHub.bus`."""
+
+    def __init__(self, hub: MemoryHub, name: str) -> None:
+        self.hub, self.name = hub, name
+        self.bytes_in = self.bytes_out = 0
+        self.queryables: dict[str, Callable[[bytes], bytes]] = {}
+        self.pending_replies: list[tuple[str, bytes, float]] = []
+        self._store = SampleStore()
+        self._subscriptions: list[MemorySubscription] = []
+
+    @property
+    def dropped(self) -> int:
+        return self._store.overflowed
+
+    @property
+    def status_message(self) -> str:
+        return "the hub is down" if self.hub.down else ""
+
+    def join(self, greeting: bytes) -> None:
+        if why := self.hub.rejection_reason(greeting):
+            raise JoinRejected(why)
+
+    def publisher(self, key: str, reliable: bool = False) -> MemoryPublisher:
+        if "*" in key:
+            raise ValueError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
+        return MemoryPublisher(self, key, reliable)
+
+    def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> MemorySubscription:
+        subscription = MemorySubscription(self, pattern, depth)
+        self._subscriptions.append(subscription)
+        return subscription
+
+    def unsubscribe(self, subscription: MemorySubscription) -> None:
+        if subscription in self._subscriptions:
+            self._subscriptions.remove(subscription)
+
+    def is_subscribed(self, key: str) -> bool:
+        return any(matches(subscription.pattern, key) for subscription in self._subscriptions)
+
+    def deliver(self, key: str, payload: bytes) -> None:
+        depths = [s.depth for s in self._subscriptions if matches(s.pattern, key)]
+        if depths:
+            self.bytes_in += len(payload)
+            self._store.put(max(depths), key, payload)
+
+    def poll(self) -> list[tuple[str, bytes]]:
+        return self._store.take()
+
+    def query(self, key: str, payload: bytes = b"") -> None:
+        if not self.hub.down:
+            self.hub.query(self, key, payload)
+
+    def replies(self) -> list[Reply]:
+        pending_replies, self.pending_replies = self.pending_replies, []
+        return [Reply(key, payload, self.hub.time - at) for key, payload, at in pending_replies]
+
+    def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
+        self.queryables[key] = respond
+
+    def alive(self) -> frozenset[str]:
+        return self.hub.visible_names(self.name)
+
+    def close(self) -> None:
+        self._subscriptions.clear()
+        self.queryables.clear()
+        self.hub.remove(self.name)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
