@@ -59,7 +59,9 @@ def test_free_motion_in_space_is_mujocos() -> None:
     """Backward Euler is MuJoCo's ``discrete``: 1e-5 m over 1 s, 5 rad/s in every joint, springs that nearly float."""
     rng = np.random.default_rng(3)
     model = assemble([forked(rng), forked(rng, soft=0.1)])
-    plants = awake(model, random_state(model, rng, 5.0), phi=1.0, geometric_stiffness=False, fast_rate=np.inf, max_rate=np.inf)
+    plants = awake(
+        model, random_state(model, rng, 5.0), phi=1.0, geometric_stiffness=False, fast_rate=np.inf, max_rate=np.inf
+    )
     # our solver takes off the damping that its scheme adds; MuJoCo keeps both
     peer = compile_plants(model, dt=DT, damping=model.joint_damping[:, 1] - DT * model.joint_stiffness[:, 1])
     data = mujoco.MjData(peer)
