@@ -16,7 +16,7 @@ SKIPS_FAIL = bool(os.environ.get("CI"))
 
 SLOW = (
     "tests/cli/test_", "tests/laws/", "tests/story/", "tests/bench/", "tests/client/test_humans.py",
-    "tests/client/test_randomizer.py", "tests/net/test_replicator.py", "tests/net/test_faults.py",
+    "tests/client/test_domain_randomizer.py", "tests/net/test_replicator.py", "tests/net/test_faults.py",
     "tests/net/test_replication_laws.py", "tests/net/test_wire.py", "tests/robot/test_pick.py",
     "tests/robot/test_push.py", "tests/robot/test_swap_boxes.py", "tests/scene/test_vineyard.py",
     "tests/sensors/test_camera_raster.py", "tests/sensors/test_cuda_rasterizer.py", "tests/sensors/test_dataset.py",
@@ -34,9 +34,9 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
         if any(one.scope in ("module", "class") for found in fixtures for one in found):
             # tests that share such a fixture run in one process, which sets it up once
             item.add_marker(pytest.mark.xdist_group(item.nodeid.split("::")[0]))
-    from vinesim.ros import ros_setup
+    from vinesim.ros import middleware
 
-    reason = ros_setup.unavailable_reason()
+    reason = middleware.unavailable_reason()
     if reason:
         skip = pytest.mark.skip(reason=f"ROS 2 is not usable here: {reason}")
         for item in items:

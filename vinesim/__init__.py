@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from vinesim.api.simulation import Simulation as Simulation
     from vinesim.errors import UsageError as UsageError
     from vinesim.net.server.server import Server as Server
-    from vinesim.robot.drives.robot import Robot as Robot
+    from vinesim.robot.drives.controlled_robot import Robot as Robot
     from vinesim.scene.cane import CaneBuilder as CaneBuilder
     from vinesim.scene.cane import assemble as assemble
     from vinesim.scene.cane import cane as cane

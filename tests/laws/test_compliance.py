@@ -15,7 +15,7 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
 

@@ -59,7 +59,9 @@ def test_free_motion_in_space_is_mujocos() -> None:
     """Backward Euler is MuJoCo's ``discrete``: 1e-5 m over 1 s, 5 rad/s in every joint, springs that nearly float."""
     rng = np.random.default_rng(3)
     model = assemble([forked(rng), forked(rng, soft=0.1)])
-    plants = awake(model, random_state(model, rng, 5.0), phi=1.0, tension=False, brisk=np.inf, limit=np.inf)
+    plants = awake(
+        model, random_state(model, rng, 5.0), phi=1.0, geometric_stiffness=False, fast_rate=np.inf, max_rate=np.inf
+    )
     # our solver takes off the damping that its scheme adds; MuJoCo keeps both
     peer = compile_plants(model, dt=DT, damping=model.joint_damping[:, 1] - DT * model.joint_stiffness[:, 1])
     data = mujoco.MjData(peer)
@@ -83,7 +85,7 @@ def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
     """Y = J (M + metric)^-1 J^T with MuJoCo's J and M, metric = phi dt (phi dt K + D) in the joint frames."""
     rng = np.random.default_rng(5)
     model = assemble([forked(rng, isotropic=False), forked(rng, isotropic=False)])
-    plants = awake(model, random_state(model, rng, 1.0), phi=phi, tension=False)
+    plants = awake(model, random_state(model, rng, 1.0), phi=phi, geometric_stiffness=False)
     state, size = plants.state, int(model.tree_size[0])
     touched = np.array([4, size + 12, 9, size + 3], np.int32)
     plants.predict()
@@ -118,7 +120,7 @@ def test_predicted_velocity_is_realised() -> None:
     """velocity_free + response @ impulse is what the bodies have after commit, at the poses of the tick's start."""
     rng = np.random.default_rng(7)
     model = assemble([forked(rng, isotropic=False), forked(rng)])
-    plants = awake(model, random_state(model, rng, 2.0), limit=np.inf)
+    plants = awake(model, random_state(model, rng, 2.0), max_rate=np.inf)
     state = plants.state
     plants.predict()
     touched = np.array([5, 8, 20, 5], np.int32)  # one body twice
@@ -343,7 +345,7 @@ def test_a_cut_cane_keeps_its_momentum(kind: str, phi: float) -> None:
 def test_response_of_a_cut_tree_is_that_of_a_free_joint(phi: float) -> None:
     """Against MuJoCo's inertia with a free joint where the cut is; what stands and what fell do not feel each other."""
     rng = np.random.default_rng(23)
-    plants = spun(forked(rng, isotropic=False), rng, 0, phi=phi, tension=False, brisk=np.inf)
+    plants = spun(forked(rng, isotropic=False), rng, 0, phi=phi, geometric_stiffness=False, fast_rate=np.inf)
     model, state = plants.model, plants.state
     plants.cut(6)
     plants.predict()

@@ -10,8 +10,8 @@ import time
 import numpy as np
 
 from tests.support.live_server import Served, wait
-from vinesim.bench import fuzz
-from vinesim.bench.fuzz import EVIL, storm
+from vinesim.bench import message_fuzz
+from vinesim.bench.message_fuzz import EVIL, storm
 from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, row
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
@@ -26,7 +26,7 @@ from vinesim.scene.spec import load_scene
 
 def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
     """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
-    ada, bob, _, arrived = fuzz.play(3_000, seed=11)
+    ada, bob, _, arrived = message_fuzz.play(3_000, seed=11)
     said = [record.message for record in caplog.records if EVIL in record.message and "dropped" in record.message]
     assert len(said) == 2, "once by each of the two who hear it"
     counters = ada.replicator.counters

@@ -291,9 +291,9 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
     [
         ({"length": 0.0}, r"rod of length 0.0 m, .*all must be positive"),
         ({"radius": (0.004, -0.001)}, r"rod of .*radius \(0.004, -0.001\) m.*all must be positive"),
-        ({"wood": RodMaterial(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
-        ({"wood": RodMaterial(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
-        ({"pieces": 0}, r"rod of .* 0 pieces.*all must be positive"),
+        ({"material": RodMaterial(-5e9, 800.0)}, r"rod of .*modulus=-5000000000.0.*all must be positive"),
+        ({"material": RodMaterial(5e9, 0.0)}, r"rod of .*density=0.0.*all must be positive"),
+        ({"segments": 0}, r"rod of .* 0 segments.*all must be positive"),
         ({"parent": 3, "offset": (0, 0, 0)}, r"body 0 names parent 3, which does not stand before it"),
     ],
 )
@@ -302,8 +302,8 @@ def test_wood_that_cannot_be_is_refused_in_words(change: dict, says: str) -> Non
         "parent": -1,
         "length": 1.0,
         "radius": (0.004, 0.004),
-        "wood": RodMaterial(5e9, 800.0),
-        "pieces": 4,
+        "material": RodMaterial(5e9, 800.0),
+        "segments": 4,
     } | change
     with pytest.raises(ValueError, match=says):
         TreeBuilder(frames.pose(np.zeros(3))).add_rod(**given)

@@ -9,7 +9,7 @@ from tests.support.shared_vineyard import BOX, BUNCH, cart, vineyard
 from vinesim import frames
 from vinesim.physics.rigid.support_tracking import SupportTracker
 from vinesim.physics.step import Physics
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 
 DECK = frames.pose([0.0, 0.0, 0.253])

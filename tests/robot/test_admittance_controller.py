@@ -9,7 +9,7 @@ from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.admittance_controller import AdmittanceController
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 
 

@@ -9,7 +9,7 @@ from vinesim import frames
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose, solve_prioritized_ik
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 
 UP = np.array([0.0, 0.0, 1.0])

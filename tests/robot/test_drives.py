@@ -15,8 +15,8 @@ from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError, CommandInterface
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.remote_robot import RemoteRobot
-from vinesim.robot.drives.robot import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
 

@@ -13,7 +13,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble
 

@@ -9,7 +9,7 @@ import pytest
 
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.builder import assemble
 

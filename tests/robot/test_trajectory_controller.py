@@ -15,7 +15,7 @@ from vinesim.robot.control.trajectory_controller import (
     TrajectoryError,
 )
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 
 ARM = tuple(f"arm_left_{i}_joint" for i in range(1, 8))

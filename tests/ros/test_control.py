@@ -9,11 +9,11 @@ import time
 import numpy as np
 import pytest
 
-from vinesim.ros import ros_setup
+from vinesim.ros import middleware
 
 pytestmark = pytest.mark.ros
-if ros_setup.unavailable_reason() is not None:
-    pytest.skip(str(ros_setup.unavailable_reason()), allow_module_level=True)
+if middleware.unavailable_reason() is not None:
+    pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import JointState

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim import frames
-from vinesim.ros import ros_setup
+from vinesim.ros import middleware
 
 pytestmark = pytest.mark.ros
-if ros_setup.unavailable_reason() is not None:
-    pytest.skip(str(ros_setup.unavailable_reason()), allow_module_level=True)
+if middleware.unavailable_reason() is not None:
+    pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from geometry_msgs.msg import TransformStamped, TwistStamped
 from rclpy.serialization import deserialize_message, serialize_message
@@ -25,7 +25,7 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from vinesim.ros.messages import convert, interfaces
+from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.messages.transforms import SerializedTransforms, split_time
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
@@ -257,7 +257,7 @@ def test_wrench_is_the_same_force_seen_from_the_link():
 
 
 def test_transforms_equal_stock_serialisation_field_for_field():
-    interfaces.ensure_importable(["tf2_msgs"])
+    message_packages.ensure_importable(["tf2_msgs"])
     from tf2_msgs.msg import TFMessage
 
     pairs = [("map", "odom"), ("odom", "b"), ("b", "arm_left_1_link"), ("", "xyz"), ("é", "four")]

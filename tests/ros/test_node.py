@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.ros import ros_setup
+from vinesim.ros import middleware
 
 pytestmark = pytest.mark.ros
-if ros_setup.unavailable_reason() is not None:
-    pytest.skip(str(ros_setup.unavailable_reason()), allow_module_level=True)
+if middleware.unavailable_reason() is not None:
+    pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 import rclpy
 from geometry_msgs.msg import TwistStamped, WrenchStamped
@@ -308,9 +308,9 @@ def test_two_robots_in_one_process_under_namespaces():
 
 
 def test_frames_lead_from_the_map_to_the_fingers():
-    from vinesim.ros.messages import interfaces
+    from vinesim.ros.messages import message_packages
 
-    interfaces.ensure_importable(["tf2_msgs"])
+    message_packages.ensure_importable(["tf2_msgs"])
     from tf2_msgs.msg import TFMessage
 
     with Node("vinebot", URDF) as node, StockNode() as peer:

@@ -17,7 +17,7 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import SensorError
-from vinesim.sensors.truth import truth
+from vinesim.sensors.truth import ground_truth
 
 SUN = (0.4, 0.5, 0.77)
 
@@ -92,7 +92,7 @@ def test_every_visible_bunch_has_a_label(model, primitives) -> None:
     frame = _camera(sensor_scenes.IDEAL.info("o")).render(
         primitives, look_at(np.array([-1.5, 1.2, 1.3]), np.array([3.0, 1.2, 1.6]))
     )
-    seen = truth.detect_bunches(frame)
+    seen = ground_truth.detect_bunches(frame)
     assert len(seen) > 30
     assert {s.bunch for s in seen} <= set(range(len(model.bunch_body)))
     assert sum(s.pixels for s in seen) == (frame.labels >> 20 == int(Organ.BUNCH)).sum()

@@ -15,8 +15,8 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
 from vinesim.cli.render import run as render
-from vinesim.client.composition.composer import PlacementError
-from vinesim.client.composition.randomizer import SceneRandomizer
+from vinesim.client.composition.domain_randomizer import SceneRandomizer
+from vinesim.client.composition.scene_composer import PlacementError
 from vinesim.errors import UsageError
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.scene.data_files import DataFileNotFound

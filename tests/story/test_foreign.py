@@ -9,7 +9,7 @@ from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.builder import assemble
 

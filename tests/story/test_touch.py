@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vinesim.client.client import Client
-from vinesim.client.recording.trace import Trace, remote_error, touch_to_motion
+from vinesim.client.recording.bunch_trace import Trace, remote_error, touch_to_motion
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot

@@ -1,7 +1,10 @@
 """Pages name files that exist."""
 
+import os
 import pathlib
 import re
+import subprocess
+import sys
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -24,3 +27,17 @@ def test_the_glossary_names_places_that_exist():
     places = {place for row in rows for place in re.findall(r"`([a-z_/]+(?:/|\.py))`", row)}
     assert len(places) > 30
     assert [place for place in sorted(places) if not (ROOT / "vinesim" / place).exists()] == []
+
+
+def test_the_python_of_the_readme_runs(tmp_path):
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    last = done.stdout.splitlines()[-1]
+    assert last.startswith("3.0 ["), last

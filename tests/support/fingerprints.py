@@ -24,7 +24,7 @@ from vinesim.client.tasks import start_poses
 from vinesim.net.codec import messages
 from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate

@@ -9,7 +9,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 
 

@@ -24,7 +24,7 @@ from vinesim.client.tasks.start_poses import start_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene

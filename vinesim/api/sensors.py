@@ -14,7 +14,7 @@ import numpy as np
 
 from vinesim.api.simulation import Simulation, base_pose
 from vinesim.errors import UsageError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.values import CameraFrame, CameraInfo, LidarScan
 from vinesim.sensors.camera import camera as rgbd
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN

@@ -22,7 +22,7 @@ from vinesim.errors import UsageError
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import TreeBuilder
 from vinesim.scene.cane import CaneBuilder, assemble
 from vinesim.scene.generation.vineyard import generate

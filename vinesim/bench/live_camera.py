@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.recording.trace import Trace
+from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, start_pose

@@ -25,10 +25,10 @@ from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import depth_colours, look_at, write_png
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
-from vinesim.sensors.raster.renderers import RendererUnavailable
+from vinesim.sensors.raster.renderer_selection import RendererUnavailable
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster
-from vinesim.sensors.truth import truth
+from vinesim.sensors.truth import ground_truth
 
 RANGES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
 """At which depth is measured [m]; what lies within a tenth of one counts for it."""
@@ -130,8 +130,8 @@ def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, snap
     rows = []
     for away in (0.6, 0.8, 1.0, 1.3):
         for _ in range(VIEWS_PER_RANGE):
-            seen = truth.render_buffers(primitives, info, _towards_a_bunch(rng, model, snapshot, away))
-            for one in truth.bunch_truths(primitives, snapshot, seen):
+            seen = ground_truth.render_buffers(primitives, info, _towards_a_bunch(rng, model, snapshot, away))
+            for one in ground_truth.bunch_truths(primitives, snapshot, seen):
                 left, top, right, bottom = one.amodal_box
                 whole = left > 0 and top > 0 and right < info.width - 1 and bottom < info.height - 1
                 if whole and one.amodal_pixels > 1500:

@@ -65,7 +65,7 @@ def _sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
 
 
 def _sync(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    from vinesim.bench.sync import sync
+    from vinesim.bench.replication_delay import sync
 
     return sync(plot=plot)
 
@@ -77,19 +77,19 @@ def _traffic() -> Iterator[Measurement]:
 
 
 def _load() -> Iterator[Measurement]:
-    from vinesim.bench.load import load
+    from vinesim.bench.router_load import load
 
     return load()
 
 
 def _fuzz() -> Iterator[Measurement]:
-    from vinesim.bench.fuzz import fuzz
+    from vinesim.bench.message_fuzz import fuzz
 
     return fuzz()
 
 
 def _link() -> Iterator[Measurement]:
-    from vinesim.bench.link import link
+    from vinesim.bench.touch_latency import link
 
     return link()
 

@@ -91,10 +91,10 @@ def check_options(options: ClientOptions) -> None:
     if options.tls is not None and options.connect is None:
         raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")
     from vinesim.physics.plants.device_buffers import find_device
-    from vinesim.sensors.raster import renderers
+    from vinesim.sensors.raster import renderer_selection
 
     find_device(options.device)
-    renderers.check_renderer(options.renderer)
+    renderer_selection.check_renderer(options.renderer)
     if options.threads > 1 and options.device != "cpu":
         raise UsageError(
             f"--threads {options.threads} --device {options.device}: threads are for the CPU; leave one of the two out"

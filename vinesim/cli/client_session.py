@@ -17,7 +17,7 @@ from typing import Any, Self, TypeVar
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.recording.trace import Trace
+from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
 from vinesim.net.transport.bus import Bus

@@ -14,12 +14,12 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vinesim.cli.render import parse_size
-from vinesim.client.composition.randomizer import SceneRandomizer
+from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.errors import UsageError
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
-from vinesim.sensors.raster import renderers
+from vinesim.sensors.raster import renderer_selection
 
 Worker = tuple[BaseProcess, Any]
 """A process and the end of the pipe on which it reports."""
@@ -49,7 +49,7 @@ def run(
         camera,
         None if size is None else parse_size(size),
         randomizer,
-        renderers.check_renderer(renderer),
+        renderer_selection.check_renderer(renderer),
     )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     running: list[Worker] = []

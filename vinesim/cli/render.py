@@ -13,7 +13,7 @@ import numpy as np
 from vinesim.errors import UsageError
 
 if TYPE_CHECKING:
-    from vinesim.client.composition.composer import SceneComposer
+    from vinesim.client.composition.scene_composer import SceneComposer
 
 
 def run(
@@ -40,12 +40,12 @@ def run(
     from vinesim.sensors.export import annotations as formats
     from vinesim.sensors.export import images as picture
     from vinesim.sensors.export.dataset import resized_intrinsics
-    from vinesim.sensors.raster import renderers
+    from vinesim.sensors.raster import renderer_selection
     from vinesim.sensors.scene.primitives import Primitives
     from vinesim.sensors.scene.ray_caster import enclosing_primitive
-    from vinesim.sensors.truth import truth
+    from vinesim.sensors.truth import ground_truth
 
-    renderers.check_renderer(renderer)
+    renderer_selection.check_renderer(renderer)
     eye, target = parse_point("--at", at), parse_point("--look", look)
     if np.linalg.norm(target - eye) < 1e-6:
         raise UsageError(f"--look {look} is where the camera stands; look at another point")
@@ -64,8 +64,8 @@ def run(
         organ, index = unlabel(int(primitives.label[inside]))
         raise UsageError(f"--at {at} lies inside {organ.name.lower()} {index}; move the camera out of it")
     pose = picture.look_at(eye, target)
-    seen = truth.render_buffers(primitives, info, pose)
-    truths = truth.bunch_truths(primitives, view, seen)
+    seen = ground_truth.render_buffers(primitives, info, pose)
+    truths = ground_truth.bunch_truths(primitives, view, seen)
     frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
     images = {
         "rgb": frame.rgb,
@@ -94,7 +94,7 @@ def run(
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:
     """The actors and crates of ``--robot``, ``--person`` and ``--crate``; :class:`UsageError` if one is wrong."""
-    from vinesim.client.composition.composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
+    from vinesim.client.composition.scene_composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
     from vinesim.robot.description.loader import load_description
     from vinesim.scene import appearance
 

@@ -10,7 +10,7 @@ from vinesim.client.client import Client
 from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
-from vinesim.client.tasks.tasks import plan_task, validate_task_name
+from vinesim.client.tasks.task_registry import plan_task, validate_task_name
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch

@@ -22,7 +22,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.avatar.local_human import LocalHuman
-from vinesim.client.recording.trace import Trace
+from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
@@ -36,8 +36,8 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.remote_robot import RemoteRobot
-from vinesim.robot.drives.robot import Robot
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
@@ -182,9 +182,9 @@ class Client:
                 self.remote_actors[name] = other
                 self.physics.contact_solver.remote_actors.add(name)
             match self.remote_actors.get(name), update:
-                case RemoteRobot() as robot, RobotUpdate():
+                case [RemoteRobot() as robot, RobotUpdate()]:
                     robot.follow(update)
-                case RemoteHuman() as human, HumanUpdate():
+                case [RemoteHuman() as human, HumanUpdate()]:
                     human.follow(update)
         self._apply_remote_trees(inbox)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.recording.trace import touch_to_motion
+from vinesim.client.recording.bunch_trace import touch_to_motion
 from vinesim.robot.tasks.task import Task
 
 

@@ -26,10 +26,10 @@ from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_node_name import validate_node_name
 from rclpy.validate_topic_name import validate_topic_name
 
-from vinesim.ros import ros_setup
+from vinesim.ros import middleware
 from vinesim.ros.commands.subscriptions import CommandSubscriptions
 from vinesim.ros.commands.types import Command
-from vinesim.ros.messages import convert, interfaces
+from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.publishers.camera import CameraPublisher
 from vinesim.ros.publishers.clock import ClockPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
@@ -81,8 +81,8 @@ class Node:
         except NameValidationException as error:
             # rclpy points at the wrong letter in a second line.
             raise ValueError(" ".join(str(error).replace("^", "").split())) from error
-        ros_setup.configure()
-        interfaces.ensure_importable(["tf2_msgs"])
+        middleware.configure()
+        message_packages.ensure_importable(["tf2_msgs"])
         from tf2_msgs.msg import TFMessage
 
         self._topics: dict[str, Topic] = {}

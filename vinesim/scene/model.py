@@ -17,7 +17,7 @@ import hashlib
 import numpy as np
 
 from vinesim import frames
-from vinesim.arrays import StructOfArrays, array
+from vinesim.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)

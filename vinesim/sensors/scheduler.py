@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import camera_raster, camera_raster_plants, lidar_raster, pose_clusters
+from vinesim.kernels.raster import camera_raster, camera_raster_plants, lidar_raster, transform_primitives
 from vinesim.kernels.sensing import lidar_echoes, stereo_depth
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.scene.model import Model
@@ -36,7 +36,7 @@ _MAX_PENDING_POSES = 1024
 def load_kernels() -> None:
     """Compile the kernels of cameras and lidars, or read them from the cache, before the first frame is due."""
     for module in (
-        pose_clusters,
+        transform_primitives,
         camera_raster,
         camera_raster_plants,
         lidar_raster,

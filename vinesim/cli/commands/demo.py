@@ -45,14 +45,14 @@ def demo(
       vinesim demo --job exchange
     """
     if job == "push":
-        from vinesim.cli.demo.push import run_push
+        from vinesim.cli.demo.push_demo import run_push
 
         code = run_push(
             seconds=seconds or 20.0, seed=seed, scene=scene or "demo", robot=robot or "vinebot", headless=headless,
             out=out,
         )  # fmt: skip
     else:
-        from vinesim.cli.demo.job import run_job
+        from vinesim.cli.demo.task_demo import run_job
 
         code = run_job(job, seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out)
     raise typer.Exit(code)

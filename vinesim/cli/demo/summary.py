@@ -10,8 +10,8 @@ from typing import Any
 from rich.table import Table
 
 from vinesim.cli.demo.progress import PICKER, VISITOR
-from vinesim.client.recording import touch_plot
-from vinesim.client.recording.trace import Rows, remote_error
+from vinesim.client.recording import contact_force_plot
+from vinesim.client.recording.bunch_trace import Rows, remote_error
 
 LOOP_KEYS = ("tick_hz", "tick_p50_ms", "tick_p99_ms", "overruns", "real_time_factor")
 
@@ -36,7 +36,7 @@ def push_summary(
     """What was measured of a push; draws ``touch.png``. ``received``: statistics of the topic monitor, by topic."""
     reports = {name: report_of(out, name) for name in (PICKER, VISITOR)}
     traces = {name: Rows.load(out / name / "trace.npz") for name in (PICKER, VISITOR)}
-    touch_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
+    contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
     touch_keys = (
         "touch_to_motion_ticks", "force_peak_n", "environment_bytes_when_far", "ticks_touching_when_far",
         "environment_bytes_out",

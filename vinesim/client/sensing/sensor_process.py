@@ -28,8 +28,8 @@ from vinesim.client.sensing.sensor_worker import (
 )
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.drives.robot import Robot
-from vinesim.ros import ros_setup
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.ros import middleware
 from vinesim.ros.commands.types import Command
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
@@ -82,7 +82,7 @@ class SensorProcess:
         """
         self.name = name
         self._attached = False
-        if ros and (reason := ros_setup.unavailable_reason()) is not None:
+        if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
         self._ros = ros

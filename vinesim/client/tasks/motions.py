@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 
 
 class DriveTo:

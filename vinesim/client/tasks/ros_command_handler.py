@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from vinesim.robot.control.trajectory_controller import Trajectory, TrajectoryController
 from vinesim.robot.drives.commands import CommandError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.ros.commands.types import BaseVelocity, Command, JointPositions
 
 log = logging.getLogger(__name__)

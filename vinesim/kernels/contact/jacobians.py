@@ -7,7 +7,7 @@ began.
 
 import warp as wp
 
-from vinesim.kernels.contact.motion import to_double, velocity_at
+from vinesim.kernels.contact.body_motion import to_double, velocity_at
 from vinesim.kernels.contact.structs import (
     Candidates,
     Contacts,

@@ -5,10 +5,10 @@ Two capsules that overlap while all plants rest as generated, or are that near, 
 
 import warp as wp
 
+from vinesim.kernels.contact.body_motion import extrapolate_point, to_double, velocity_at, velocity_product_acceleration
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import segment_segment_distance, vec6d
-from vinesim.kernels.contact.motion import extrapolate_point, to_double, velocity_at, velocity_product_acceleration
 from vinesim.kernels.contact.structs import (
     AWAKE_TREES,
     SORT_AXIS,

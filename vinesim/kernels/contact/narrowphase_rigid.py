@@ -5,6 +5,13 @@ Two shapes that overlap while all plants rest as generated, or are that near, ar
 
 import warp as wp
 
+from vinesim.kernels.contact.body_motion import (
+    extrapolate_point,
+    rotate_by_small_angle,
+    to_double,
+    velocity_at,
+    velocity_product_acceleration,
+)
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import (
@@ -12,13 +19,6 @@ from vinesim.kernels.contact.distance import (
     interval_along_face,
     segment_primitive_distance,
     vec5d,
-)
-from vinesim.kernels.contact.motion import (
-    extrapolate_point,
-    rotate_by_small_angle,
-    to_double,
-    velocity_at,
-    velocity_product_acceleration,
 )
 from vinesim.kernels.contact.structs import (
     AABB_BLOCK,

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim.kernels.contact import structs
+from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters
 from vinesim.physics.contact.detection import ContactDetection
 from vinesim.physics.contact.impulse_solver import ImpulseSolver
 from vinesim.physics.contact.plant_capsules import nearest_body, plant_capsules
-from vinesim.physics.contact.scene_arrays import PlantArrays, RigidArrays, kernel_parameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.model import Model

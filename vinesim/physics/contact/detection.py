@@ -15,9 +15,9 @@ import warp as wp
 
 from vinesim.kernels.contact import broadphase, narrowphase_plants, narrowphase_rigid, structs
 from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
-from vinesim.physics.contact.scene_arrays import PlantArrays, RigidArrays
-from vinesim.physics.contact.shared_arrays import SharedArrays, share
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 

@@ -11,9 +11,9 @@ import warp as wp
 
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
 from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.detection import ContactDetection
-from vinesim.physics.contact.scene_arrays import PlantArrays, RigidArrays
-from vinesim.physics.contact.shared_arrays import SharedArrays, share
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld

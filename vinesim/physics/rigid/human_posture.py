@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels import human_posture as kernels
+from vinesim.kernels import human_kinematics as kernels
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.rigid.human_shapes import (
     ANKLE_HEIGHT,

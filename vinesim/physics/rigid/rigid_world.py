@@ -16,14 +16,14 @@ import numpy as np
 
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, recompile, static_world
-from vinesim.physics.rigid.bunch_access import BunchAccess
-from vinesim.physics.rigid.human_access import HumanAccess
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
-from vinesim.physics.rigid.robot_access import RobotAccess
+from vinesim.physics.rigid.mujoco_world import CompiledWorld
+from vinesim.physics.rigid.rigid_world_bunches import BunchAccess
+from vinesim.physics.rigid.rigid_world_humans import HumanAccess
+from vinesim.physics.rigid.rigid_world_robots import RobotAccess
 from vinesim.physics.rigid.robot_body import RobotBody, build_error
 from vinesim.physics.rigid.urdf import RobotError
-from vinesim.physics.rigid.world_core import CompiledWorld
 from vinesim.scene.model import Model
 from vinesim.scene.values import HumanSpec, RobotSpec
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.robot.drives.commands import CommandError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.values import RobotSample
 
 JACOBIAN_DAMPING = 0.05

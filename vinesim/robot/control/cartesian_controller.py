@@ -18,7 +18,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.robot.drives.commands import CommandError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 
 POSITION_GAIN = 5.0
 """[1/s] Feedback gain of position and orientation; well below the servos' bandwidth. GUESSED"""

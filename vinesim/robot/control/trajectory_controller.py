@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vinesim.robot.drives.commands import CommandError, CommandInterface
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 
 
 class Outcome(enum.IntEnum):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 
 POSITION_TOLERANCE = 0.01
 """[m] A waypoint this near is reached. GUESSED"""

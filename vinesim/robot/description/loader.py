@@ -23,10 +23,10 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has n
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
 from vinesim.robot.description.errors import DescriptionError, description_error
-from vinesim.robot.description.guesses import guess_cameras, guess_groups, guess_lidars
-from vinesim.robot.description.installed_files import find_installed
+from vinesim.robot.description.inferred_defaults import guess_cameras, guess_groups, guess_lidars
 from vinesim.robot.description.kinematics import joint_origin, link_anchors, moving_joints
 from vinesim.robot.description.meshes import resolve_meshes
+from vinesim.robot.description.package_resources import find_installed
 from vinesim.robot.description.sidecar import Sidecar, check_sidecar, read_sidecar
 from vinesim.robot.description.urdf_checks import check_joints, check_masses, check_tree
 from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES, check_numbers, fix_wheels, read_xml

@@ -9,7 +9,7 @@ import yourdfpy
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.errors import description_error
-from vinesim.robot.description.installed_files import find_installed
+from vinesim.robot.description.package_resources import find_installed
 
 MESH_FORMATS = (".stl", ".obj", ".msh")
 """File formats that MuJoCo reads; meshes of others, such as Collada, are replaced."""

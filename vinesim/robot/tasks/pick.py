@@ -25,7 +25,7 @@ from vinesim.physics.step import Physics
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.commands import CommandError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
 
 STALK_LENGTH = 0.012

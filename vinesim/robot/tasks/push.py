@@ -19,7 +19,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.robot.control.cartesian_controller import CartesianController
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 
 log = logging.getLogger(__name__)
 

@@ -24,7 +24,7 @@ from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.commands import CommandError
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
 
 LIFT_HEIGHT = 0.15

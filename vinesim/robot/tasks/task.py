@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 
 log = logging.getLogger(__name__)
 

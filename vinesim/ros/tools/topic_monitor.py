@@ -26,8 +26,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from vinesim.ros import ros_setup
-from vinesim.ros.messages import interfaces
+from vinesim.ros import middleware
+from vinesim.ros.messages import message_packages
 
 DISCOVERY_PERIOD = 0.2
 """Time between two searches for new topics [s]."""
@@ -193,12 +193,12 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Monitor and report; the exit status."""
     given = parse(arguments)
-    reason = ros_setup.unavailable_reason()
+    reason = middleware.unavailable_reason()
     if reason is not None:
         sys.stderr.write(reason + "\n")
         return 2
-    ros_setup.clear_profile()
-    interfaces.ensure_importable(["tf2_msgs"])
+    middleware.clear_profile()
+    message_packages.ensure_importable(["tf2_msgs"])
     stop = threading.Event()
     if given.seconds is None:
         threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()

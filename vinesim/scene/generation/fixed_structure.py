@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.scene.generation.slots import ARM_SEGMENTS, TRUNK_SEGMENTS
+from vinesim.scene.generation.shoot_slots import ARM_SEGMENTS, TRUNK_SEGMENTS
 from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene.generation.bodies import Bodies
+from vinesim.scene.generation.plant_bodies import Bodies
+from vinesim.scene.generation.shoot_slots import AXIS_SEGMENTS, LATERAL_NODES, LATERAL_SEGMENTS, MAX_NODES
 from vinesim.scene.generation.shoots import Shoots
-from vinesim.scene.generation.slots import AXIS_SEGMENTS, LATERAL_NODES, LATERAL_SEGMENTS, MAX_NODES
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene
 

@@ -9,7 +9,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.scene import berries
 from vinesim.scene.generation.fixed_structure import FixedStructure
-from vinesim.scene.generation.slots import AXIS_SEGMENTS, MAX_BUNCHES, PEDUNCLE_SEGMENTS
+from vinesim.scene.generation.shoot_slots import AXIS_SEGMENTS, MAX_BUNCHES, PEDUNCLE_SEGMENTS
 from vinesim.scene.plant_parameters import Range, VineParameters
 from vinesim.scene.spec import Scene
 

@@ -10,7 +10,7 @@ from vinesim import frames
 from vinesim.scene import builder
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.fruit import choose_bunches, sample_fruit
-from vinesim.scene.generation.slots import (
+from vinesim.scene.generation.shoot_slots import (
     ARM_SEGMENTS,
     AXIS_SEGMENTS,
     LATERAL_NODES,

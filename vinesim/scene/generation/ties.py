@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.scene.generation.bodies import Bodies
+from vinesim.scene.generation.plant_bodies import Bodies
 from vinesim.scene.generation.shoots import Shoots
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene

@@ -1,6 +1,6 @@
 """From a scene to a model: poles, wires and old wood stand fixed; every shoot is a tree with leaves and bunches.
 
-Shoots are rows of a table with the same slots each (:mod:`~vinesim.scene.generation.slots`); what a shoot does not have
+Shoots are rows of a table with the same slots each (:mod:`~vinesim.scene.generation.shoot_slots`); what a shoot does not have
 is masked out at the end, so nothing loops over plants except the drawing of random numbers. Each vine rngs from its own
 stream, named by (seed, row, place): the numbers of a vine do not depend on how many others there are.
 """
@@ -11,11 +11,11 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.scene import builder, leaves, plant_parameters
-from vinesim.scene.generation.bodies import Bodies, build_bodies
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
 from vinesim.scene.generation.foliage import place_leaves
+from vinesim.scene.generation.plant_bodies import Bodies, build_bodies
+from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
 from vinesim.scene.generation.shoots import Shoots, sample_shoots
-from vinesim.scene.generation.slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
 from vinesim.scene.generation.ties import find_ties
 from vinesim.scene.model import Model
 from vinesim.scene.plant_parameters import VineParameters

@@ -32,7 +32,7 @@ from vinesim.sensors.scene.bunch_primitives import Ripeness
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.spec_file import SensorError
-from vinesim.sensors.truth import truth
+from vinesim.sensors.truth import ground_truth
 
 IMAGES_PER_VINEYARD = 5
 """Images of one vineyard before the next one is generated."""
@@ -145,7 +145,7 @@ class VineyardRenderer:
         hour, sun = _random_sun(rng)
         snapshot, near, activity = self._pose_scene(image)
         seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
-        truths = truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
+        truths = ground_truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image)
         frame = camera.render(self.primitives, seen.pose)
         assert frame.exact_depth is not None
@@ -195,7 +195,7 @@ class VineyardRenderer:
 
     def _choose_view(
         self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
-    ) -> truth.PixelBuffers:
+    ) -> ground_truth.PixelBuffers:
         """From somewhere near a hanging bunch, in the open, with that bunch in sight.
 
         If there are actors, the bunch hangs ``near`` them, and one of the ``actors`` [m] is seen too, if a
@@ -229,7 +229,7 @@ class VineyardRenderer:
                 continue
             optical = picture.look_at(eye, aim)
             optical[3:] = frames.multiply(optical[3:], roll)
-            seen = truth.render_buffers(self.primitives, self.info, optical)
+            seen = ground_truth.render_buffers(self.primitives, self.info, optical)
             shown = (seen.labels == label(Organ.BUNCH, bunch)).sum()
             if (
                 actors

@@ -13,20 +13,20 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.raster import pose_clusters, primitives
+from vinesim.kernels.raster import primitives, transform_primitives
 from vinesim.kernels.shading import materials
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import RigidVisual, Snapshot
-from vinesim.sensors.raster import renderers
+from vinesim.sensors.raster import renderer_selection
 from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
-from vinesim.sensors.scene.cluster_layout import ClusterLayout, lay_out
-from vinesim.sensors.scene.leaf_density import LeafDensity
+from vinesim.sensors.scene.leaf_area_density import LeafDensity
 from vinesim.sensors.scene.plant_primitives import cane_batch, leaf_batches
 from vinesim.sensors.scene.primitive_batches import placeholder_batch
+from vinesim.sensors.scene.primitive_clusters import ClusterLayout, lay_out
 from vinesim.sensors.scene.rigid_primitives import rigid_batches
 from vinesim.sensors.scene.static_primitives import grass_batch, litter_batch, row_layout, trellis_batch
 
@@ -49,10 +49,10 @@ class Primitives:
         renderer: str = "warp",
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
-        the fruit: all of it is ripe unless given; ``renderer``: see :mod:`~vinesim.sensors.raster.renderers`.
+        the fruit: all of it is ripe unless given; ``renderer``: see :mod:`~vinesim.sensors.raster.renderer_selection`.
         """
         self.model, self.device, self._ripeness = model, device, ripeness
-        self.rasterizer = renderers.create_rasterizer(renderer, device)
+        self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
         """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer` does so itself."""
         bodies = len(model.body_mass)
         self._static_carrier = bodies
@@ -276,7 +276,7 @@ class Primitives:
     def _pose(self, dirty: np.ndarray) -> None:
         self._pose_array.assign(self._poses)
         wp.launch(
-            pose_clusters.pose_clusters,
+            transform_primitives.pose_clusters,
             len(dirty),
             inputs=[
                 self._local,

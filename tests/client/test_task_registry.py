@@ -10,11 +10,11 @@ from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
-from vinesim.client.tasks.tasks import UnknownTask, plan_task
+from vinesim.client.tasks.task_registry import UnknownTask, plan_task
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description as load_robot
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes
 from vinesim.robot.tasks.task import Task

@@ -16,7 +16,7 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.raster.primitive_arrays import SPHEROID
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
-from vinesim.sensors.truth import truth
+from vinesim.sensors.truth import ground_truth
 
 
 def _frame(labels: np.ndarray, depth: np.ndarray) -> CameraFrame:
@@ -33,14 +33,14 @@ def test_pixels_boxes_and_distances() -> None:
     depth = np.full((6, 8), np.inf, np.float32)
     depth[1:3, 2:5] = 1.5
     depth[1, 2] = -np.inf
-    three, seven = truth.detect_bunches(_frame(labels, depth))
+    three, seven = ground_truth.detect_bunches(_frame(labels, depth))
     assert (three.bunch, three.pixels, three.box) == (3, 1, (7, 5, 7, 5))
     assert np.isnan(three.distance)
     assert (seven.bunch, seven.pixels, seven.box, seven.distance) == (7, 6, (2, 1, 4, 2), pytest.approx(1.5))
 
 
 def test_no_bunch_no_sighting() -> None:
-    assert truth.detect_bunches(_frame(np.zeros((4, 4), np.int32), np.zeros((4, 4), np.float32))) == ()
+    assert ground_truth.detect_bunches(_frame(np.zeros((4, 4), np.int32), np.zeros((4, 4), np.float32))) == ()
 
 
 # ---- a picture and all that is true of it ----------------------------------------------------------------------------
@@ -70,11 +70,11 @@ def _before(model, view, bunch: int, away=(-0.48, 0.3, -0.12)) -> np.ndarray:
     return look_at(middle + np.array(away), middle)
 
 
-def _of(truths, bunch: int) -> truth.BunchTruth:
+def _of(truths, bunch: int) -> ground_truth.BunchTruth:
     return next(one for one in truths if one.bunch == bunch)
 
 
-def _points(seen: truth.PixelBuffers, mask: np.ndarray) -> np.ndarray:
+def _points(seen: ground_truth.PixelBuffers, mask: np.ndarray) -> np.ndarray:
     """World points [k, 3] of some pixels, from depth and intrinsics alone."""
     local = sensor_scenes.pixel_rays(seen.info)[mask] * seen.depth[mask].astype(float)[:, None]
     return seen.pose[:3] + frames.rotate(seen.pose[3:], local)
@@ -84,8 +84,8 @@ def _points(seen: truth.PixelBuffers, mask: np.ndarray) -> np.ndarray:
 def along(grove):
     """A look along the rows, and the truth of it."""
     _, primitives, view = grove
-    seen = truth.render_buffers(primitives, NEAR, look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
-    return seen, truth.bunch_truths(primitives, view, seen)
+    seen = ground_truth.render_buffers(primitives, NEAR, look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
+    return seen, ground_truth.bunch_truths(primitives, view, seen)
 
 
 def test_ids_pixels_and_berries_are_those_of_the_ray_caster(grove, along) -> None:
@@ -100,7 +100,7 @@ def test_ids_pixels_and_berries_are_those_of_the_ray_caster(grove, along) -> Non
         mine = organ == label(Organ.BUNCH, one.bunch)
         assert abs(mine.sum() - one.pixels) <= 0.01 * mine.sum() + 2
         berry, count = np.unique(oracle[mine & (kind[oracle] == SPHEROID)], return_counts=True)
-        seen_by_oracle = (count >= truth.MIN_BERRY_PIXELS).sum()
+        seen_by_oracle = (count >= ground_truth.MIN_BERRY_PIXELS).sum()
         assert abs(seen_by_oracle - one.berries_seen) <= 1  # one pixel more or less
         assert one.berries == model.bunch_berries[one.bunch] >= one.berries_seen
         assert len(berry) <= one.berries
@@ -109,7 +109,7 @@ def test_ids_pixels_and_berries_are_those_of_the_ray_caster(grove, along) -> Non
 def test_berry_numbers_are_those_of_the_packed_bunch(grove) -> None:
     model, primitives, view = grove
     bunch = 22
-    seen = truth.render_buffers(primitives, NEAR, _before(model, view, bunch))
+    seen = ground_truth.render_buffers(primitives, NEAR, _before(model, view, bunch))
     mine = (seen.labels == label(Organ.BUNCH, bunch)) & (seen.berries >= 0)
     assert mine.sum() > 500
     own = lay_out_berries(
@@ -138,8 +138,8 @@ def test_amodal_masks_are_what_rays_meet_of_the_bunch_alone(grove) -> None:
     model, _, view = grove
     bunch = 18
     whole = Primitives(model, grass=0.0)
-    seen = truth.render_buffers(whole, NEAR, look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
-    one = _of(truth.bunch_truths(whole, view, seen), bunch)
+    seen = ground_truth.render_buffers(whole, NEAR, look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7])))
+    one = _of(ground_truth.bunch_truths(whole, view, seen), bunch)
     assert not (one.visible & ~one.amodal).any()
     assert one.pixels < one.amodal_pixels
     mine = whole.label[whole.cluster_first] == label(Organ.BUNCH, bunch)
@@ -148,7 +148,7 @@ def test_amodal_masks_are_what_rays_meet_of_the_bunch_alone(grove) -> None:
     _, oracle = sensor_scenes.oracle(whole, seen.pose, NEAR)
     mask = one.mask(one.amodal, NEAR)
     assert ((oracle >= 0) != mask).sum() <= 2
-    assert one.amodal_box == truth._box_of(oracle >= 0, (0, 0, 0, 0))
+    assert one.amodal_box == ground_truth._box_of(oracle >= 0, (0, 0, 0, 0))
 
 
 def test_a_wall_hides_and_truth_knows_how_much(grove) -> None:
@@ -158,13 +158,15 @@ def test_a_wall_hides_and_truth_knows_how_much(grove) -> None:
     pose = _before(model, rest, bunch)
     forward, right = (frames.rotate(pose[3:], np.eye(3)[k]) for k in (2, 0))
 
-    def behind(aside: float) -> truth.BunchTruth:
+    def behind(aside: float) -> ground_truth.BunchTruth:
         """The bunch behind a board whose left edge is so far [m] right of the line of sight, or all over it."""
         board = pose[:3] + 0.2 * forward + (0.5 + aside) * right
         primitives, view = sensor_scenes.world(
             sensor_scenes.thing(sensor_scenes.shape("box", 0.5, 0.5, 0.001)), model=model, at=[[*board, *pose[3:]]]
         )
-        return _of(truth.bunch_truths(primitives, view, truth.render_buffers(primitives, NEAR, pose)), bunch)
+        return _of(
+            ground_truth.bunch_truths(primitives, view, ground_truth.render_buffers(primitives, NEAR, pose)), bunch
+        )
 
     free, half, hidden = behind(5.0), behind(0.0), behind(-0.5)
     assert free.occlusion < 0.1
@@ -212,8 +214,8 @@ def test_cut_points_lie_in_the_middle_of_the_peduncle(grove, along) -> None:
 def test_the_3d_box_holds_the_bunch_and_no_more(grove) -> None:
     model, primitives, view = grove
     bunch = 22
-    seen = truth.render_buffers(primitives, NEAR, _before(model, view, bunch))
-    one = _of(truth.bunch_truths(primitives, view, seen), bunch)
+    seen = ground_truth.render_buffers(primitives, NEAR, _before(model, view, bunch))
+    one = _of(ground_truth.bunch_truths(primitives, view, seen), bunch)
     own = np.flatnonzero(primitives.label == label(Organ.BUNCH, bunch))
     a, b = (getattr(primitives.shapes, k).numpy()[own].astype(float) for k in "ab")
     berry = primitives.shapes.kind.numpy()[own] == SPHEROID
@@ -238,7 +240,7 @@ def test_depth_labels_and_intrinsics_give_the_middle_of_a_bunch(grove) -> None:
         points, box = [], None
         for turn in np.arange(4) * np.pi / 2:
             pose = _before(model, view, bunch, (0.45 * np.cos(turn), 0.45 * np.sin(turn), -0.12))
-            truths = truth.bunch_truths(primitives, view, truth.render_buffers(primitives, NEAR, pose))
+            truths = ground_truth.bunch_truths(primitives, view, ground_truth.render_buffers(primitives, NEAR, pose))
             box = _of(truths, bunch)
             if box.occlusion > 0.02:
                 continue
@@ -258,13 +260,15 @@ def test_a_picked_bunch_keeps_its_number(grove) -> None:
     model, primitives, rest = grove
     bunch = 22
     pose = _before(model, rest, bunch)
-    before = _of(truth.bunch_truths(primitives, rest, truth.render_buffers(primitives, NEAR, pose)), bunch)
+    before = _of(
+        ground_truth.bunch_truths(primitives, rest, ground_truth.render_buffers(primitives, NEAR, pose)), bunch
+    )
     link = RigidVisual(f"bunch/{bunch}", Organ.BUNCH, bunch, ())
     lying = rest_snapshot(model, (link,), rest.body_q[model.bunch_body[[bunch]]])
     lying.bunch_attached[bunch] = False
     loose = Primitives(model, grass=2.0)
     loose.update(lying)
-    after = _of(truth.bunch_truths(loose, lying, truth.render_buffers(loose, NEAR, pose)), bunch)
+    after = _of(ground_truth.bunch_truths(loose, lying, ground_truth.render_buffers(loose, NEAR, pose)), bunch)
     assert (after.attached, after.cut, after.cut_pixel, after.cut_seen) == (False, None, None, False)
     assert (after.label, after.berries) == (before.label, before.berries)
     assert after.amodal_box == before.amodal_box
@@ -275,10 +279,10 @@ def test_a_picked_bunch_keeps_its_number(grove) -> None:
 def test_flow_of_a_moved_camera_lands_on_the_same_points(grove) -> None:
     _, primitives, _ = grove
     one, two = (
-        truth.render_buffers(primitives, NEAR, look_at(np.array([x, 1.2, 1.3]), np.array([3.0, y, 1.7])))
+        ground_truth.render_buffers(primitives, NEAR, look_at(np.array([x, 1.2, 1.3]), np.array([3.0, y, 1.7])))
         for x, y in ((0.4, 1.0), (0.46, 1.03))
     )
-    shift, shown = truth.optical_flow(one, two)
+    shift, shown = ground_truth.optical_flow(one, two)
     assert np.array_equal(np.isnan(shift[..., 0]), one.primitive == -1)
     assert shown.mean() > 0.5
     v, u = np.nonzero(shown)
@@ -303,7 +307,7 @@ def test_flow_of_a_moved_plant_is_its_motion_alone(grove) -> None:
     model, _, view = grove
     primitives, bunch = Primitives(model, grass=0.0), 22
     pose = _before(model, view, bunch)
-    one = truth.render_buffers(primitives, NEAR, pose)
+    one = ground_truth.render_buffers(primitives, NEAR, pose)
     tree = int(model.body_tree[model.bunch_body[bunch]])
     body_q = view.body_q.copy()
     turn = frames.exp(np.array([0.02, 0.0, 0.1]))
@@ -312,7 +316,7 @@ def test_flow_of_a_moved_plant_is_its_motion_alone(grove) -> None:
     body_q[bodies, :3] = hub + frames.rotate(turn, body_q[bodies, :3] - hub)
     body_q[bodies, 3:] = frames.multiply(turn, body_q[bodies, 3:])
     primitives.update(dataclasses.replace(view, body_q=body_q, moved_trees=np.array([tree])))
-    shift, _ = truth.optical_flow(one, truth.render_buffers(primitives, NEAR, pose))
+    shift, _ = ground_truth.optical_flow(one, ground_truth.render_buffers(primitives, NEAR, pose))
     carried = np.append(np.isin(one.carrier_poses[:, :3], view.body_q[bodies, :3]).all(1), [False, False])[
         one.primitive
     ]
@@ -332,7 +336,7 @@ def test_flow_of_a_moved_plant_is_its_motion_alone(grove) -> None:
         )
     )
     with pytest.raises(ValueError, match="came or went"):
-        truth.optical_flow(one, truth.render_buffers(primitives, NEAR, pose))
+        ground_truth.optical_flow(one, ground_truth.render_buffers(primitives, NEAR, pose))
 
 
 def test_depth_and_lidar_measure_the_same_scene(grove) -> None:
@@ -341,7 +345,7 @@ def test_depth_and_lidar_measure_the_same_scene(grove) -> None:
     pose = look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7]))
     scan = Lidar(LidarSpec.load("vlp16").ideal()).scan(primitives, np.array([*pose[:3], 0.0, 0.0, 0.0, 1.0]))
     fine = CameraInfo(1280, 960, 1000.0, 1000.0, 639.5, 479.5, "optical")
-    seen = truth.render_buffers(primitives, fine, pose)
+    seen = ground_truth.render_buffers(primitives, fine, pose)
     local = frames.rotate(frames.conjugate(pose[3:]), scan.xyz.astype(float))
     pixel = np.round(np.nan_to_num(project_points(local, fine), nan=-1.0)).astype(int)
     inside = ((pixel >= 0) & (pixel < [fine.width, fine.height])).all(1) & (local[:, 2] < 4.0)
@@ -361,7 +365,7 @@ def test_registration_recovers_the_motion_between_two_views(grove) -> None:
     step = np.array([0.01, -0.006, 0.012, *frames.exp(np.radians([0.4, -0.5, 0.3]))])
     clouds = []
     for pose in (start, frames.compose(start, step)):
-        seen = truth.render_buffers(primitives, sensor_scenes.IDEAL.info("optical"), pose)
+        seen = ground_truth.render_buffers(primitives, sensor_scenes.IDEAL.info("optical"), pose)
         near = (seen.depth < 4.0) & (seen.primitive >= 0)
         local = sensor_scenes.pixel_rays(seen.info)[near] * seen.depth[near].astype(float)[:, None]
         points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(local))

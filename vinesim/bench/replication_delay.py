@@ -20,7 +20,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.recording.trace import Trace
+from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
@@ -382,7 +382,7 @@ def sync(delays: tuple[float, ...] = DELAYS, *, plot: pathlib.Path | None = None
         lines.append(line)
         yield line
     if plot is not None:
-        from vinesim.bench.sync_plot import draw
+        from vinesim.bench.replication_delay_plot import draw
 
         draw(lines, {key: 1e3 * along(rows) for key, rows in fights.items()}, plot)
 

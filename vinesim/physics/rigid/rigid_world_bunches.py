@@ -10,7 +10,7 @@ from vinesim import frames
 from vinesim.physics.rigid import free_bunch
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.mujoco_sleep import wake_body
-from vinesim.physics.rigid.world_core import WorldCore
+from vinesim.physics.rigid.mujoco_world import WorldCore
 
 
 class BunchAccess(WorldCore):

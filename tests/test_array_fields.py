@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vinesim.arrays import StructOfArrays, array
+from vinesim.array_fields import StructOfArrays, array
 
 
 @dataclasses.dataclass

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from vinesim.client.recording.trace import Rows, remote_error, touch_to_motion
+from vinesim.client.recording.bunch_trace import Rows, remote_error, touch_to_motion
 
 
 def rows(clock, x, force, told=True):

@@ -17,7 +17,7 @@ import numpy as np
 
 from vinesim.bench.support.fake_client import FakeClientProcess
 from vinesim.bench.support.network_emulator import Link, LinkProfile, NetworkEmulator
-from vinesim.client.recording.trace import Rows, remote_error
+from vinesim.client.recording.bunch_trace import Rows, remote_error
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene

@@ -6,7 +6,7 @@ import pathlib
 
 import numpy as np
 
-from vinesim.client.recording.trace import Rows
+from vinesim.client.recording.bunch_trace import Rows
 
 
 def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:

@@ -8,8 +8,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.scene import builder
-from vinesim.scene.generation.shoots import Shoots
-from vinesim.scene.generation.slots import (
+from vinesim.scene.generation.shoot_slots import (
     AXIS_SEGMENTS,
     CORE_SLOTS,
     LATERAL_SEGMENTS,
@@ -20,6 +19,7 @@ from vinesim.scene.generation.slots import (
     cluster_slots,
     peduncle_slots,
 )
+from vinesim.scene.generation.shoots import Shoots
 from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import Cane as CaneParameters
 from vinesim.scene.plant_parameters import Peduncle as PeduncleParameters

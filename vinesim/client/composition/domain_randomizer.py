@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.client.composition.composer import (
+from vinesim.client.composition.scene_composer import (
     CratePlacement,
     PersonPlacement,
     PlacementError,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim.bench import sync
-from vinesim.bench.sync import buffered, extrapolation, turns
+from vinesim.bench import replication_delay
+from vinesim.bench.replication_delay import buffered, extrapolation, turns
 
 
 def test_a_touch_moves_at_once_here_and_late_through_an_authority_far_away():
     """F12, F68, F81, F87."""
-    rows = sync.one_push(0.05)
+    rows = replication_delay.one_push(0.05)
     assert rows.seen(0) == 0.0, "the tick of the touch is the tick of the motion"
     assert 0.04 <= rows.seen(1) <= 0.08, "another sees it one way later"
     assert rows.seen(2) >= 0.10, "an authority far away answers a round trip later"

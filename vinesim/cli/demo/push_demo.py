@@ -15,7 +15,7 @@ from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import push_summary, push_table, write_summary
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.ros import ros_setup
+from vinesim.ros import middleware
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
 
@@ -34,7 +34,7 @@ def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headle
     for folder in (out, out / PICKER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
-    no_ros = ros_setup.unavailable_reason()
+    no_ros = middleware.unavailable_reason()
     if no_ros:
         console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
 

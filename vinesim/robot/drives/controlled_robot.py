@@ -20,9 +20,9 @@ from vinesim.physics.plants.detachment import Blade
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.drives.body_sensors import BodySensors, elastic_sample
 from vinesim.robot.drives.commands import CommandError, CommandInterface
 from vinesim.robot.drives.joint_servos import JointServos
+from vinesim.robot.drives.proprioception import BodySensors, elastic_sample
 from vinesim.robot.drives.robot_instance import RobotInstance
 from vinesim.scene.values import Contact, RobotSample, RobotUpdate
 

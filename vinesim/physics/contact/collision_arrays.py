@@ -10,7 +10,7 @@ from vinesim import frames
 from vinesim.kernels.contact import structs
 from vinesim.physics.contact.collision_geoms import RigidGeoms, concatenate, persistent_names
 from vinesim.physics.contact.plant_capsules import PlantCapsules
-from vinesim.physics.contact.shared_arrays import SharedArrays
+from vinesim.physics.contact.warp_arrays import SharedArrays
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld

@@ -11,9 +11,9 @@ from vinesim.cli.demo.placement import visitor_pose
 from vinesim.cli.demo.processes import START_TIMEOUT, process_group
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
-from vinesim.client.tasks.tasks import UnknownTask
+from vinesim.client.tasks.task_registry import UnknownTask
 from vinesim.robot.description.loader import load_description
-from vinesim.ros import ros_setup
+from vinesim.ros import middleware
 from vinesim.scene.spec import load_scene, with_seed
 
 JOBS = {"pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged")}
@@ -57,7 +57,7 @@ def run_job(
         if visitor is not None:
             visitor.finish()
     summary = job_summary(
-        out, job, done_key, scene=scene, seed=plan.seed, robot=robot, no_ros=ros_setup.unavailable_reason(),
+        out, job, done_key, scene=scene, seed=plan.seed, robot=robot, no_ros=middleware.unavailable_reason(),
         with_visitor=visitor is not None,
     )  # fmt: skip
     write_summary(out, summary)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.support import sensor_scenes
-from vinesim.client.composition.randomizer import FOOTPRINT_RADIUS, SceneRandomizer, random_composition
+from vinesim.client.composition.domain_randomizer import FOOTPRINT_RADIUS, SceneRandomizer, random_composition
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
 

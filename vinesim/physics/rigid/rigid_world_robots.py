@@ -5,8 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from vinesim.physics.rigid.mujoco_world import WorldCore
 from vinesim.physics.rigid.robot_body import LinkSensor
-from vinesim.physics.rigid.world_core import WorldCore
 
 
 class RobotAccess(WorldCore):

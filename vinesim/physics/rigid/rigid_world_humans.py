@@ -8,7 +8,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.rigid.hand_wrenches import hand_wrenches
 from vinesim.physics.rigid.human_shapes import PALM_TO_FINGERTIP
-from vinesim.physics.rigid.world_core import WorldCore
+from vinesim.physics.rigid.mujoco_world import WorldCore
 from vinesim.scene.values import HandSample, HumanPose
 
 

@@ -10,12 +10,12 @@ import sys
 
 import pytest
 
-from vinesim.ros import ros_setup
-from vinesim.ros.messages import interfaces
+from vinesim.ros import middleware
+from vinesim.ros.messages import message_packages
 
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.skipif(ros_setup.unavailable_reason() is not None, reason=str(ros_setup.unavailable_reason())),
+    pytest.mark.skipif(middleware.unavailable_reason() is not None, reason=str(middleware.unavailable_reason())),
 ]
 
 # As `ros2 topic info --verbose /tf` prints it on ROS 2 Jazzy.
@@ -27,7 +27,7 @@ OFFICIAL = {
 ASK_HASHES = """
 import rclpy
 from rclpy.context import Context
-from vinesim.ros.messages import interfaces
+from vinesim.ros.messages import message_packages as interfaces
 interfaces.ensure_importable(["tf2_msgs"])
 from tf2_msgs.msg import TF2Error, TFMessage
 context = Context()
@@ -41,7 +41,7 @@ node.destroy_node()
 context.shutdown()
 """
 
-BUILD = "import sys; from vinesim.ros.messages import interfaces; sys.stdout.write(str(interfaces.build('tf2_msgs')))"
+BUILD = "import sys; from vinesim.ros.messages import message_packages as interfaces; sys.stdout.write(str(interfaces.build('tf2_msgs')))"
 
 
 @pytest.fixture(scope="module")
@@ -80,35 +80,37 @@ def test_what_can_be_imported_is_not_built(own_cache, monkeypatch):
     def refuse(package: str):
         raise AssertionError(f"built {package}")
 
-    monkeypatch.setattr(interfaces, "build", refuse)
-    interfaces.ensure_importable(["std_msgs", "sensor_msgs"])
+    monkeypatch.setattr(message_packages, "build", refuse)
+    message_packages.ensure_importable(["std_msgs", "sensor_msgs"])
 
 
 def test_unknown_package_names_the_folder():
-    with pytest.raises(interfaces.InterfacesError, match=r"'no_such_msgs'.*add its \.msg files to .*msgs/no_such_msgs"):
-        interfaces.build("no_such_msgs")
+    with pytest.raises(
+        message_packages.InterfacesError, match=r"'no_such_msgs'.*add its \.msg files to .*msgs/no_such_msgs"
+    ):
+        message_packages.build("no_such_msgs")
 
 
 def test_missing_compiler_names_the_remedy(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     which = shutil.which
     monkeypatch.setattr(shutil, "which", lambda name: None if name == "g++" else which(name))
-    with pytest.raises(interfaces.InterfacesError, match=r"g\+\+ is missing; apt install g\+\+"):
-        interfaces.build("tf2_msgs")
+    with pytest.raises(message_packages.InterfacesError, match=r"g\+\+ is missing; apt install g\+\+"):
+        message_packages.build("tf2_msgs")
 
 
 def test_missing_generators_name_the_extra(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rosidl_generator_py" else find(name))
-    with pytest.raises(interfaces.InterfacesError, match=r"vinesim\[ros\]"):
-        interfaces.build("tf2_msgs")
+    with pytest.raises(message_packages.InterfacesError, match=r"vinesim\[ros\]"):
+        message_packages.build("tf2_msgs")
 
 
 def test_a_changed_definition_changes_the_key(tmp_path, monkeypatch):
-    before = interfaces._key("tf2_msgs")
-    monkeypatch.setattr(interfaces, "DEFINITIONS", tmp_path)
+    before = message_packages._key("tf2_msgs")
+    monkeypatch.setattr(message_packages, "DEFINITIONS", tmp_path)
     folder = tmp_path / "tf2_msgs" / "msg"
     folder.mkdir(parents=True)
     (folder / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\nuint8 more\n")
-    assert interfaces._key("tf2_msgs") != before
+    assert message_packages._key("tf2_msgs") != before

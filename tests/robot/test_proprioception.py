@@ -11,7 +11,7 @@ from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim import frames
-from vinesim.client.composition.composer import (
+from vinesim.client.composition.scene_composer import (
     CRATE_WALL,
     HEAP_DENSITY,
     CratePlacement,

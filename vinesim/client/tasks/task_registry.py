@@ -9,7 +9,7 @@ import numpy as np
 
 from vinesim.client.tasks import pick_planning, swap_planning
 from vinesim.physics.step import Physics
-from vinesim.robot.drives.robot import Robot
+from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task

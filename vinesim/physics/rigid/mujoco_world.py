@@ -16,12 +16,12 @@ from vinesim.physics.contact import collision_geoms
 from vinesim.physics.contact.effective_mass import EffectiveMass
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, recompile, static_world
+from vinesim.physics.rigid.body_tables import list_owners, list_visuals
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS
 from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.rigid.world_tables import list_owners, list_visuals
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual
 
