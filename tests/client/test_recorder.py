@@ -13,7 +13,8 @@ from tests.support.recorded_world import TICK, Light, vineyard
 from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, Recorder, grid
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
-from vinesim.net.recording.mcap_file import Recording, RecordingWriter, read
+from vinesim.net.recording.mcap_reader import Recording, read_recording
+from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.replication.interest import INTEREST_RADIUS
 from vinesim.net.replication.peers import WorldMismatch
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -61,7 +62,7 @@ class World:
 
     def tape(self) -> Recording:
         self.recording.close()
-        return read(self.recording.path)
+        return read_recording(self.recording.path)
 
 
 def families(tape: Recording) -> set[str]:

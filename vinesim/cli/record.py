@@ -13,7 +13,7 @@ import time
 
 from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, grid
 from vinesim.errors import UsageError
-from vinesim.net.recording.mcap_file import RecordingWriter, free_path
+from vinesim.net.recording.mcap_writer import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 POLL = 0.004

@@ -18,7 +18,8 @@ from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.recording.mcap_file import RecordingWriter, sender_of
+from vinesim.net.keys import sender_of
+from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.replication import interest
 from vinesim.net.replication.clock_sync import PING_WINDOW, ClockEstimate, Ping
 from vinesim.net.replication.peers import ASK_PERIOD, FAR_PERIOD, PING_PERIOD, WorldMismatch

@@ -20,7 +20,8 @@ from collections.abc import Callable, Iterable
 from vinesim.client.recording.recorder import NetworkClock
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
-from vinesim.net.recording.mcap_file import RecordedMessage, Recording, sender_of
+from vinesim.net.keys import sender_of
+from vinesim.net.recording.mcap_reader import RecordedMessage, Recording
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_LAST_1, Bus, NameTaken, Publisher, Reply, SampleStore, matches
 

@@ -1,8 +1,8 @@
 """Outgoing half of replication: claims, states of what moves, states at rest and retained records.
 
 States leave only when a peer is near the object and subscribes to its cell, and only when the copies of the peers would
-otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record leaves once, wherever the peers are:
-the server keeps it.
+otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record leaves once, wherever the peers
+are: the server keeps it.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from vinesim.scene.ids import is_tree
 from vinesim.scene.values import TreeUpdate
 
 ADOPTION_DELAY = 0.5
-"""An object that moves without an owner for so long [s] is taken over by the nearest actor, which then publishes where it
-comes to rest. GUESSED."""
+"""An object that moves without an owner for so long [s] is taken over by the nearest actor, which then publishes where
+it comes to rest. GUESSED."""
 
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
