@@ -240,7 +240,7 @@ def count(endpoint: str, path: pathlib.Path | None, apart: float) -> list[int]:
                 )
             if recorder is not None:
                 there &= recorder.greetings.keys() == {"ada", "bob"} and bool(recorder.recording.count > 6)
-                there &= apart > 5.0 or recorder._near.get("ada", (None, None))[1] is not None
+                there &= apart > 5.0 or recorder._full_rate.get("ada", (None, None))[1] is not None
             return there
 
         end = time.monotonic() + TIMEOUT
