@@ -219,7 +219,8 @@ class Client:
             touching |= bool(touched)
             settled = replicator.send(
                 now, pose, touched=touched, moving=moving, read=objects.read_state,
-                grabbed=objects.with_trees(detached), parted=detached, cut=objects.cut_roots, changed=objects.is_changed,
+                grabbed=objects.with_trees(detached), parted=detached, cut=objects.cut_roots,
+                changed=objects.is_changed,
                 lies=self.physics.support_tracker.pose_on_support,
                 pushed=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip

@@ -1,6 +1,7 @@
 """Actors without physics: scripted poses and trees on a real exchange. What the network does is measured with them.
 
-    python -m vinesim.bench.support.fake_client '{"connect": "tcp/127.0.0.1:7447", "puppets": [{"name": "ada", "place": [1, 0]}]}'
+    python -m vinesim.bench.support.fake_client '{"connect": "tcp/127.0.0.1:7447", "puppets": [{"name": "ada", "place":
+    [1, 0]}]}'
 
 Such a process answers each line on its input, a JSON object, with one line: ``{"who": "ada", "touch": [3]}`` lets it
 act, and every answer is its :meth:`Puppet.report`. It ends with its input.

@@ -117,7 +117,8 @@ def _cell(key: str) -> tuple[int, int] | None:
 
 
 class ReplayBus:
-    """A member of a world that happened already; see :class:`vinesim.net.transport.bus.Bus`. What it says nobody hears."""
+    """A member of a world that happened already; see :class:`vinesim.net.transport.bus.Bus`. What it says nobody
+    hears."""
 
     bytes_out = 0
     status_message = ""
