@@ -17,7 +17,7 @@ skipped."""
 
 SLOW = (
     "tests/cli/test_", "tests/laws/", "tests/story/", "tests/bench/", "tests/client/test_humans.py",
-    "tests/client/test_domain_randomizer.py", "tests/net/test_exchange.py", "tests/net/test_faults.py",
+    "tests/client/test_domain_randomizer.py", "tests/net/test_replicator.py", "tests/net/test_faults.py",
     "tests/net/test_replication_laws.py", "tests/net/test_wire.py", "tests/robot/test_pick.py",
     "tests/robot/test_push.py", "tests/robot/test_swap_boxes.py", "tests/scene/test_vineyard.py",
     "tests/sensors/test_camera_raster.py", "tests/sensors/test_cuda_rasterizer.py", "tests/sensors/test_dataset.py",

@@ -14,8 +14,8 @@ from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, 
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.recording.mcap_file import Recording, RecordingWriter, read
-from vinesim.net.replication.exchange import WorldMismatch
 from vinesim.net.replication.interest import INTEREST_RADIUS
+from vinesim.net.replication.peers import WorldMismatch
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 
@@ -159,10 +159,10 @@ def test_two_recorders_do_not_keep_each_other_listening(tmp_path):
         other = Recorder(world.hub.bus("other", live=False), recording, clock=lambda: world.hub.time)
         world.steps.append(other.step)
         world.run(1.0)
-        assert world.ada.exchange._actors._pose.matching
+        assert world.ada.replicator._state.peers._pose.matching
         world.bob.robot.base_q[0] = 60.0
         world.run(1.0)
-        assert not world.ada.exchange._actors._pose.matching
+        assert not world.ada.replicator._state.peers._pose.matching
 
 
 @pytest.mark.parametrize("only", FAMILIES)

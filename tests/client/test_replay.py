@@ -168,11 +168,11 @@ def test_on_a_network_it_happens_again(tape):
     stage = Stage(tape)
     stage.run()
     assert sorted(stage.viewer.joined) == ["ada", "bob"]
-    assert "bob" not in stage.viewer.exchange.peers
+    assert "bob" not in stage.viewer.replicator.peers
     rest = recorded_trees(tape)[-1]
     np.testing.assert_array_equal(stage.viewer.read(0)[0], rest.joint_q.astype(np.float32))
     # stamped anew: nobody extrapolates from the year of the recording, and velocities are believed
-    heard = stage.viewer.exchange._actors.known["ada"].update
+    heard = stage.viewer.replicator._state.peers.known["ada"].update
     assert 0.0 <= 5e8 + stage.hub.time - heard.time < 1.0  # since Bob left she had nobody to tell
     assert {fact.object for fact in stage.kept} == {object_id(ObjectKind.BUNCH, 3), object_id(ObjectKind.BUNCH, 4)}
     stage.replay.close()

@@ -90,13 +90,13 @@ def test_a_spectator_owns_nothing_even_when_an_owner_goes():
     for number in range(30):
         ada.bend(0, 0.02 * number)
         run(ada, onlooker, bob, seconds=TICK)
-    assert onlooker.exchange.owner(0) == "ada"
+    assert onlooker.replicator.owner(0) == "ada"
     bob.moving = onlooker.moving = {0}
     ada.bus.close()
     run(onlooker, bob)
     # it stands nearer, and has the lower name
-    assert bob.exchange.owner(0) == "bob"
-    assert onlooker.exchange.owner(0) == "bob"
+    assert bob.replicator.owner(0) == "bob"
+    assert onlooker.replicator.owner(0) == "bob"
     assert onlooker.environment() == 0
 
 

@@ -11,7 +11,7 @@ from tests.support.shared_vineyard import BOX, BUNCH, Server, vineyard
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.exchange import Replicator
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import is_tree
 from vinesim.scene.values import RobotUpdate
@@ -38,9 +38,9 @@ class Least:
     def __init__(self, hub: MemoryHub, name: str, start: Claim) -> None:
         self.hub, self.name, self.model = hub, name, vineyard()
         self.bus = hub.bus(name)
-        self.exchange = Replicator(self.bus, Hello(name, scene="rows", digest="same", joints=0), self.model)
+        self.replicator = Replicator(self.bus, Hello(name, scene="rows", digest="same", joints=0), self.model)
         for thing in THINGS:
-            self.exchange._ownership[thing].claim = start
+            self.replicator._state.ownership[thing].claim = start
         self.x = -1.5 + NAMES.index(name)
         self.robot = RobotUpdate(name, 0.0, frames.pose([self.x, 0.0, 0.0]), np.zeros(6), np.zeros(0), np.zeros(0))
         self.touched: set[int] = set()
@@ -50,7 +50,7 @@ class Least:
 
     def tick(self) -> None:
         now = self.hub.time
-        inbox = self.exchange.receive(now)
+        inbox = self.replicator.receive(now)
         for fact, holds in inbox.records:
             if not is_tree(fact.object):
                 self.picked.add(fact.object)
@@ -63,9 +63,9 @@ class Least:
         for thing in there - {0}:
             self.pose[thing] = self.pose[thing] + [0.002 * self.x, 0.001, 0, 0, 0, 0, 0]
         told, self.mine_to_tell = self.mine_to_tell, set()
-        self.exchange.send(
-            now, self.robot, touched=there, moving=there, read=self.read, grabbed=told, parted=told & self.picked,
-            lies=lambda thing: ("", self.pose[thing]),
+        self.replicator.send(
+            now, self.robot, touched=there, moving=there, read=self.read, grabbed=told, detached=told & self.picked,
+            pose_on_support=lambda thing: ("", self.pose[thing]),
         )  # fmt: skip
 
     def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
@@ -130,9 +130,9 @@ def test_once_all_have_let_go_everything_lies_where_everybody_says_within_a_roun
         client.touched.clear()
     run(hub, server, clients, RTT + 2 * TICK)
     for thing in THINGS:
-        owners = {client.exchange.owner(thing) for client in clients.values()}
-        assert owners == {None}, [client.exchange.claim(thing) for client in clients.values()]
-        facts = {client.exchange.record(thing) for client in clients.values()}
+        owners = {client.replicator.owner(thing) for client in clients.values()}
+        assert owners == {None}, [client.replicator.claim(thing) for client in clients.values()]
+        facts = {client.replicator.record(thing) for client in clients.values()}
         assert facts == {server.facts.get(thing)}
     for client in clients.values():
         # nothing picked hangs again, nothing is picked for some only
@@ -148,8 +148,8 @@ def test_with_losses_one_heartbeat_later_there_is_one_owner_who_touches(story, s
     hub.loss = 0.0
     run(hub, server, clients, 1.5)
     for thing in THINGS:
-        owners = {client.exchange.owner(thing) for client in clients.values()}
-        assert len(owners) == 1, [client.exchange.claim(thing) for client in clients.values()]
+        owners = {client.replicator.owner(thing) for client in clients.values()}
+        assert len(owners) == 1, [client.replicator.claim(thing) for client in clients.values()]
         touching = {
             c.name for c in clients.values() if thing in c.touched and (thing in c.picked or thing in (0, BOX(0)))
         }
@@ -163,5 +163,7 @@ def test_with_losses_one_heartbeat_later_there_is_one_owner_who_touches(story, s
 @pytest.mark.parametrize("order", [("ada", "bob"), ("bob", "ada")])
 def test_of_two_that_grab_in_the_same_tick_the_lower_name_has_it(start, order):
     _, _, clients, _ = tell([(name, "grab", BUNCH(0), 15 * i) for i, name in enumerate(order)], 1, 0.0, start)
-    assert {client.exchange.owner(BUNCH(0)) for client in clients.values()} == {"ada"}
-    assert {client.exchange.claim(BUNCH(0)).ownership for client in clients.values()} == {(start.ownership + 1) % 65536}
+    assert {client.replicator.owner(BUNCH(0)) for client in clients.values()} == {"ada"}
+    assert {client.replicator.claim(BUNCH(0)).ownership for client in clients.values()} == {
+        (start.ownership + 1) % 65536
+    }

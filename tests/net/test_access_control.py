@@ -16,12 +16,13 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
-from vinesim.net.transport import zenoh_bus
+from vinesim.net.transport import zenoh_session
 from vinesim.net.transport.access_control import CertificateError, Role, tls_config
 from vinesim.net.transport.bus import KEEP_ALL, BusError, JoinRejected
 from vinesim.net.transport.certificates import create, roles
 from vinesim.net.transport.endpoints import parse
-from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus, close_session, config, open_session
+from vinesim.net.transport.zenoh_bus import ZenohBus
+from vinesim.net.transport.zenoh_session import ServerUnreachable, close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
 
 
@@ -124,7 +125,7 @@ def test_another_world_does_not_exist(server, certs):
 
 
 def test_nobody_gets_in_without_a_certificate_of_this_authority(server, certs, tmp_path, monkeypatch):
-    monkeypatch.setattr(zenoh_bus, "CONNECT_TIMEOUT", 0.7)  # Zenoh tries again for as long as it may
+    monkeypatch.setattr(zenoh_session, "CONNECT_TIMEOUT", 0.7)  # Zenoh tries again for as long as it may
     address = server.endpoint.partition("/")[2]
     with pytest.raises(ServerUnreachable):
         ZenohBus("ada", connect=f"tcp/{address}")

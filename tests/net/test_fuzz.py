@@ -29,13 +29,13 @@ def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
     ada, bob, _, arrived = message_fuzz.play(3_000, seed=11)
     said = [record.message for record in caplog.records if EVIL in record.message and "dropped" in record.message]
     assert len(said) == 2, "once by each of the two who hear it"
-    counters = ada.exchange.counters
+    counters = ada.replicator.counters
     assert arrived > 1_500
     assert counters.malformed > 0.3 * arrived
     assert counters.malformed + counters.dropped <= 2 * arrived
     for puppet in (ada, bob):
         for tree in (1, 2):
-            assert puppet.exchange.owner(tree) == "ada"
+            assert puppet.replicator.owner(tree) == "ada"
         for update in puppet.robots.values():
             assert np.isfinite(np.concatenate([update.base_q, update.base_qd, update.position, update.velocity])).all()
     assert bob.heard[2] > 0.0
@@ -56,11 +56,11 @@ def test_one_record_from_the_far_future_does_not_silence_its_author_for_ever():
     run(0.5)
     ada.touching = {0}
     run(0.5)
-    far = ada.exchange.bus
+    far = ada.replicator.bus
     pose = ada.pose(hub.time)
     far.publisher("a/ada").put(messages.encode_robot(type(pose)(**_fields(pose) | {"time": 1e300})))
     q, qd = ada.read(0)
-    claim = ada.exchange.claim(0)
+    claim = ada.replicator.claim(0)
     one = np.array([0]), np.array([claim.ownership]), np.array([claim.authority]), np.array([messages.TOUCHED])
     poison = messages.TreeStates(1e300, *one, np.array([len(q)]), q, qd)
     far.publisher("c/0/0/ada").put(messages.encode_trees(poison)[0][0])

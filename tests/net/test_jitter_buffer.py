@@ -14,8 +14,8 @@ from vinesim.bench.support.fake_client import FakeClient, row
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning
-from vinesim.net.replication.exchange import Replicator
 from vinesim.net.replication.jitter_buffer import MAX_DELAY, MAX_SAMPLES, JitterBuffer
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.values import RobotUpdate
 

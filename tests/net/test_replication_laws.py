@@ -55,7 +55,7 @@ class World:
                 puppet.tick(self.hub.time)
 
     def owners(self, number: int) -> set:
-        return {puppet.exchange.owner(number) for puppet in self.cast.values()}
+        return {puppet.replicator.owner(number) for puppet in self.cast.values()}
 
 
 names = st.sampled_from(sorted(PLACES))
@@ -89,7 +89,7 @@ def play(world: World, name: str, act: str, number: int, picked: set[int]) -> No
         puppet.grabbing.add(number)
     elif act == "pick":
         # somebody who has not heard of it may pick what another has picked: both believe it, one owns it
-        first = puppet.exchange.record(number) is None and number not in puppet.carrying
+        first = puppet.replicator.record(number) is None and number not in puppet.carrying
         (puppet.picking if first else puppet.grabbing).add(number)
         puppet.carrying.add(number)
         picked.add(number)
@@ -114,19 +114,19 @@ def test_after_any_story_all_agree_and_nothing_picked_hangs_again(story, seed, l
     world.run(2.0)
     for puppet in world.cast.values():  # of two who carry one thing, the one who does not own it lets go
         for number in sorted(puppet.carrying):
-            if puppet.exchange.owner(number) != puppet.name:
+            if puppet.replicator.owner(number) != puppet.name:
                 puppet.carrying.discard(number)
     world.run(1.5)
     for number in (0, 1, 2, *BUNCHES, *BOXES):
         owners = world.owners(number)
-        assert len(owners) == 1, (number, [(p.name, p.exchange.claim(number)) for p in world.cast.values()])
+        assert len(owners) == 1, (number, [(p.name, p.replicator.claim(number)) for p in world.cast.values()])
         assert owners <= {None, *world.cast}
     newcomer = next((name for name in PLACES if name not in world.cast), None)
     if newcomer is not None:
         world.come(newcomer)
         world.run(1.5)
     for number in picked:
-        known = [puppet.exchange.record(number) is not None for puppet in world.cast.values()]
+        known = [puppet.replicator.record(number) is not None for puppet in world.cast.values()]
         kept = world.keeper.facts.get(number) is not None
         # who picked it alone and left before anybody could hear of it took the story along
         assert all(known) == any(known) == kept
@@ -177,9 +177,9 @@ def test_bytes_leave_exactly_when_somebody_is_near(where, tree, near):
     run(60)
     cast[0].touching.add(tree)
     run(60)
-    middle = cast[0].exchange._tree_stream.middle[tree]
+    middle = cast[0].replicator._state.tree_stream.middle[tree]
     away = [float(np.hypot(*(puppet.place[:2] - middle[:2]))) for puppet in cast]
-    sent = cast[0].exchange.counters.environment.bytes_out
+    sent = cast[0].replicator.counters.environment.bytes_out
     if any(abs(one - near) < 0.01 for one in away):
         return  # a pose is quantised on its way: on the very edge either may be right
     assert (sent > 0) == any(one <= near for one in away[1:])
@@ -201,6 +201,6 @@ def test_any_two_clocks_agree_as_far_as_jitter_allows(seed, delay, uneven, skew_
         hub.advance(TICK)
         ada.tick(hub.time + skew_a)
         bob.tick(hub.time + skew_b)
-    times = [hub.time + skew + puppet.exchange.offset for skew, puppet in ((skew_a, ada), (skew_b, bob))]
+    times = [hub.time + skew + puppet.replicator.offset for skew, puppet in ((skew_a, ada), (skew_b, bob))]
     for time in times:
         assert time == pytest.approx(hub.time, abs=jitter + 1e-6)

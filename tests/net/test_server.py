@@ -24,7 +24,8 @@ from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import PortTaken, Server
 from vinesim.net.transport.bus import KEEP_ALL, JoinRejected, NameTaken
 from vinesim.net.transport.endpoints import resolve_ports
-from vinesim.net.transport.zenoh_bus import ZenohBus, close_session, config, open_session
+from vinesim.net.transport.zenoh_bus import ZenohBus
+from vinesim.net.transport.zenoh_session import close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
 
 
@@ -131,7 +132,7 @@ def test_an_answer_of_another_protocol_is_refused_by_both_numbers():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         newer = bytearray(messages.encode_welcome(Welcome()))
         newer[2] = 9
-        for answer, words in ((bytes(newer), "protocol version 9"), (b"junk", "cannot be read")):
+        for answer, words in ((bytes(newer), "protocol version 9"), (b"junk", "cannot be decoded")):
             # what answers is another program
             server._declared[1].undeclare()
             server._declared[1] = server._session.declare_queryable(

@@ -18,13 +18,14 @@ from tests.support.waiting import TIMEOUT, wait
 from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import Replicator
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus
 from vinesim.net.transport.bus import KEEP_ALL, NameTaken
 from vinesim.net.transport.certificates import create
 from vinesim.net.transport.endpoints import resolve_ports
-from vinesim.net.transport.zenoh_bus import ServerUnreachable, ZenohBus
+from vinesim.net.transport.zenoh_bus import ZenohBus
+from vinesim.net.transport.zenoh_session import ServerUnreachable
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate
@@ -241,7 +242,7 @@ class Client:
             trees.append(tree)
         self.model = assemble(trees)
         self.state = State.at_rest(self.model)
-        self.exchange = Replicator(bus, Hello(bus.name, digest=self.model.digest(), joints=1), self.model)
+        self.replicator = Replicator(bus, Hello(bus.name, digest=self.model.digest(), joints=1), self.model)
         self.robot = RobotUpdate(bus.name, 0.0, frames.pose(np.array([x, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
         self.touched: set[int] = set()
         self.robots: dict[str, RobotUpdate] = {}
@@ -249,10 +250,10 @@ class Client:
 
     def tick(self) -> None:
         now = time.monotonic()
-        inbox = self.exchange.receive(now)
+        inbox = self.replicator.receive(now)
         self.robots = inbox.robots
         self.heard += inbox.trees
-        self.exchange.send(now, self.robot, touched=self.touched, read=self.read)
+        self.replicator.send(now, self.robot, touched=self.touched, read=self.read)
 
     def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
         bodies = self.model.bodies_of(tree)
@@ -280,25 +281,25 @@ def test_two_clients_exchange_what_is_touched_near_and_nothing_far(server):
         ada, bob = Client(a, 1.0), Client(b, 60.0)
         ticking = together(ada, bob)
         wait(ticking(lambda: "bob" in ada.robots and "ada" in bob.robots), "both to see each other")
-        wait(ticking(lambda: abs(ada.exchange.offset + time.monotonic() - time.time()) < 0.1), "the server's clock")
+        wait(ticking(lambda: abs(ada.replicator.offset + time.monotonic() - time.time()) < 0.1), "the server's clock")
         ada.touched = {0}
         turn = frames.exp(np.array([0.0, 0.3, 0.0]))
         ada.state.joint_q[:] = frames.multiply(turn, ada.model.joint_settled)
-        counters = ada.exchange.counters
+        counters = ada.replicator.counters
         poses = counters.actor.messages_out
         wait(ticking(lambda: counters.actor.messages_out > poses + 5), "a second of far poses")
         assert (counters.environment.messages_out, counters.event.messages_out) == (0, 0)
         # all that left is poses and upkeep: were trees among it, thousands of bytes would be
         assert a.bytes_out == counters.actor.bytes_out
-        assert ada.exchange.owner(0) == "ada"
-        assert bob.exchange.owner(0) is None
+        assert ada.replicator.owner(0) == "ada"
+        assert bob.replicator.owner(0) is None
         bob.robot = RobotUpdate("bob", 0.0, frames.pose(np.array([2.0, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
         wait(ticking(lambda: bob.heard), "the touched tree")
         update = bob.heard[0]
         assert (update.tree, update.owner) == (0, "ada")
         np.testing.assert_allclose(update.joint_q, ada.read(0)[0], atol=1e-4)
         ada.touched = set()
-        wait(ticking(lambda: bob.exchange.owner(0) is None), "the rest record")
+        wait(ticking(lambda: bob.replicator.owner(0) is None), "the rest record")
         assert wire.up > 0
 
 
@@ -322,15 +323,15 @@ def test_a_router_that_is_killed_and_restarted_resumes():
             ada, bob = Client(a, 1.0), Client(b, 2.0)
             ticking = together(ada, bob)
             ada.touched = {1}
-            wait(ticking(lambda: bob.exchange.owner(1) == "ada"), "the first touch")
+            wait(ticking(lambda: bob.replicator.owner(1) == "ada"), "the first touch")
             router.kill()
             router.wait()
             wait(ticking(lambda: a.status_message and b.status_message), "both to notice that the server is gone")
             assert endpoint in a.status_message
             wait(ticking(lambda: a.alive() == {"ada"} and not bob.robots), "each to be alone")
-            assert ada.exchange.owner(1) == "ada"
+            assert ada.replicator.owner(1) == "ada"
             router = start()
-            wait(ticking(lambda: bob.exchange.owner(1) == "ada" and "ada" in bob.robots), "the stream again")
+            wait(ticking(lambda: bob.replicator.owner(1) == "ada" and "ada" in bob.robots), "the stream again")
             assert a.status_message == b.status_message == ""
     finally:
         router.kill()

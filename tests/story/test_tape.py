@@ -195,7 +195,7 @@ def test_what_was_left_is_replayed_to_a_viewer(story, listen):
     heard = next(int(found[1]) for line in lines if (found := re.match(r"(\d+) messages were heard", line)))
     assert heard > 100
     assert sorted(viewer.joined) == ["ada", "bob"]
-    assert viewer.exchange.counters.malformed == 0
+    assert viewer.replicator.counters.malformed == 0
     # events are what they were but for their time, each once and in order; the tree moved
     before = [entry.payload for entry in read(path).messages if entry.key == "own/0/0/ada"]
     after = [payload for key, payload in arrived if key == "own/0/0/ada"]
@@ -229,10 +229,14 @@ def count(endpoint: str, path: pathlib.Path | None, apart: float) -> list[int]:
             time.sleep(0.002)
 
         def settled() -> bool:
-            there = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.exchange._actors._far_pose.matching
+            there = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.replicator._state.peers._far_pose.matching
             if apart < 5.0:
-                streams = [s.matching and e.matching for s, e in ada.exchange._cell_publishers.values()]
-                there &= ada.exchange._actors._pose.matching and bob.exchange._actors._pose.matching and any(streams)
+                streams = [s.matching and e.matching for s, e in ada.replicator._state.cells.publishers.values()]
+                there &= (
+                    ada.replicator._state.peers._pose.matching
+                    and bob.replicator._state.peers._pose.matching
+                    and any(streams)
+                )
             if recorder is not None:
                 there &= recorder.greetings.keys() == {"ada", "bob"} and bool(recorder.recording.count > 6)
                 there &= apart > 5.0 or recorder._near.get("ada", (None, None))[1] is not None

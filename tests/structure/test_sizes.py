@@ -14,11 +14,7 @@ MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
 """Without the docstring."""
 
-KNOWN = {
-    "net/codec/messages.py": 1,
-    "net/replication/exchange.py": 1,
-    "net/transport/zenoh_bus.py": 1,
-}
+KNOWN: dict[str, int] = {}
 """Offences per file that are still to be removed; the numbers only fall."""
 
 

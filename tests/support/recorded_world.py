@@ -8,7 +8,8 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import Inbox, Replicator
+from vinesim.net.replication.receiver import Inbox
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
@@ -35,7 +36,7 @@ class Light:
     def __init__(self, bus: Bus, x: float, **hello) -> None:
         self.model, self.bus, self.name = vineyard(), bus, bus.name
         hello = {"scene": "rows", "digest": self.model.digest(), "joints": 2, "seed": 5} | hello
-        self.exchange = Replicator(bus, Hello(bus.name, **hello), self.model)
+        self.replicator = Replicator(bus, Hello(bus.name, **hello), self.model)
         self.state = State.at_rest(self.model)
         joints = np.array([0.1, -0.2][: hello["joints"]])
         self.robot = RobotUpdate(bus.name, 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), joints, np.zeros(len(joints)))
@@ -46,13 +47,13 @@ class Light:
         self.joined: list[str] = []
 
     def tick(self, now: float) -> None:
-        self.inbox = self.exchange.receive(now)
+        self.inbox = self.replicator.receive(now)
         self.joined += [hello.name for hello in self.inbox.joined]
         self.heard += self.inbox.trees
         for update in self.inbox.trees:
             here = self.model.bodies_of(update.tree)
             self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
-        for update in self.exchange.send(now, self.robot, touched=self.touched, moving=self.moving, read=self.read):
+        for update in self.replicator.send(now, self.robot, touched=self.touched, moving=self.moving, read=self.read):
             here = self.model.bodies_of(update.tree)
             self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
 
@@ -69,5 +70,5 @@ class Light:
 
     def environment(self) -> int:
         """Bytes of plants that it sent."""
-        counters = self.exchange.counters
+        counters = self.replicator.counters
         return counters.environment.bytes_out + counters.event.bytes_out

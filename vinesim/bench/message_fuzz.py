@@ -159,14 +159,14 @@ def play(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.ndarray,
 
 def heard(puppet: FakeClient) -> int:
     """Messages that arrived."""
-    counters = puppet.exchange.counters
+    counters = puppet.replicator.counters
     return counters.actor.messages_in + counters.environment.messages_in + counters.event.messages_in
 
 
 def fuzz() -> Iterator[Measurement]:
     """What the storm did."""
     ada, _, spent, arrived = play(STORM)
-    counters = ada.exchange.counters
+    counters = ada.replicator.counters
     for case, value, unit in (
         ("broken messages sent", STORM, ""),
         ("arrived where somebody listens, newest poses only", arrived, ""),

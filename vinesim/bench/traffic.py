@@ -107,8 +107,8 @@ def traffic() -> Iterator[Measurement]:
         yield line("heard by a client, peak of a tenth of a second", float(heard.max()))
         yield line("heard with framing, the client that hears most", float((heard + OVERHEAD * count).mean(0).max()))
         yield line("said by a client, mean of all", float(said.mean()))
-        poses = np.mean([p.exchange.counters.actor.bytes_in for p in puppets]) / hub.time
-        trees = np.mean([p.exchange.counters.environment.bytes_in for p in puppets]) / hub.time
+        poses = np.mean([p.replicator.counters.actor.bytes_in for p in puppets]) / hub.time
+        trees = np.mean([p.replicator.counters.environment.bytes_in for p in puppets]) / hub.time
         yield Measurement("traffic", f"{size}: of that, poses", float(poses) / 1e3, "kB/s")
         yield Measurement("traffic", f"{size}: of that, trees", float(trees) / 1e3, "kB/s")
         for puppet in puppets:
@@ -122,5 +122,5 @@ def _tick(hub: MemoryHub, puppets: list[FakeClient]) -> None:
 
 
 def _messages(puppet: FakeClient) -> int:
-    counters = puppet.exchange.counters
+    counters = puppet.replicator.counters
     return counters.actor.messages_in + counters.environment.messages_in + counters.event.messages_in

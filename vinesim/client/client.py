@@ -28,7 +28,8 @@ from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
-from vinesim.net.replication.exchange import Inbox, Replicator
+from vinesim.net.replication.receiver import Inbox
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_posture import standing_pose
@@ -126,7 +127,9 @@ class Client:
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
             seed=self.scene.seed,
         )  # fmt: skip
-        replicator = Replicator(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
+        replicator = Replicator(
+            bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer
+        )
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
         self._add_replicator(name, replicator)
@@ -138,7 +141,9 @@ class Client:
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
-        replicator = Replicator(bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer)
+        replicator = Replicator(
+            bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer
+        )
         self.humans[spec.name] = human = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
         self._add_replicator(spec.name, replicator)
         return human
@@ -219,10 +224,10 @@ class Client:
             touching |= bool(touched)
             settled = replicator.send(
                 now, pose, touched=touched, moving=moving, read=objects.read_state,
-                grabbed=objects.with_trees(detached), parted=detached, cut=objects.cut_roots,
-                changed=objects.is_changed,
-                lies=self.physics.support_tracker.pose_on_support,
-                pushed=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
+                grabbed=objects.with_trees(detached), detached=detached, detached_roots=objects.cut_roots,
+                is_changed=objects.is_changed,
+                pose_on_support=self.physics.support_tracker.pose_on_support,
+                wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip
             for update in settled:
                 # the last message is what all copies hold: hold the same, quantised state
@@ -238,8 +243,8 @@ class Client:
             supported = self.objects.supported_by(name)
             if supported:
                 self.replicators[name].send(
-                    now, robot.update(now), read=self.objects.read_state, grabbed=supported, parted=supported,
-                    lies=self.physics.support_tracker.pose_on_support,
+                    now, robot.update(now), read=self.objects.read_state, grabbed=supported, detached=supported,
+                    pose_on_support=self.physics.support_tracker.pose_on_support,
                 )  # fmt: skip
 
     def side_of(self, point: np.ndarray) -> str:

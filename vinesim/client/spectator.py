@@ -10,7 +10,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.client import Client, label_index
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication.exchange import SPECTATOR, Replicator
+from vinesim.net.replication.replication_state import SPECTATOR
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
@@ -57,7 +58,7 @@ class Spectator(Client):
             index=label_index(self.name), joints=0, seed=self.scene.seed,
         )  # fmt: skip
         self.replicators[self.name] = Replicator(
-            bus, hello, self.model, near=self._interest_radius, jitter_buffer=self._jitter_buffer
+            bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer
         )
 
     def sense(self) -> None:

@@ -1,4 +1,4 @@
-"""Actors without physics: scripted poses and trees on a real exchange. What the network does is measured with them.
+"""Actors without physics: scripted poses and trees on a real replicator. What the network does is measured with them.
 
     python -m vinesim.bench.support.fake_client '{"connect": "tcp/127.0.0.1:7447", "puppets": [{"name": "ada", "place":
     [1, 0]}]}'
@@ -25,7 +25,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
-from vinesim.net.replication.exchange import Replicator
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import is_tree
@@ -78,7 +78,7 @@ class FakeClient:
         joints = 0 if kind == "human" else joints
         hello = Hello(bus.name, kind=kind, scene="puppets", digest=digest, joints=joints)
         self.bus, self.model, self.name = bus, model, bus.name
-        self.exchange = Replicator(bus, hello, model, near=near)
+        self.replicator = Replicator(bus, hello, model, interest_radius=near)
         self.place = np.array([*place, 0.0])
         self.joints, self.restless = joints, restless
         self.touching: set[int] = set()
@@ -115,7 +115,7 @@ class FakeClient:
     def tick(self, now: float) -> None:
         """One tick of a client's share in the network."""
         self._now = now
-        inbox = self.exchange.receive(now)
+        inbox = self.replicator.receive(now)
         for hello in inbox.joined:
             self.came[hello.name] = now
         for name in inbox.left:
@@ -135,15 +135,15 @@ class FakeClient:
         grabbed, self.grabbing = self.grabbing, set()
         picked, self.picking = self.picking, set()
         self.carrying |= picked
-        self.exchange.send(
+        self.replicator.send(
             now, self.pose(now), touched=self.touching | self.carrying, moving=self.swinging, read=self.read,
-            grabbed=grabbed | picked, parted=picked, lies=self.lies,
+            grabbed=grabbed | picked, detached=picked, pose_on_support=self.lies,
         )  # fmt: skip
         self.ticks += 1
 
     def pose(self, now: float) -> RobotUpdate | HumanUpdate:
         """What it would say of itself at ``now``."""
-        if self.exchange.name.kind == "human":
+        if self.replicator.hello.kind == "human":
             points = np.tile(frames.pose(self.place), (len(POINT_NAMES), 1))
             points[:, 2] = (0.0, 1.65, 1.1 + 0.2 * np.sin(2.0 * now), 1.1, 0.9, 0.1, 0.1)
             velocity = np.zeros((len(POINT_NAMES), 6))
@@ -155,7 +155,7 @@ class FakeClient:
 
     def held(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] of what it carries: to and fro above where it stands."""
-        phase = 2.0 * np.pi * SWING * (self._now + self.exchange.offset) + thing
+        phase = 2.0 * np.pi * SWING * (self._now + self.replicator.offset) + thing
         pose, velocity = frames.pose(self.place + np.array([0.2 * np.sin(phase), 0.0, 1.0])), np.zeros(6)
         velocity[0] = 0.4 * np.pi * SWING * np.cos(phase)
         return pose, velocity
@@ -169,28 +169,28 @@ class FakeClient:
         self.reads += 1
         if not is_tree(thing):
             return self.held(thing)
-        return swung(self.model, thing, self._now + self.exchange.offset, self.sway)
+        return swung(self.model, thing, self._now + self.replicator.offset, self.sway)
 
     def report(self) -> dict[str, Any]:
         """All that a test may want to know."""
-        exchange = self.exchange
+        replicator = self.replicator
         return {
             "name": self.name,
             "ticks": self.ticks,
             "reads": self.reads,
             "now": self._now,
-            "offset": exchange.offset,
-            "others": sorted(exchange.peers),
+            "offset": replicator.offset,
+            "others": sorted(replicator.peers),
             "came": self.came,
             "went": self.went,
-            "owner": {thing: exchange.owner(thing) for thing in sorted(exchange.known)},
-            "claim": {thing: list(exchange.claim(thing)) for thing in sorted(exchange.known)},
+            "owner": {thing: replicator.owner(thing) for thing in sorted(replicator.known)},
+            "claim": {thing: list(replicator.claim(thing)) for thing in sorted(replicator.known)},
             "facts": self.facts,
             "heard": self.heard,
             "first": self.first,
             "released": self.released,
             "poses": {name: getattr(one, "position", one.base_q)[:1].tolist() for name, one in self.robots.items()},
-            "counters": dataclasses.asdict(exchange.counters),
+            "counters": dataclasses.asdict(replicator.counters),
             "bytes_in": self.bus.bytes_in,
             "lost": self.bus.dropped,
             "trouble": self.bus.status_message,

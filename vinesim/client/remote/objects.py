@@ -12,7 +12,7 @@ import numpy as np
 
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
-from vinesim.net.replication.exchange import Inbox
+from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.physics.rigid.support_tracking import GROUND
 from vinesim.physics.step import Physics

@@ -68,7 +68,8 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """Lasting state of one object, valid when its author has left: a pose at rest, or which bodies were cut off a tree.
 
     Records travel once, reliably. The server keeps, for each object, the record with the greatest claim
-    (:mod:`vinesim.net.replication.retained`) for clients that join later. An array on the wire: field names are not sent.
+    (:mod:`vinesim.net.replication.retained`) for clients that join later. An array on the wire: field names are not
+    sent.
     """
 
     object: int
@@ -168,7 +169,8 @@ def encode_records(records: list[RetainedRecord]) -> bytes:
 def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> list[RetainedRecord]:
     """Decode retained records and check ids, sequences, names, poses and sizes.
 
-    ``counts``: number of objects of each kind in the scene, if known. Records of trees are not checked against the model.
+    ``counts``: number of objects of each kind in the scene, if known. Records of trees are not checked against the
+    model.
     """
     records = _unpack(payload, MessageKind.RETAINED, "retained records", _records_decoder)
     if len(records) > MAX_RECORDS:

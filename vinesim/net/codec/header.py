@@ -1,9 +1,9 @@
 """Header of every network message: protocol version and kind, and for frequent kinds a count and a time; errors.
 
 Every message starts with four bytes: ``VS``, the protocol version, the kind (:class:`MessageKind`). Kinds that are sent
-often go on with a u16 count and the network time as f64, little-endian (:data:`HEADER`); rare kinds continue in msgpack.
-A decoder raises :class:`MessageError` and nothing else for a message that is malformed, truncated, too large, of another
-version or not finite.
+often go on with a u16 count and the network time as f64, little-endian (:data:`HEADER`); rare kinds continue in
+msgpack. A decoder raises :class:`MessageError` and nothing else for a message that is malformed, truncated, too large,
+of another version or not finite.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Wire format of a person's pose, and encoding of any actor's pose.
 
-A person is transmitted as the root, the tracked points (head, two hands; CANOPIES D6.4, section 5.3), hips and feet, the
-flexion of ten fingers, four flags and the velocities of all points: always 161 bytes. Positions except the root are
+A person is transmitted as the root, the tracked points (head, two hands; CANOPIES D6.4, section 5.3), hips and feet,
+the flexion of ten fingers, four flags and the velocities of all points: always 161 bytes. Positions except the root are
 relative to the root in steps of 0.2 mm, up to 6.5 m; rotations are rotation vectors of 3 i16; velocities are i8 of two
 scales of the message.
 """

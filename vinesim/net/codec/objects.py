@@ -1,7 +1,7 @@
 """Wire format of moving rigid objects: boxes and free bunches, 26 bytes each, with positions relative to a cell.
 
-Position: 3 i16 in steps of 0.1 mm from the middle of the interest cell in the key. Rotation: 32 bits (error 0.28 degrees).
-Linear and angular velocity: i8 with an exponent of two for each.
+Position: 3 i16 in steps of 0.1 mm from the middle of the interest cell in the key. Rotation: 32 bits (error 0.28
+degrees). Linear and angular velocity: i8 with an exponent of two for each.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class ObjectStates:
 def encode_objects(objects: ObjectStates, cell: Cell) -> tuple[list[bytes], ObjectStates]:
     """Encode objects that are published under ``cell``; return the messages and the batch as receivers decode it.
 
-    A message has at most :data:`MAX_DATAGRAM` bytes. Raises :class:`MessageError` if ids do not increase or a value is not
-    finite.
+    A message has at most :data:`MAX_DATAGRAM` bytes. Raises :class:`MessageError` if ids do not increase or a value is
+    not finite.
     """
     ids = objects.object
     if not len(ids) or (len(ids) > 1 and not (ids[1:] > ids[:-1]).all()):

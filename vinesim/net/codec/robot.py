@@ -42,8 +42,8 @@ def encode_robot(update: RobotUpdate) -> bytes:
     """Encode a robot's pose in 46 bytes, 3 for each joint and 4 more for each joint beyond 6.5 rad or m (a wheel).
 
     Errors: joint positions 0.1 mrad or mm, joint velocities 0.4 % of the fastest joint. Base velocities are clipped at
-    32.7 m/s or rad/s, joint velocities at 83. Raises :class:`MessageError` for wrong sizes, values that are not finite or
-    beyond 1e9, and a quaternion that is not of unit length.
+    32.7 m/s or rad/s, joint velocities at 83. Raises :class:`MessageError` for wrong sizes, values that are not finite
+    or beyond 1e9, and a quaternion that is not of unit length.
     """
     pose, twist = update.base_q.tolist(), update.base_qd.tolist()
     position, velocity = update.position.tolist(), update.velocity.tolist()

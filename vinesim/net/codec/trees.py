@@ -1,9 +1,9 @@
 """Wire format of moving trees: joint rotations and rates of all bodies, and detached bodies with their positions.
 
-A batch holds several trees of one owner at one instant. Joint rotations travel as rotation vectors of 3 i16, joint rates
-as i8 of a scale of each tree (error 0.4 % of its fastest joint): 9 bytes a body, 13 a tree. A body that was cut off its
-parent has a floating root: its position [m] as f4 and its velocity as i2 follow, 20 bytes each. An owner that wants to
-have the same bits as all copies applies what :func:`quantise_tree` or :func:`encode_trees` returns.
+A batch holds several trees of one owner at one instant. Joint rotations travel as rotation vectors of 3 i16, joint
+rates as i8 of a scale of each tree (error 0.4 % of its fastest joint): 9 bytes a body, 13 a tree. A body that was cut
+off its parent has a floating root: its position [m] as f4 and its velocity as i2 follow, 20 bytes each. An owner that
+wants to have the same bits as all copies applies what :func:`quantise_tree` or :func:`encode_trees` returns.
 """
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ def quantise_tree(joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray
 def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
     """Encode a batch; return its messages and the batch as receivers decode it.
 
-    A message has at most :data:`MAX_DATAGRAM` bytes unless a single tree needs more. Raises :class:`MessageError` if ids do
-    not increase, sizes disagree or a value is not finite.
+    A message has at most :data:`MAX_DATAGRAM` bytes unless a single tree needs more. Raises :class:`MessageError` if
+    ids do not increase, sizes disagree or a value is not finite.
     """
     ids = trees.tree
     if not len(ids) or (len(ids) > 1 and not (ids[1:] > ids[:-1]).all()):

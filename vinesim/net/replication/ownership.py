@@ -1,7 +1,7 @@
 """What one client knows of who owns what: the greatest claim on each thing, and what follows from it.
 
-The order of claims is :mod:`vinesim.net.replication.authority`'s. Here are the rules around it: what counts as heard, who is
-silent, who takes over, and which claims deserve a correction. Times are network time [s].
+The order of claims is :mod:`vinesim.net.replication.authority`'s. Here are the rules around it: what counts as heard,
+who is silent, who takes over, and which claims deserve a correction. Times are network time [s].
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """What moves, between two messages: what was last said of it, how wrong that has become, and what to say instead.
 
 :class:`TreeStream` for trees, which stay in their cells, :class:`ThingStream` for boxes and loose bunches, which do
-not.
-Sender and receiver remember the same quantised values and extrapolate them alike (:mod:`vinesim.net.replication.dead_reckoning`).
+not. Sender and receiver remember the same quantised values and extrapolate them alike
+(:mod:`vinesim.net.replication.dead_reckoning`).
 """
 
 from __future__ import annotations

@@ -24,7 +24,8 @@ from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.net.transport import endpoints
 from vinesim.net.transport.access_control import SERVER, acl_config, tls_config
 from vinesim.net.transport.bus import BusError
-from vinesim.net.transport.zenoh_bus import ROOT, WORLD, close_session, config, open_session
+from vinesim.net.transport.zenoh_bus import ROOT, WORLD
+from vinesim.net.transport.zenoh_session import close_session, config, open_session
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +70,8 @@ class Server:
         :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, and in it only who has a certificate.
 
         :class:`PortTaken` if an endpoint is taken, :class:`UsageError` if it is none,
-        :class:`vinesim.net.server.journal.NotKept` and :class:`vinesim.net.transport.access_control.NoCertificate` in words.
+        :class:`vinesim.net.server.journal.NotKept` and :class:`vinesim.net.transport.access_control.NoCertificate` in
+        words.
         """
         listen = (listen,) if isinstance(listen, str) else listen
         safe = certificates is not None

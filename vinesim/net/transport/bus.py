@@ -1,8 +1,8 @@
 """Publish, subscribe and query on one world: the :class:`Bus` protocol that Zenoh, memory and recordings implement.
 
-Keys are relative to the world, chunks joined by ``/``. In a key expression ``*`` matches one chunk and ``**`` any number
-(Zenoh's grammar without ``$*``). A bus never calls back into the real-time loop: samples are stored on arrival and
-:meth:`Bus.poll` returns them. Every member has a name, whose liveliness token holds from construction to
+Keys are relative to the world, chunks joined by ``/``. In a key expression ``*`` matches one chunk and ``**`` any
+number (Zenoh's grammar without ``$*``). A bus never calls back into the real-time loop: samples are stored on arrival
+and :meth:`Bus.poll` returns them. Every member has a name, whose liveliness token holds from construction to
 :meth:`Bus.close`.
 """
 
@@ -96,7 +96,8 @@ class Bus(Protocol):
     def join(self, greeting: bytes) -> None:
         """Ask the server for admission with an encoded :class:`messages.Hello`, once, before anything else is sent.
 
-        Raises :class:`JoinRejected`. Without a server the actors check each other (:mod:`vinesim.net.replication.peers`).
+        Raises :class:`JoinRejected`. Without a server the actors check each other
+        (:mod:`vinesim.net.replication.peers`).
         """
 
     def publisher(self, key: str, reliable: bool = False) -> Publisher:

@@ -15,9 +15,9 @@ from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Repl
 class MemoryHub:
     """Carries samples between buses in memory; :meth:`advance` moves its clock. All randomness comes from ``seed``.
 
-    ``delay`` and ``jitter`` [s] are one way: uniform from delay - jitter to delay + jitter, so that samples overtake each
-    other. ``loss`` and ``duplicated`` are the probabilities that an unreliable sample is lost or arrives twice. Reliable
-    samples arrive once and in order.
+    ``delay`` and ``jitter`` [s] are one way: uniform from delay - jitter to delay + jitter, so that samples overtake
+    each other. ``loss`` and ``duplicated`` are the probabilities that an unreliable sample is lost or arrives twice.
+    Reliable samples arrive once and in order.
     """
 
     def __init__(

@@ -15,7 +15,9 @@ from vinesim.net.codec import control, messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.exchange import Inbox, Replicator, WorldMismatch
+from vinesim.net.replication.peers import WorldMismatch
+from vinesim.net.replication.receiver import Inbox
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.memory_bus import MemoryBus, MemoryHub
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
@@ -44,7 +46,7 @@ class Client:
         self.hub, self.name = hub, name
         self.model = vineyard()
         self.bus: MemoryBus = hub.bus(name)
-        self.exchange = Replicator(self.bus, Hello(name, scene="rows", digest=digest, joints=2, **hello), self.model)
+        self.replicator = Replicator(self.bus, Hello(name, scene="rows", digest=digest, joints=2, **hello), self.model)
         self.state = State.at_rest(self.model)
         self.robot = RobotUpdate(
             name, 0.0, frames.pose(np.array([x, 0.0, 0.0])), np.zeros(6), np.array([0.1, -0.2]), np.zeros(2)
@@ -61,7 +63,7 @@ class Client:
 
     def tick(self) -> None:
         now = self.hub.time
-        self.inbox = inbox = self.exchange.receive(now)
+        self.inbox = inbox = self.replicator.receive(now)
         self.heard += inbox.trees
         self.released += inbox.released
         self.joined += [hello.name for hello in inbox.joined]
@@ -69,7 +71,7 @@ class Client:
         for update in inbox.trees:
             bodies = self.model.bodies_of(update.tree)
             self.state.joint_q[bodies], self.state.joint_qd[bodies] = update.joint_q, update.joint_qd
-        self.left_records = self.exchange.send(
+        self.left_records = self.replicator.send(
             now, self.robot, touched=self.touched, moving=self.swinging, read=self.read, grabbed=self.grabbed
         )
         self.grabbed = set()
@@ -89,7 +91,7 @@ class Client:
         self.robot = dataclasses.replace(self.robot, base_q=frames.pose(np.array([x, 0.0, 0.0])))
 
     def environment_bytes(self) -> int:
-        counters = self.exchange.counters
+        counters = self.replicator.counters
         return sum(t.bytes_in + t.bytes_out for t in (counters.environment, counters.event))
 
 
@@ -101,7 +103,7 @@ def run(hub: MemoryHub, clients: list[Client], seconds: float) -> None:
 
 
 def owners(clients: list[Client], tree: int) -> set[str | None]:
-    return {client.exchange.owner(tree) for client in clients}
+    return {client.replicator.owner(tree) for client in clients}
 
 
 # ---------------------------------------------------------------- meeting
@@ -112,8 +114,8 @@ def test_actors_meet_see_each_other_and_part():
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0, urdf="<robot/>", index=4)
     run(hub, [ada, bob], 0.5)
     assert (ada.joined, bob.joined) == (["bob"], ["ada"])
-    assert ada.exchange.peers["bob"].urdf == "<robot/>"
-    assert ada.exchange.peers["bob"].index == 4
+    assert ada.replicator.peers["bob"].urdf == "<robot/>"
+    assert ada.replicator.peers["bob"].index == 4
     seen = ada.inbox.robots["bob"]
     np.testing.assert_allclose(seen.base_q, bob.robot.base_q, atol=1e-4)
     np.testing.assert_allclose(seen.position, [0.1, -0.2], atol=1e-4)
@@ -129,10 +131,10 @@ def test_poses_come_at_60_hz_from_near_and_at_5_hz_from_far(x, low, high):
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", x)
     run(hub, [ada, bob], 1.0)
-    before = ada.exchange.counters.actor.messages_in
+    before = ada.replicator.counters.actor.messages_in
     run(hub, [ada, bob], 2.0)
     # near: 60 Hz and the 5 Hz that everybody hears
-    assert low <= (ada.exchange.counters.actor.messages_in - before) / 2 <= high
+    assert low <= (ada.replicator.counters.actor.messages_in - before) / 2 <= high
 
 
 def test_a_driving_robot_is_seen_where_it_is_now_not_where_it_was():
@@ -155,7 +157,7 @@ def test_a_driving_robot_is_seen_where_it_is_now_not_where_it_was():
     where = []
     for _ in range(60):
         hub.advance(TICK)
-        where.append(ada.exchange._actors.known["bob"].sample(hub.time, hub.time))
+        where.append(ada.replicator._state.peers.known["bob"].sample(hub.time, hub.time))
     assert where[-1].base_q[0] == pytest.approx(where[-20].base_q[0], abs=1e-9)
     assert not where[-1].base_qd.any()
     assert not where[-1].velocity.any()
@@ -220,7 +222,7 @@ def test_far_from_everybody_not_one_byte_of_environment_leaves():
     run(hub, [ada, bob, cleo], 0.5)
     ada.swinging = set()
     run(hub, [ada, bob, cleo], 0.5)
-    assert ada.exchange.owner(0) is None
+    assert ada.replicator.owner(0) is None
     assert [c.environment_bytes() for c in (ada, bob, cleo)] == [0, 0, 0]
     assert ada.reads == 0
 
@@ -231,7 +233,7 @@ def test_in_the_same_window_of_cells_but_not_near_not_one_byte_leaves():
     run(hub, [ada, bob], 1.0)
     ada.touched = {0}
     run(hub, [ada, bob], 1.0)
-    assert ada.exchange._cell_publishers[(0, 0)][0].matching
+    assert ada.replicator._state.cells.publishers[(0, 0)][0].matching
     assert ada.environment_bytes() == 0
 
 
@@ -242,9 +244,9 @@ def test_of_the_trees_one_moves_only_those_near_somebody_leave():
     ada.touched = {0, 3}
     run(hub, [ada, bob], 1.5)
     assert {update.tree for update in bob.heard} == {3}
-    assert ada.exchange.counters.environment.bytes_out == bob.exchange.counters.environment.bytes_in
-    assert bob.exchange.claim(0) == Claim()
-    assert ada.exchange.counters.environment.bytes_out == 2 * (14 + 13 + 6 * 9)
+    assert ada.replicator.counters.environment.bytes_out == bob.replicator.counters.environment.bytes_in
+    assert bob.replicator.claim(0) == Claim()
+    assert ada.replicator.counters.environment.bytes_out == 2 * (14 + 13 + 6 * 9)
 
 
 def test_near_the_state_arrives_within_quantisation():
@@ -272,9 +274,9 @@ def test_a_steady_touch_costs_a_heartbeat_and_a_moving_one_what_extrapolation_mi
     ada.touched = {0}
     ada.bend(0, 0.2)
     run(hub, [ada, bob], 0.5)
-    before = ada.exchange.counters.environment.messages_out
+    before = ada.replicator.counters.environment.messages_out
     run(hub, [ada, bob], 10.0)
-    assert ada.exchange.counters.environment.messages_out - before == 10
+    assert ada.replicator.counters.environment.messages_out - before == 10
     worst = 0.0
     bodies = ada.model.bodies_of(0)
     for k in range(300):
@@ -282,11 +284,11 @@ def test_a_steady_touch_costs_a_heartbeat_and_a_moving_one_what_extrapolation_mi
         ada.bend(0, 0.2 + 0.1 * np.sin(3 * t), 0.3 * np.cos(3 * t))
         run(hub, [ada, bob], TICK)
         if k > 20:
-            late = ada.exchange._tree_stream
-            silence = dead_reckoning.clamp_age(hub.time - ada.exchange._ownership[0].said_at)
+            late = ada.replicator._state.tree_stream
+            silence = dead_reckoning.clamp_age(hub.time - ada.replicator._state.ownership[0].said_at)
             said = dead_reckoning.extrapolate(late._said_q[bodies], late._said_rate[bodies], silence)
             worst = max(worst, dead_reckoning.angle_between(ada.state.joint_q[bodies].astype(float), said).max())
-    moved = ada.exchange.counters.environment.messages_out - before - 10
+    moved = ada.replicator.counters.environment.messages_out - before - 10
     assert 20 < moved < 200
     assert worst <= dead_reckoning.ANGLE_ERROR
 
@@ -297,9 +299,9 @@ def test_several_trees_of_a_cell_travel_in_one_message():
     run(hub, [ada, bob], 0.5)
     ada.touched = {0, 1, 2, 3, 4}
     run(hub, [ada, bob], TICK)
-    assert ada.exchange.counters.environment.messages_out == 1
-    assert ada.exchange.counters.environment.bytes_out == 14 + 5 * (13 + 6 * 9)
-    assert ada.exchange.counters.event.messages_out == 1
+    assert ada.replicator.counters.environment.messages_out == 1
+    assert ada.replicator.counters.environment.bytes_out == 14 + 5 * (13 + 6 * 9)
+    assert ada.replicator.counters.event.messages_out == 1
 
 
 def test_who_comes_near_hears_at_once_and_who_goes_costs_nothing():
@@ -310,14 +312,14 @@ def test_who_comes_near_hears_at_once_and_who_goes_costs_nothing():
     assert ada.environment_bytes() == 0
     bob.goto(3.0)
     run(hub, [ada, bob], 0.3)
-    assert bob.exchange.owner(0) == "ada"
+    assert bob.replicator.owner(0) == "ada"
     assert {update.tree for update in bob.heard} == {0}
     bob.goto(30.0)
     run(hub, [ada, bob], 0.5)
-    before = ada.exchange.counters.environment.bytes_out
+    before = ada.replicator.counters.environment.bytes_out
     run(hub, [ada, bob], 4.0)
-    assert ada.exchange.counters.environment.bytes_out == before
-    assert bob.exchange.owner(0) is None
+    assert ada.replicator.counters.environment.bytes_out == before
+    assert bob.replicator.owner(0) is None
     assert bob.released == [0]
 
 
@@ -357,10 +359,10 @@ def test_both_touch_and_one_owns_everywhere_soon():
     ada.touched = bob.touched = {1}
     run(hub, clients, 2 * 0.03 + 2 * TICK + TICK)
     assert owners(clients, 1) == {"ada"}
-    claims = {client.exchange.claim(1) for client in clients}
+    claims = {client.replicator.claim(1) for client in clients}
     run(hub, clients, 2.0)
     # they go on pressing and do not take it from each other
-    assert {client.exchange.claim(1) for client in clients} == claims
+    assert {client.replicator.claim(1) for client in clients} == claims
     ada.touched = set()
     ada.swinging = {1}
     run(hub, clients, 0.2)
@@ -381,13 +383,13 @@ def test_who_knows_nothing_of_a_long_story_is_told_and_takes_its_turn():
             run(hub, [ada, bob], 0.1)
             client.touched = set()
             run(hub, [ada, bob], 0.1)
-    assert ada.exchange.claim(0) == Claim(0, 6, "")
+    assert ada.replicator.claim(0) == Claim(0, 6, "")
     cy = Client(hub, "cy", 2.5)
     run(hub, [ada, bob, cy], 0.5)
     cy.touched = {0}
     run(hub, [ada, bob, cy], 0.3)
     assert owners([ada, bob, cy], 0) == {"cy"}
-    assert cy.exchange.claim(0) == Claim(0, 7, "cy")
+    assert cy.replicator.claim(0) == Claim(0, 7, "cy")
 
 
 def test_touches_of_which_nobody_hears_use_no_sequence_numbers():
@@ -396,10 +398,10 @@ def test_touches_of_which_nobody_hears_use_no_sequence_numbers():
     for _ in range(5):
         ada.touched = {0}
         run(hub, [ada], 0.05)
-        assert ada.exchange.owner(0) == "ada"
+        assert ada.replicator.owner(0) == "ada"
         ada.touched = set()
         run(hub, [ada], 0.05)
-    assert ada.exchange.claim(0) == Claim()
+    assert ada.replicator.claim(0) == Claim()
 
 
 def test_an_owner_leaves_and_the_nearest_takes_over():
@@ -424,15 +426,15 @@ def test_an_owner_that_was_not_heard_for_long_is_followed_again_at_its_next_word
     run(hub, clients, 0.5)
     ada.touched = {0}
     run(hub, clients, 0.3)
-    claim = ada.exchange.claim(0)
+    claim = ada.replicator.claim(0)
     hub.loss = 1.0
     run(hub, clients, 4.0)
-    assert (bob.exchange.owner(0), bob.released) == (None, [0])
+    assert (bob.replicator.owner(0), bob.released) == (None, [0])
     hub.loss = 0.0
     run(hub, clients, 1.1)
     assert owners(clients, 0) == {"ada"}
     # bob did not argue: not hearing is no reason to say that it rests
-    assert ada.exchange.claim(0) == bob.exchange.claim(0) == claim
+    assert ada.replicator.claim(0) == bob.replicator.claim(0) == claim
 
 
 def test_a_restarted_owner_is_told_how_far_the_story_went():
@@ -449,14 +451,14 @@ def test_a_restarted_owner_is_told_how_far_the_story_went():
     bob.goto(40.0)
     ada.bus.close()
     run(hub, [bob], 0.2)
-    assert bob.exchange.claim(0).owner == "ada"
-    assert bob.exchange.owner(0) is None
+    assert bob.replicator.claim(0).owner == "ada"
+    assert bob.replicator.owner(0) is None
     bob.goto(2.0)
     again = Client(hub, "ada", 1.0)
     again.touched = {0}
     run(hub, [again, bob], 1.5)
     assert owners([again, bob], 0) == {"ada"}
-    assert again.exchange.claim(0) == bob.exchange.claim(0)
+    assert again.replicator.claim(0) == bob.replicator.claim(0)
 
 
 def test_the_server_goes_and_comes_and_everybody_agrees_again():
@@ -471,7 +473,7 @@ def test_the_server_goes_and_comes_and_everybody_agrees_again():
     assert bob.left == ["ada"]
     bob.touched = {0}
     run(hub, clients, 0.5)
-    assert (ada.exchange.owner(0), bob.exchange.owner(0)) == ("ada", "bob")
+    assert (ada.replicator.owner(0), bob.replicator.owner(0)) == ("ada", "bob")
     hub.down = False
     run(hub, clients, 1.0)
     assert len(owners(clients, 0)) == 1
@@ -508,7 +510,7 @@ def test_after_any_story_on_any_network_there_is_one_owner_everywhere(story, see
     hub.loss = 0.0
     run(hub, everybody, 1.5)
     for tree in range(3):
-        assert len(owners(everybody, tree)) == 1, [client.exchange.claim(tree) for client in everybody]
+        assert len(owners(everybody, tree)) == 1, [client.replicator.claim(tree) for client in everybody]
         touching = {client.name for client in everybody if tree in client.touched}
         assert owners(everybody, tree) <= (touching or {None})
 
@@ -525,7 +527,7 @@ def test_malformed_messages_are_counted_said_once_and_the_tick_goes_on(caplog):
         for publisher in evil:
             publisher.put(b"VS\x01" + bytes([k]) + bytes(k))
         run(hub, [ada, bob], TICK)
-    assert ada.exchange.counters.malformed == 60
+    assert ada.replicator.counters.malformed == 60
     assert sum("bob" in record.message for record in caplog.records) == 1
     assert "bob" in ada.inbox.robots
 
@@ -538,9 +540,9 @@ def test_a_stranger_another_tree_and_a_replay_change_nothing():
     stranger.publisher("own/0/0/stranger", True).put(messages.encode_claims([(0, Claim(5, 5, "stranger"), True)]))
     bob.bus.publisher("own/0/0/bob", True).put(messages.encode_claims([(TREES, Claim(5, 5, "bob"), True)]))
     run(hub, [ada, bob], 0.2)
-    assert ada.exchange.claim(0) == Claim()
-    assert ada.exchange.counters.malformed == 1
-    assert ada.exchange.counters.dropped >= 1
+    assert ada.replicator.claim(0) == Claim()
+    assert ada.replicator.counters.malformed == 1
+    assert ada.replicator.counters.dropped >= 1
     bob.touched = {0}
     bob.bend(0, 0.3)
     eve = hub.bus("eve")
@@ -562,7 +564,7 @@ def test_a_pose_with_another_number_of_joints_is_malformed():
     run(hub, [ada, bob], 0.3)
     bob.robot = dataclasses.replace(bob.robot, position=np.zeros(3), velocity=np.zeros(3))
     run(hub, [ada, bob], 0.1)
-    assert ada.exchange.counters.malformed > 0
+    assert ada.replicator.counters.malformed > 0
     assert len(ada.inbox.robots["bob"].position) == 2
 
 
@@ -575,7 +577,7 @@ def test_the_clock_of_the_server_is_found():
     server.declare_queryable("clock", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 1.5)
-    assert ada.exchange.offset == pytest.approx(1000.0, abs=0.012)
+    assert ada.replicator.offset == pytest.approx(1000.0, abs=0.012)
 
 
 def test_one_actor_has_one_name_and_near_has_a_bound():
@@ -583,7 +585,7 @@ def test_one_actor_has_one_name_and_near_has_a_bound():
     with pytest.raises(ValueError, match="one actor has one name"):
         Replicator(hub.bus("ada"), Hello("bob"), vineyard())
     with pytest.raises(ValueError, match=r"near = 9\.0 m"):
-        Replicator(hub.bus("bob"), Hello("bob"), vineyard(), near=9.0)
+        Replicator(hub.bus("bob"), Hello("bob"), vineyard(), interest_radius=9.0)
 
 
 def test_a_run_is_the_same_twice():
@@ -594,6 +596,6 @@ def test_a_run_is_the_same_twice():
         for k in range(100):
             ada.bend(0, 0.2 * np.sin(0.3 * k), 6.0 * np.cos(0.3 * k))
             run(hub, [ada, bob], TICK)
-        return ada.state.joint_q.tobytes() + bob.state.joint_q.tobytes() + str(bob.exchange.counters).encode()
+        return ada.state.joint_q.tobytes() + bob.state.joint_q.tobytes() + str(bob.replicator.counters).encode()
 
     assert story() == story()

@@ -1,0 +1,77 @@
+"""What receiving and sending share: peers, claims, streams, retained records and the channels of the interest cells."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.net.codec.messages import Hello
+from vinesim.net.counters import Counters, Traffic
+from vinesim.net.replication import authority, interest
+from vinesim.net.replication.cell_channels import CellChannels
+from vinesim.net.replication.hand_forces import WrenchSync
+from vinesim.net.replication.interest import Cell
+from vinesim.net.replication.ownership import Ownership
+from vinesim.net.replication.peers import PeerRegistry
+from vinesim.net.replication.retained_sync import RetainedSync
+from vinesim.net.replication.streams import ObjectStream, TreeStream, object_counts
+from vinesim.net.transport.bus import Bus, Publisher
+from vinesim.scene.ids import is_tree
+from vinesim.scene.model import Model
+
+SPECTATOR = "spectator"
+"""Kind of actor that owns nothing and publishes nothing but its pose."""
+
+
+class ReplicationState:
+    """The replicated state as one actor knows it."""
+
+    def __init__(self, bus: Bus, hello: Hello, model: Model, interest_radius: float, jitter_buffer: float) -> None:
+        self.bus, self.hello, self.model = bus, hello, model
+        self.cells = CellChannels(bus, interest_radius)
+        self.counters = Counters()
+        self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
+        self.wrench_sync = WrenchSync(bus, hello.name)
+        self.ownership = Ownership(hello.name, self.peers.known)
+        self.retained = RetainedSync(bus, self.counters)
+        self.tree_stream = TreeStream(model)
+        self.object_stream = ObjectStream()
+        self.object_counts = object_counts(model)
+        """Number of objects of each kind in the scene."""
+
+    @property
+    def is_spectator(self) -> bool:
+        """Whether this actor owns nothing."""
+        return self.hello.kind == SPECTATOR
+
+    def position_of(self, object_id: int) -> np.ndarray:
+        """Last known position of an object [3] m."""
+        return self.tree_stream.middle[object_id] if is_tree(object_id) else self.object_stream.position(object_id)
+
+    def cell_of(self, object_id: int) -> Cell | None:
+        """Cell under which an object is published; None if it never was."""
+        return self.tree_stream.cell[object_id] if is_tree(object_id) else self.object_stream.cell(object_id)
+
+    def owner_candidates(self) -> dict[str, np.ndarray]:
+        """Positions [3] m of all actors that can own objects: all but spectators."""
+        known, positions = self.peers.known, self.peers.positions()
+        positions = {name: place for name, place in positions.items() if known[name].hello.kind != SPECTATOR}
+        if self.cells.centre is not None and not self.is_spectator:
+            positions[self.hello.name] = self.cells.position
+        return positions
+
+    def successor_of(self, object_id: int) -> str:
+        """The actor that takes over an object whose owner has left."""
+        return authority.choose_successor(self.position_of(object_id), self.owner_candidates())
+
+    def count_listeners(self, positions: np.ndarray) -> np.ndarray:
+        """Number of peers within the interest radius of each position [k, 3] m: [k] int."""
+        others = np.array(list(self.peers.positions().values())).reshape(-1, 3)
+        return interest.count_listeners(positions, others, self.cells.interest_radius)
+
+
+def put_counted(publisher: Publisher, payload: bytes, traffic: Traffic) -> bool:
+    """Publish and count; False, and nothing is counted, without a subscriber."""
+    if not publisher.put(payload):
+        return False
+    traffic.count_out(payload)
+    return True

@@ -1,0 +1,157 @@
+"""Replication of one actor's world: :meth:`Replicator.receive` before a step of the physics, :meth:`Replicator.send` after it.
+
+The decisions are pure functions in other modules: who owns an object (:mod:`~vinesim.net.replication.authority`), who is
+near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong (:mod:`~vinesim.net.replication.dead_reckoning`).
+
+Keys: ``a/<actor>`` poses, ``c/<x>/<y>/<actor>`` states of what moves in a cell, ``own/<x>/<y>/<actor>`` claims and states at
+rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, and the queries ``snap/<x>/<y>``
+(records of a cell), ``hello/<actor>`` and ``clock``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.counters import Counters
+from vinesim.net.replication import interest
+from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.receiver import Inbox, Receiver
+from vinesim.net.replication.replication_state import ReplicationState
+from vinesim.net.replication.sender import LocalStep, Sender
+from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots, StateReader
+from vinesim.net.transport.bus import Bus
+from vinesim.scene.model import Model
+from vinesim.scene.values import HumanUpdate, RobotUpdate, TreeUpdate
+
+
+class Replicator:
+    """Replicates the objects of a scene for one actor. Call :meth:`receive` and :meth:`send` once a step, from one thread.
+
+    ``now`` is any clock of the client in seconds; the offset to the server's clock is kept inside. Objects are trees,
+    boxes and free bunches, by :func:`vinesim.scene.ids.object_id`.
+    """
+
+    def __init__(
+        self, bus: Bus, hello: Hello, model: Model, *, interest_radius: float = interest.INTEREST_RADIUS,
+        jitter_buffer: float = 0.0,
+    ) -> None:  # fmt: skip
+        """``interest_radius`` [m]: peers nearer than this to an object receive its states; at most 5 m.
+
+        ``jitter_buffer`` [s]: delay with which poses of peers are shown (:mod:`vinesim.net.replication.jitter_buffer`).
+        Raises ValueError if the hello has another name than the bus.
+        """
+        if hello.name != bus.name:
+            raise ValueError(f"greeting of {hello.name!r} on the bus of {bus.name!r}: one actor has one name")
+        self.bus, self.hello, self.model = bus, hello, model
+        self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer)
+        self._receiver = Receiver(self._state)
+        self._sender = Sender(self._state)
+        self._now: float | None = None
+        self._last_sent = -1e9
+
+    @property
+    def counters(self) -> Counters:
+        """Traffic and rejected messages since the start."""
+        return self._state.counters
+
+    @property
+    def interest_radius(self) -> float:
+        """Interest radius [m]."""
+        return self._state.cells.interest_radius
+
+    @property
+    def local_actors(self) -> set[str]:
+        """Other actors of the same client: they share its simulation, so nothing is exchanged with them."""
+        return self._state.peers.local_actors
+
+    @local_actors.setter
+    def local_actors(self, names: set[str]) -> None:
+        self._state.peers.local_actors = set(names)
+
+    def owner(self, object_id: int) -> str | None:
+        """Name of the live actor that owns an object now (perhaps this one), or None."""
+        return self._state.ownership.owner(object_id)
+
+    def claim(self, object_id: int) -> Claim:
+        """The greatest claim on an object that was made or received."""
+        return self._state.ownership.claim(object_id)
+
+    def record(self, object_id: int) -> RetainedRecord | None:
+        """The retained record of an object, if any."""
+        return self._state.retained.state.get(object_id)
+
+    @property
+    def owned(self) -> frozenset[int]:
+        """Objects that this actor owns."""
+        return frozenset(self._state.ownership.owned)
+
+    @property
+    def known(self) -> frozenset[int]:
+        """Objects on which any claim was made or received."""
+        return frozenset(self._state.ownership.known)
+
+    @property
+    def peers(self) -> dict[str, Hello]:
+        """The hello of each peer that is in this world now."""
+        return {name: peer.hello for name, peer in self._state.peers.known.items()}
+
+    @property
+    def offset(self) -> float:
+        """Network time minus the client's own time [s]."""
+        return self._state.peers.clock.offset
+
+    def receive(self, now: float) -> Inbox:
+        """Everything that arrived since the last call.
+
+        Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
+        """
+        peers = self._state.peers
+        peers.clock = peers.clock.advanced(now - self._now if self._now is not None else 0.0)
+        self._now = now
+        return self._receiver.receive(now, self.offset)
+
+    def send(
+        self,
+        now: float,
+        pose: RobotUpdate | HumanUpdate,
+        *,
+        read: StateReader,
+        touched: Iterable[int] = (),
+        moving: Iterable[int] = (),
+        grabbed: Iterable[int] = (),
+        detached: Iterable[int] = (),
+        detached_roots: Callable[[int], DetachedRoots] = lambda _: NO_ROOTS,
+        pose_on_support: Callable[[int], tuple[str, np.ndarray]] | None = None,
+        is_changed: Callable[[int], bool] = lambda _: False,
+        wrenches: dict[str, dict[str, np.ndarray]] | None = None,
+    ) -> list[TreeUpdate]:
+        """Publish one step; return the states of trees at rest that left, as all copies hold them.
+
+        ``pose``: of this actor; its ``time`` is replaced. A spectator passes its viewpoint, without joints.
+        ``read(object_id)``: joints ([n, 4], [n, 3] rad/s) of a tree, pose [7] and velocity [6] of another object; called
+        only for objects that a peer may need.
+        ``touched``: objects in contact with this actor; boxes and bunches only while they move in their parent's frame.
+        ``moving``: objects that move by themselves; trees and boxes of other owners are ignored.
+        ``grabbed``: objects that this actor grabbed, picked or cut in this step; ``detached``: those of them that left
+        their plant. ``detached_roots(tree)``: bodies that were cut off a tree.
+        ``pose_on_support(object_id)``: parent frame and pose [7] in it of an object at rest.
+        ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
+        ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
+        """
+        state = self._state
+        time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
+        state.cells.position = np.asarray(pose.base_q[:3], float)
+        state.peers.publish_pose(pose, now, time)
+        for payload in state.wrench_sync.publish(wrenches or {}, now, time):
+            state.counters.force.count_out(payload)
+        touched, moving, grabbed, detached = (
+            {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached)
+        )
+        return self._sender.send(
+            LocalStep(
+                now, time, touched, moving, grabbed, detached, read, detached_roots, pose_on_support, is_changed
+            )
+        )  # fmt: skip

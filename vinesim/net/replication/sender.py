@@ -1,0 +1,254 @@
+"""Outgoing half of replication: claims, states of what moves, states at rest and retained records.
+
+States leave only when a peer is near the object and subscribes to its cell, and only when the copies of the peers would
+otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record leaves once, wherever the peers are:
+the server keeps it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+
+from vinesim.net.codec import messages
+from vinesim.net.codec.messages import RetainedRecord, TreeStates
+from vinesim.net.replication import authority, dead_reckoning
+from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.interest import Cell
+from vinesim.net.replication.ownership import ObjectRecord
+from vinesim.net.replication.replication_state import ReplicationState, put_counted
+from vinesim.net.replication.streams import (
+    ClaimColumns,
+    DetachedRoots,
+    ObjectStream,
+    StateReader,
+    TreeStream,
+    with_roots,
+)
+from vinesim.scene.ids import is_tree
+from vinesim.scene.values import TreeUpdate
+
+ADOPTION_DELAY = 0.5
+"""An object that moves without an owner for so long [s] is taken over by the nearest actor, which then publishes where it
+comes to rest. GUESSED."""
+
+_IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class LocalStep:
+    """What the own simulation reports about one step; see :meth:`vinesim.net.replication.replicator.Replicator.send`."""
+
+    now: float
+    """Own clock [s]."""
+    time: float
+    """Network time [s]."""
+    touched: set[int]
+    moving: set[int]
+    grabbed: set[int]
+    detached: set[int]
+    read: StateReader
+    detached_roots: Callable[[int], DetachedRoots]
+    pose_on_support: Callable[[int], tuple[str, np.ndarray]] | None
+    is_changed: Callable[[int], bool]
+
+
+class Sender:
+    """Publishes what the own actor does to objects."""
+
+    def __init__(self, state: ReplicationState) -> None:
+        self._state = state
+        self._orphans: dict[int, float] = {}
+        """Since when [s, own clock] a moving object has had no owner."""
+
+    def send(self, step: LocalStep) -> list[TreeUpdate]:
+        """Publish one step; return the states of trees at rest that left, as all copies hold them."""
+        state, touched = self._state, set(step.touched)
+        for object_id in sorted(step.grabbed):
+            state.ownership.grab(object_id)
+            touched.add(object_id)
+        for object_id in sorted(touched):
+            state.ownership.touch(object_id)
+        self._adopt_orphans(step.moving - touched, step)
+        self._update_interest(step.now)
+        owned = state.ownership.owned
+        active = tuple(sorted(owned & (touched | step.moving)))
+        settled = self._publish_at_rest(sorted(owned.difference(active)), step) if owned else []
+        for object_id in sorted(step.detached & owned):
+            self._publish_detachment(object_id, step)
+        state.retained.flush()
+        tree_count = sum(map(is_tree, active))
+        for stream, ids in ((state.tree_stream, active[:tree_count]), (state.object_stream, active[tree_count:])):
+            if ids:
+                self._publish_states(stream, ids, touched, step)
+        return settled
+
+    def _adopt_orphans(self, moving: set[int], step: LocalStep) -> None:
+        """Take over objects that have moved without an owner for a while, if no candidate is nearer."""
+        state = self._state
+        orphans = {
+            object_id
+            for object_id in moving
+            if not is_tree(object_id) and state.ownership.owner(object_id) is None
+        }  # fmt: skip
+        self._orphans = {object_id: self._orphans.get(object_id, step.now) for object_id in orphans}
+        due = (object_id for object_id, since in self._orphans.items() if step.now - since >= ADOPTION_DELAY)
+        for object_id in sorted(due):
+            position = step.read(object_id)[0][:3]
+            if authority.choose_successor(position, state.owner_candidates()) == state.hello.name:
+                state.ownership.take_over(object_id)
+
+    def _update_interest(self, now: float) -> None:
+        """Open and close channels for the present position and the objects that are owned."""
+        state = self._state
+        owned = {cell for object_id in state.ownership.owned if (cell := state.cell_of(object_id)) is not None}
+        state.cells.update(owned)
+        state.retained.update_window(state.cells.subscriptions, now)
+        state.peers.update_interest(state.cells.position)
+
+    # ------------------------------------------------------------ moving
+
+    def _publish_states(
+        self, stream: TreeStream | ObjectStream, active: tuple[int, ...], touched: set[int], step: LocalStep
+    ) -> None:
+        """Publish, cell by cell, the states of which the copies are wrong."""
+        state = self._state
+        entries = [state.ownership[object_id] for object_id in active]
+        listeners = state.count_listeners(stream.positions(active, step.read))
+        contact = [object_id in touched for object_id in active]
+        if not listeners.any():
+            for entry, touching in zip(entries, contact, strict=True):
+                entry.said_to, entry.touching = 0, touching
+            return
+        due = self._find_due(stream, active, entries, listeners, contact, step)
+        cells = stream.cells(active)
+        rows_by_cell: dict[Cell, list[int]] = {}
+        for row in np.flatnonzero(due).tolist():
+            rows_by_cell.setdefault(cells[row], []).append(row)
+        for cell, rows in sorted(rows_by_cell.items()):
+            if cell not in state.cells.publishers:
+                continue
+            states, events = state.cells.publishers[cell]
+            if not states.matching:
+                continue
+            here = [(active[row], entries[row]) for row in rows]
+            new = [(object_id, entry.claim, entry.touching) for object_id, entry in here if not entry.announced]
+            if new:
+                put_counted(events, messages.encode_claims(new), state.counters.event)
+            flags = [messages.TOUCHED * entry.touching for _, entry in here]
+            columns = ClaimColumns([entry.claim for _, entry in here], flags)
+            for payload in stream.encode(rows, columns, step.time, cell):
+                put_counted(states, payload, state.counters.environment)
+            for row in rows:
+                entry = entries[row]
+                entry.announced, entry.said_at, entry.said_to = True, step.time, int(listeners[row])
+
+    def _find_due(
+        self, stream: TreeStream | ObjectStream, active: tuple[int, ...], entries: list[ObjectRecord],
+        listeners: np.ndarray, contact: list[bool], step: LocalStep,
+    ) -> np.ndarray:  # fmt: skip
+        """Which objects to publish [k] bool: the prediction is wrong, or a listener, the claim or the contact is new."""
+        silence = step.time - np.array([entry.said_at for entry in entries])
+        error = stream.prediction_error(active, silence, step.read, step.detached_roots)
+        due = dead_reckoning.needs_update(*error, silence)
+        for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
+            due[row] |= listeners[row] > entry.said_to or entry.touching != touching
+            entry.touching = touching
+            entry.said_to = min(entry.said_to, int(listeners[row]))
+        return due & (listeners > 0)
+
+    # ------------------------------------------------------------ rest and retained records
+
+    def _publish_at_rest(self, object_ids: list[int], step: LocalStep) -> list[TreeUpdate]:
+        """Release owned objects that have come to rest; the states of trees that left."""
+        settled = []
+        for object_id in object_ids:
+            if not is_tree(object_id):
+                self._publish_object_at_rest(object_id, step)
+            elif (update := self._publish_tree_at_rest(object_id, step)) is not None:
+                settled.append(update)
+        return settled
+
+    def _publish_tree_at_rest(self, tree: int, step: LocalStep) -> TreeUpdate | None:
+        """Publish one reliable state of a tree to subscribers nearby, then nothing more.
+
+        If picks or cuts have changed the tree, the state is a retained record, too.
+        """
+        state, is_changed = self._state, step.is_changed(tree)
+        if is_changed:
+            state.ownership.increment(tree)
+        entry, claim = state.ownership[tree], state.ownership.release(tree)
+        cell = state.tree_stream.cell[tree]
+        events = state.cells.event_publisher(cell)
+        is_near = bool(state.count_listeners(state.tree_stream.middle[[tree]])[0])
+        listened = events if is_near and events is not None and events.matching else None
+        if listened is None and not is_changed:
+            if not entry.announced:
+                state.ownership.rollback(tree)
+            return None
+        payload, update = self._encode_tree(tree, claim, step, messages.RESTING)
+        if is_changed:
+            record = RetainedRecord(
+                tree, claim.ownership, claim.authority, state.hello.name, _IDENTITY_POSE, "", (), payload
+            )
+            self._publish_tree_record(cell, record, step)
+        if listened is not None:
+            put_counted(listened, payload, state.counters.event)
+        entry.announced, entry.said_at = True, step.time
+        return update
+
+    def _publish_object_at_rest(self, object_id: int, step: LocalStep) -> None:
+        """Publish where an object rests in the frame of its support, as a retained record."""
+        state = self._state
+        assert step.pose_on_support is not None, f"object {object_id} rests, but no pose_on_support was given"
+        state.ownership.increment(object_id)
+        claim = state.ownership.release(object_id)
+        state.object_stream.positions((object_id,), step.read)
+        parent, pose = step.pose_on_support(object_id)
+        state.ownership[object_id].announced = True
+        x, y, z, qx, qy, qz, qw = pose.tolist()
+        state.retained.publish(
+            state.object_stream.cells((object_id,))[0],
+            RetainedRecord(
+                object_id, claim.ownership, claim.authority, state.hello.name, (x, y, z, qx, qy, qz, qw), parent
+            ),
+        )
+
+    def _publish_detachment(self, object_id: int, step: LocalStep) -> None:
+        """Publish, to everyone, that an object has left its plant and moves."""
+        state = self._state
+        claim = state.ownership.claim(object_id)
+        record = RetainedRecord(object_id, claim.ownership, claim.authority, state.hello.name, moving=True)
+        state.ownership[object_id].announced = True
+        if is_tree(object_id):
+            payload, _ = self._encode_tree(object_id, claim, step, messages.TOUCHED)
+            record = msgspec.structs.replace(record, trees=payload)
+            self._publish_tree_record(state.tree_stream.cell[object_id], record, step)
+            return
+        state.object_stream.positions((object_id,), step.read)
+        pose, _ = step.read(object_id)
+        record = msgspec.structs.replace(record, pose=tuple(np.asarray(pose, float).tolist()))
+        state.retained.publish(state.object_stream.cells((object_id,))[0], record)
+
+    def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:
+        """Publish a retained record of a tree, with all bodies that were cut off it."""
+        first = int(self._state.model.tree_first[record.object])
+        cut = tuple((first + step.detached_roots(record.object)[0]).tolist())
+        self._state.retained.publish(cell, msgspec.structs.replace(record, cut=cut))
+
+    def _encode_tree(self, tree: int, claim: Claim, step: LocalStep, flags: int) -> tuple[bytes, TreeUpdate]:
+        """State of a tree as a message, and as receivers decode it; at rest its rates are zero."""
+        q, qd = step.read(tree)
+        numbers, x, xd = step.detached_roots(tree)
+        rate_factor = 0.0 if flags & messages.RESTING else 1.0
+        columns = ClaimColumns([claim], [flags])
+        batch = TreeStates(
+            step.time, np.array([tree]), *columns.columns(), np.array([len(q)]), np.asarray(q, float),
+            rate_factor * np.asarray(qd, float),
+        )  # fmt: skip
+        (payload,), decoded = messages.encode_trees(with_roots(batch, [(numbers, x, rate_factor * xd)]))
+        (update,) = decoded.updates(self._state.hello.name)
+        return payload, update

@@ -1,0 +1,95 @@
+"""Admission of an actor by the vinesim server of a world, and again by every server that starts later.
+
+A server that was restarted does not know which actors are there. A querier with a matching listener notices it, and
+the hello is sent again.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+import zenoh
+
+from vinesim.net.codec import messages
+from vinesim.net.transport.bus import JoinRejected
+from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, has_match
+
+log = logging.getLogger(__name__)
+
+RETRY_PERIOD = 0.05
+"""Time between two attempts to be admitted again [s]."""
+
+
+class ServerAdmission:
+    """Asks the server of a world to admit one actor, and watches whether that server is there."""
+
+    def __init__(
+        self, session: zenoh.Session, prefix: str, *, name: str, world: str, endpoint: str, is_secured: bool,
+        submit: Callable[[Callable[[], object]], None],
+    ) -> None:  # fmt: skip
+        """``prefix``: key of the world with a trailing slash. ``submit`` runs a function in the bus's own thread."""
+        self._session, self._key = session, f"{prefix}join/{name}/{session.zid()}"
+        self._name, self._world, self._endpoint = name, world, endpoint
+        self._is_secured, self._submit = is_secured, submit
+        self.is_served = True
+        """The server of this world is there, or there never was one."""
+        self.rejection = ""
+        """Empty, or why a server that was restarted rejects this actor."""
+        self._declared: list[object] = []
+
+    def join(self, hello: bytes) -> None:
+        """Send an encoded hello; :class:`JoinRejected` if a server rejects it. Without a server nothing happens."""
+        welcomes = self._query(hello)
+        if any(welcome.refused for welcome in welcomes):
+            raise JoinRejected(next(welcome.refused for welcome in welcomes if welcome.refused))
+        if not welcomes and self._is_secured:
+            raise JoinRejected(
+                f"the server at {self._endpoint} lets nobody named {self._name!r} in: its folder of certificates must "
+                f"hold {self._name}.pem, and it reads them when it starts"
+            )
+        if not welcomes:
+            log.info("%s: no vinesim server keeps world %r; actors check each other", self._name, self._world)
+        elif len(welcomes) > 1:
+            log.warning("%s: %d servers keep world %r; link all but one to it with --connect", self._name,
+                        len(welcomes), self._world)  # fmt: skip
+        querier = self._session.declare_querier(self._key)
+
+        def on_matching(status: zenoh.MatchingStatus) -> None:
+            self.is_served = status.matching
+            if status.matching:
+                self._submit(lambda: self._join_again(querier, hello))
+
+        self._declared += [querier, querier.declare_matching_listener(on_matching)]
+        if not welcomes and has_match(querier):
+            self._submit(lambda: self._join_again(querier, hello))
+
+    def _join_again(self, querier: zenoh.Querier, hello: bytes) -> None:
+        """Send the hello to a server that has appeared, and note whether it rejects this actor."""
+        welcomes, end = self._query(hello), time.monotonic() + CONNECT_TIMEOUT
+        # between linked routers a server is announced before queries are routed to it
+        while not welcomes and has_match(querier) and time.monotonic() < end:
+            time.sleep(RETRY_PERIOD)
+            welcomes = self._query(hello)
+        self.rejection = next((welcome.refused for welcome in welcomes if welcome.refused), "")
+        if self.rejection:
+            log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)
+
+    def _query(self, hello: bytes) -> list[messages.Welcome]:
+        """Replies of all servers; an unreadable reply counts as a rejection."""
+        replies = self._session.get(
+            self._key, payload=hello, timeout=CONNECT_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
+        )
+        answers = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+        try:
+            return [messages.decode_welcome(answer) for answer in answers]
+        except messages.WrongVersion as error:
+            return [
+                messages.Welcome(
+                    f"the server at {self._endpoint} speaks protocol version {error.theirs}, {self._name!r} version "
+                    f"{messages.PROTOCOL}: use the same release of vinesim"
+                )
+            ]
+        except messages.MessageError as error:
+            return [messages.Welcome(f"the reply of the server at {self._endpoint} cannot be decoded: {error}")]
