@@ -131,7 +131,7 @@ class FakeClient:
         for fact, holds in inbox.records:
             self.facts[fact.object] = {"parent": fact.parent, "moving": fact.moving, "holds": holds, "pose": fact.pose}
         self.released += inbox.released
-        self.robots = inbox.robots
+        self.robots = dict(inbox.robots)
         grabbed, self.grabbing = self.grabbing, set()
         picked, self.picking = self.picking, set()
         self.carrying |= picked

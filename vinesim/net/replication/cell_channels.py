@@ -1,7 +1,7 @@
 """Subscriptions and publishers of one actor in the interest cells around it and around the objects that it owns.
 
-Keys: ``c/<x>/<y>/<actor>`` for states of what moves (best effort), ``own/<x>/<y>/<actor>`` for claims and states at rest
-(reliable).
+Keys: ``c/<x>/<y>/<actor>`` for states of what moves (best effort), ``own/<x>/<y>/<actor>`` for claims and states at
+rest (reliable).
 """
 
 from __future__ import annotations

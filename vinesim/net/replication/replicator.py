@@ -1,9 +1,12 @@
-"""Replication of one actor's world: :meth:`Replicator.receive` before a step of the physics, :meth:`Replicator.send` after it.
+"""Replication of one actor's world: :meth:`Replicator.receive` before a step of the physics, :meth:`Replicator.send`
+after it.
 
-The decisions are pure functions in other modules: who owns an object (:mod:`~vinesim.net.replication.authority`), who is
-near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong (:mod:`~vinesim.net.replication.dead_reckoning`).
+The decisions are pure functions in other modules: who owns an object (:mod:`~vinesim.net.replication.authority`), who
+is near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong
+(:mod:`~vinesim.net.replication.dead_reckoning`).
 
-Keys: ``a/<actor>`` poses, ``c/<x>/<y>/<actor>`` states of what moves in a cell, ``own/<x>/<y>/<actor>`` claims and states at
+Keys: ``a/<actor>`` poses, ``c/<x>/<y>/<actor>`` states of what moves in a cell, ``own/<x>/<y>/<actor>`` claims and
+states at
 rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, and the queries ``snap/<x>/<y>``
 (records of a cell), ``hello/<actor>`` and ``clock``.
 """
@@ -28,7 +31,8 @@ from vinesim.scene.values import HumanUpdate, RobotUpdate, TreeUpdate
 
 
 class Replicator:
-    """Replicates the objects of a scene for one actor. Call :meth:`receive` and :meth:`send` once a step, from one thread.
+    """Replicates the objects of a scene for one actor. Call :meth:`receive` and :meth:`send` once a step, from one
+    thread.
 
     ``now`` is any clock of the client in seconds; the offset to the server's clock is kept inside. Objects are trees,
     boxes and free bunches, by :func:`vinesim.scene.ids.object_id`.
@@ -131,8 +135,8 @@ class Replicator:
         """Publish one step; return the states of trees at rest that left, as all copies hold them.
 
         ``pose``: of this actor; its ``time`` is replaced. A spectator passes its viewpoint, without joints.
-        ``read(object_id)``: joints ([n, 4], [n, 3] rad/s) of a tree, pose [7] and velocity [6] of another object; called
-        only for objects that a peer may need.
+        ``read(object_id)``: joints ([n, 4], [n, 3] rad/s) of a tree, pose [7] and velocity [6] of another object;
+        called only for objects that a peer may need.
         ``touched``: objects in contact with this actor; boxes and bunches only while they move in their parent's frame.
         ``moving``: objects that move by themselves; trees and boxes of other owners are ignored.
         ``grabbed``: objects that this actor grabbed, picked or cut in this step; ``detached``: those of them that left

@@ -1,8 +1,8 @@
 """Outgoing half of replication: claims, states of what moves, states at rest and retained records.
 
 States leave only when a peer is near the object and subscribes to its cell, and only when the copies of the peers would
-otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record leaves once, wherever the peers are:
-the server keeps it.
+otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record leaves once, wherever the peers
+are: the server keeps it.
 """
 
 from __future__ import annotations
@@ -32,15 +32,16 @@ from vinesim.scene.ids import is_tree
 from vinesim.scene.values import TreeUpdate
 
 ADOPTION_DELAY = 0.5
-"""An object that moves without an owner for so long [s] is taken over by the nearest actor, which then publishes where it
-comes to rest. GUESSED."""
+"""An object that moves without an owner for so long [s] is taken over by the nearest actor, which then publishes where
+it comes to rest. GUESSED."""
 
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LocalStep:
-    """What the own simulation reports about one step; see :meth:`vinesim.net.replication.replicator.Replicator.send`."""
+    """What the own simulation reports about one step; see
+    :meth:`vinesim.net.replication.replicator.Replicator.send`."""
 
     now: float
     """Own clock [s]."""
@@ -150,7 +151,8 @@ class Sender:
         self, stream: TreeStream | ObjectStream, active: tuple[int, ...], entries: list[ObjectRecord],
         listeners: np.ndarray, contact: list[bool], step: LocalStep,
     ) -> np.ndarray:  # fmt: skip
-        """Which objects to publish [k] bool: the prediction is wrong, or a listener, the claim or the contact is new."""
+        """Which objects to publish [k] bool: the prediction is wrong, or a listener, the claim or the contact is
+        new."""
         silence = step.time - np.array([entry.said_at for entry in entries])
         error = stream.prediction_error(active, silence, step.read, step.detached_roots)
         due = dead_reckoning.needs_update(*error, silence)
