@@ -114,7 +114,7 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
         x, y, yaw = (*_parse_place("--person", ",".join(parts), 3), 0.0)[:3]
         placed_people.append(PersonPlacement(x, y, yaw, posture))
     for text in crates:
-        x, y, yaw, fill = _parse_place("--crate", text, 4)
+        x, y, yaw, fill = (*_parse_place("--crate", text, 4), 0.0, 0.0)[:4]
         crate = CratePlacement(x, y, yaw, fill)
         if not 0.0 <= crate.fill <= 1.0:
             raise UsageError(f"--crate {text}: the fill is {crate.fill:g}; give 0 (empty) to 1 (full)")

@@ -180,11 +180,11 @@ class ObjectStream:
         self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
     ) -> tuple[np.ndarray, np.ndarray]:
         """How far off everybody's copies are by now [k] m and [k] rad; ``silence`` [k] s since the last record."""
-        nothing = np.full(7, np.inf), np.zeros(6)
-        said: list[tuple[np.ndarray, np.ndarray]] = [self._said.get(thing, nothing) for thing in active]
+        nothing: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
+        said = [self._said.get(thing, nothing) for thing in active]
         pose, velocity = np.array([pose for pose, _ in said]), np.array([velocity for _, velocity in said])
         pose[:, 3:] = np.where(np.isfinite(pose[:, 3:]), pose[:, 3:], self._pose[:, 3:])
-        there = _extrapolate_pose(pose, velocity, dead_reckoning.clamp_age(silence)[:, None])
+        there = _extrapolate_pose(pose, velocity, np.asarray(dead_reckoning.clamp_age(silence))[:, None])
         return np.linalg.norm(self._pose[:, :3] - there[:, :3], axis=1), dead_reckoning.angle_between(
             self._pose[:, 3:], there[:, 3:]
         )
