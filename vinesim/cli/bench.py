@@ -129,7 +129,7 @@ def _measurements(name: str, plot: pathlib.Path | None) -> Iterator[Measurement]
         if not (missing.name or "").startswith("vinesim.bench.support"):
             raise
         raise NoSuchBench(
-            f"bench {name} needs load generators that the installed package does not hold; run it in a checkout of vinesim"
+            f"bench {name} needs load generators that are not installed; run it in a checkout of vinesim"
         ) from None
 
 
