@@ -11,7 +11,8 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 SKIPS_FAIL = bool(os.environ.get("CI"))
-"""In CI everything that tests need is installed, so a skip hides a missing part. Tests marked ``gpu`` may be skipped."""
+"""In CI everything that tests need is installed, so a skip hides a missing part. Tests marked ``gpu`` may be
+skipped."""
 
 
 SLOW = (

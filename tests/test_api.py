@@ -1,4 +1,5 @@
-"""The public interface: it loads lazily, and its energies, momenta, tips and damping are those of independent formulas."""
+"""The public interface: it loads lazily, and its energies, momenta, tips and damping are those of independent
+formulas."""
 
 import ast
 import inspect
@@ -178,7 +179,8 @@ def test_energy_of_a_pendulum():
 
 
 def test_energy_of_an_undamped_cane_is_kept():
-    """Released straight, phi 1/2, 10 s: kinetic, elastic and gravitational energy pass into each other, total to 2 %."""
+    """Released straight, phi 1/2, 10 s: kinetic, elastic and gravitational energy pass into each other, total to 2
+    %."""
     cane = vinesim.CaneBuilder(length=0.6, tip_mass=0.02)
     simulation = vinesim.Simulation(cane, parameters=vinesim.PhysicsParameters(phi=0.5), sleep=False)
     seen = [simulation.energy()]

@@ -92,8 +92,8 @@ def test_links_lose_their_share_and_can_be_cut_and_mended():
 
 def test_nothing_stays_behind_even_of_one_that_is_killed():
     code = (
-        "import sys, time\nfrom vinesim.bench.support.network_emulator import Emulator, Line\n"
-        "net = Emulator({'a': Line()})\nprint('ready', flush=True)\ntime.sleep(60)"
+        "import sys, time\nfrom vinesim.bench.support.network_emulator import Link, NetworkEmulator\n"
+        "net = NetworkEmulator({'a': Link()})\nprint('ready', flush=True)\ntime.sleep(60)"
     )
     victim = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert victim.stdout is not None

@@ -141,7 +141,8 @@ def test_distance_of_a_segment_is_the_least_of_its_points(kind, start, end):
 
 
 def ellipsoid_distance(p: np.ndarray) -> np.ndarray:
-    """Distance of points [n, 3] outside of the ellipsoid, by bisection of the Lagrange multiplier of its closest point."""
+    """Distance of points [n, 3] outside of the ellipsoid, by bisection of the Lagrange multiplier of its closest
+    point."""
     square = np.array(KINDS["ellipsoid"][1]) ** 2
     low, high = np.zeros(len(p)), np.linalg.norm(p, axis=1) * np.sqrt(square.max())
     for _ in range(60):

@@ -1,6 +1,7 @@
 """``make validation``: draws what the laws compare and writes their figures into docs/validation.md.
 
-Everything comes from the functions that the tests call: ``tests/support/beam_theory.py`` and the scenes of ``tests/support/contact_scenes.py``.
+Everything comes from the functions that the tests call: ``tests/support/beam_theory.py`` and the scenes of
+``tests/support/contact_scenes.py``.
 """
 
 from __future__ import annotations

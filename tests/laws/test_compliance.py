@@ -335,7 +335,8 @@ def test_effort_is_weight_less_j_transposed_f(vinebot: RobotDescription) -> None
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, -1)])
 def test_pose_is_held_against_50_newtons(vinebot: RobotDescription, direction: tuple[int, int, int]) -> None:
-    """F17: at rest every servo's stiffness times its deflection is J^T F, that of the base included; and back after it."""
+    """F17: at rest every servo's stiffness times its deflection is J^T F, that of the base included; and back after
+    it."""
     stand, link = Stand(vinebot), "arm_left_7_link"
     start, base = stand.run(0.2)[-1], stand.rigid.base_state("anna")[0]
     place = stand.robot.frame_pose(link)[:3]

@@ -190,10 +190,11 @@ def test_a_coasting_bar_is_thrown_back_as_the_reference_says():
 
 @pytest.mark.parametrize("speed", [0.25, 0.5, 1.0, 2.0, 3.0])
 def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
-    """Impulse and peak are the reference's, every cane is met, none is passed through, all swing back to where they hung.
+    """Impulse and peak are the reference's, every cane is met, none is passed through, all swing back to where they
+    hung.
 
-    At 3 m/s the bar goes 3 cm a tick, five times a cane's radius. The reference takes 1 ms, where it has converged: with
-    0.25 ms and contacts ten times as stiff its impulse changes by 1.7 % at 3 m/s, by 0.4 % at 0.5 m/s.
+    At 3 m/s the bar goes 3 cm a tick, five times a cane's radius. The reference takes 1 ms, where it has converged:
+    with 0.25 ms and contacts ten times as stiff its impulse changes by 1.7 % at 3 m/s, by 0.4 % at 0.5 m/s.
     """
     ours, force, met = sweep(speed, 2.0 / speed, 200.0)
     impulse, peak = 0.01 * force.sum(0), peaks(force)

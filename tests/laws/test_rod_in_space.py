@@ -31,7 +31,8 @@ def rod(turn: float, weight: float, beside: float, *, modulus: float = 5e9, shea
         tree.bodies[last]["stiffness"]
     )  # half an element lies between the last joint and the weight
     tree.add_body(
-        last, offset=(1 / PIECES, 0, 0), rest=frames.from_yaw(np.array(turn / PIECES / 2)), mass=mass, com=(0, beside, 0),
+        last, offset=(1 / PIECES, 0, 0), rest=frames.from_yaw(np.array(turn / PIECES / 2)), mass=mass,
+        com=(0, beside, 0),
         inertia=[mass * 1e-4] * 3, length=1e-3, stiffness=half, damping=0.3 * half,
     )  # fmt: skip
     return tree

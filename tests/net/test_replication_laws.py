@@ -1,4 +1,5 @@
-"""Laws of the network, on any network: whatever is delayed, lost, duplicated or overtaken, and whoever comes and goes."""
+"""Laws of the network, on any network: whatever is delayed, lost, duplicated or overtaken, and whoever comes and
+goes."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def test_thirty_thousand_puts_that_nobody_wants_cost_what_a_thousand_cost():
 
 
 def test_branch_touched_far_from_everybody_costs_nothing(world):
-    world.sync()
+    world.settle()
     world.tell("ada", place=[55.0, 0.0])  # 25 m from cleo, 53 m from bob
     time.sleep(0.3)
     idle, reads = world.count(), world.tell("ada")["reads"]
@@ -160,7 +160,7 @@ def test_branch_touched_far_from_everybody_costs_nothing(world):
 
 def test_branch_is_heard_by_who_is_near_and_by_nobody_else(world):
     """F71, F72: bob stands 1.5 m from the branch, cleo 29 m: bob hears the stream, cleo not one byte more than idle."""
-    world.sync()
+    world.settle()
     idle = world.count()
     world.tell("ada", touch=list(range(6)))
     wait(lambda: world.tell("bob")["owner"].get("0") == "ada", "bob to hear of it")
@@ -175,7 +175,7 @@ def test_branch_is_heard_by_who_is_near_and_by_nobody_else(world):
 
 
 def test_who_comes_near_hears_and_who_goes_does_not(world):
-    world.sync()
+    world.settle()
     world.tell("ada", touch=[0])
     world.tell("cleo", place=[1.0, 1.0])
     wait(lambda: world.tell("cleo")["owner"].get("0") == "ada", "cleo to hear of it")
@@ -186,7 +186,7 @@ def test_who_comes_near_hears_and_who_goes_does_not(world):
 
 
 def test_branch_that_swings_on_is_heard_and_one_that_rests_is_not(world):
-    world.sync()
+    world.settle()
     idle = world.count()
     world.tell("ada", touch=[0])
     wait(lambda: world.tell("bob")["owner"].get("0") == "ada", "bob to hear of it")
@@ -204,7 +204,7 @@ def test_branch_that_swings_on_is_heard_and_one_that_rests_is_not(world):
 
 def test_wind_moves_everything_and_nothing_is_said(world):
     """F71, F73: what nobody touched is each client's own, though it swings beside another actor."""
-    world.sync()
+    world.settle()
     before = {name: world.tell(name)["counters"] for name in world.stages}
     for name in world.stages:
         world.tell(name, swing=list(range(12)))
@@ -217,7 +217,7 @@ def test_wind_moves_everything_and_nothing_is_said(world):
 
 
 def test_actors_are_heard_at_60_hz_near_and_at_5_hz_far(world):
-    world.sync()
+    world.settle()
     before = {name: world.tell(name) for name in world.stages}
     time.sleep(WINDOW)
     after = {name: world.tell(name) for name in world.stages}
@@ -240,7 +240,7 @@ def facts(before: dict, after: dict, way: str) -> int:
 
 def test_hanging_bunch_is_part_of_its_tree_and_heard_only_near(world):
     """F73, F75: touching a bunch is touching its tree; who is not near hears nothing, and knows as much as before."""
-    world.sync()
+    world.settle()
     before = world.tell("cleo")
     world.tell("ada", touch=[2], sway=0.2)
     wait(lambda: world.tell("bob")["owner"].get("2") == "ada", "bob to hear of it")
@@ -254,7 +254,7 @@ def test_hanging_bunch_is_part_of_its_tree_and_heard_only_near(world):
 
 def test_loose_bunch_from_cut_to_ground_to_hand_to_box(world):
     """F76, F77, F78: a stream while it moves; one fact when it comes to rest, and not one byte after it."""
-    world.sync()
+    world.settle()
     start = {name: world.tell(name) for name in world.stages}
     world.tell("ada", pick=[BUNCH])
     wait(lambda: str(BUNCH) in world.tell("bob")["facts"], "bob to hear that it left its vine")
@@ -290,7 +290,7 @@ def test_loose_bunch_from_cut_to_ground_to_hand_to_box(world):
 def test_box_is_one_stream_while_it_is_carried_and_none_while_it_rides(world):
     """F79, F80: one stream for the box, zero for what is in it; on a robot that drives, which does not move it in its
     own frame, nothing (where the box is then follows from the fact that says on what it rides)."""
-    world.sync()
+    world.settle()
     world.tell("ada", grab=[BOX], carry=[BOX])
     wait(lambda: world.tell("bob")["owner"].get(str(BOX)) == "ada", "bob to hear of the box")
     before = world.tell("ada")["counters"]["environment"]
@@ -309,7 +309,7 @@ def test_box_is_one_stream_while_it_is_carried_and_none_while_it_rides(world):
 
 
 def test_a_link_that_is_cut_for_five_seconds_heals(world, record_property):
-    world.sync()
+    world.settle()
     ada, bob = world.stages["ada"], world.stages["bob"]
     world.tell("ada", touch=[1])
     wait(lambda: bob.tell()["owner"].get("1") == "ada", "bob to hear of the tree")

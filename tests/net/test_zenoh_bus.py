@@ -223,7 +223,10 @@ def test_a_huge_sample_is_not_kept(server):
 
 
 def test_a_session_left_open_does_not_hang_at_exit(server):
-    code = f"from vinesim.net.transport.zenoh_bus import ZenohBus\nbus = ZenohBus('ada', connect={server.endpoint!r})\nprint('in')"
+    code = (
+        "from vinesim.net.transport.zenoh_bus import ZenohBus\n"
+        f"bus = ZenohBus('ada', connect={server.endpoint!r})\nprint('in')"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
     assert (done.returncode, done.stdout) == (0, "in\n"), done.stderr
 

@@ -225,7 +225,8 @@ def test_rigid_groups_join_what_a_constraint_couples():
 def test_a_tick_is_a_list_of_stages_and_the_vineyard_falls_asleep_again():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "wind", "grasps", "rigid", "contacts", "detail", "plants", "contacts", "plants", "rigid", "faults", "detachment",
+        "wind", "grasps", "rigid", "contacts", "detail", "plants", "contacts", "plants", "rigid", "faults",
+        "detachment",
         "grasps", "sleep",
     ]  # fmt: skip
     physics.plants.wake(1)

@@ -269,7 +269,8 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
 
 
 def test_nothing_moves_head_trunk_or_legs():
-    """F25, F26: one arm pushes the head, one the left shin, and MuJoCo's own bodies stay where the posture puts them."""
+    """F25, F26: one arm pushes the head, one the left shin, and MuJoCo's own bodies stay where the posture puts
+    them."""
     rigid, spec = RigidWorld(yard()), eva(0.5, heading=np.pi)
     head = frames.pose(np.array([0.5, 0.0, 1.6]), frames.exp(np.array([0.1, 0.2, 3.0])))
     pose = dataclasses.replace(spec.pose, head=head)

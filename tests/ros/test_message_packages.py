@@ -27,8 +27,8 @@ OFFICIAL = {
 ASK_HASHES = """
 import rclpy
 from rclpy.context import Context
-from vinesim.ros.messages import message_packages as interfaces
-interfaces.ensure_importable(["tf2_msgs"])
+from vinesim.ros.messages import message_packages
+message_packages.ensure_importable(["tf2_msgs"])
 from tf2_msgs.msg import TF2Error, TFMessage
 context = Context()
 context.init([])
@@ -41,7 +41,11 @@ node.destroy_node()
 context.shutdown()
 """
 
-BUILD = "import sys; from vinesim.ros.messages import message_packages as interfaces; sys.stdout.write(str(interfaces.build('tf2_msgs')))"
+BUILD = """
+import sys
+from vinesim.ros.messages import message_packages
+sys.stdout.write(str(message_packages.build('tf2_msgs')))
+"""
 
 
 @pytest.fixture(scope="module")

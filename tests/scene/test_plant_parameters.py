@@ -27,7 +27,8 @@ def all_numbers():
 
 
 def test_every_number_is_graded_and_explained():
-    """A READ number names a publication (a year, or a table of a journal); a DERIVED one the numbers it follows from."""
+    """A READ number names a publication (a year, or a table of a journal); a DERIVED one the numbers it follows
+    from."""
     found = list(all_numbers())
     assert len(found) > 50
     for number in found:

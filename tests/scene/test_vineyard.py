@@ -162,7 +162,8 @@ def test_shoots_are_tied_where_they_pass_wires(vineyard):
 
 
 def test_drag_is_coefficient_times_the_area_seen_from_the_side(vineyard):
-    """Silhouettes are measured strip by strip: trapezia of wood, ellipses of bunches; leaves by their one-sided area."""
+    """Silhouettes are measured strip by strip: trapezia of wood, ellipses of bunches; leaves by their one-sided
+    area."""
     scene, model = vineyard
     asked = plant_parameters.load_plant(scene.plants)
     wood = model.body_organ != Organ.BUNCH
@@ -180,7 +181,8 @@ def test_drag_is_coefficient_times_the_area_seen_from_the_side(vineyard):
 
 
 def test_a_peduncle_breaks_where_its_outer_fibre_reaches_the_strength(vineyard):
-    """Moment of a linear stress over a round section, summed over the section: the strength is in the outermost fibre."""
+    """Moment of a linear stress over a round section, summed over the section: the strength is in the outermost
+    fibre."""
     scene, model = vineyard
     strength = plant_parameters.load_plant(scene.plants).peduncle.bend_strength.value
     radius = model.body_radius[model.body_parent[model.bunch_body], 1].astype(float)

@@ -1,7 +1,8 @@
-"""Hashes of what vinesim computes, to show that a change of its code changes no bit: ``python tests/support/fingerprints.py``
+"""Hashes of what vinesim computes, to show that a change of its code changes no bit: ``python
+tests/support/fingerprints.py``
 
-One line each for a push, a pick, a fall, a frame, a scan and messages. The hashes hold on one machine and with one set of
-dependencies only (kernels are compiled for the processor), so none is kept: run it before a change and after it, and
+One line each for a push, a pick, a fall, a frame, a scan and messages. The hashes hold on one machine and with one set
+of dependencies only (kernels are compiled for the processor), so none is kept: run it before a change and after it, and
 compare.
 """
 

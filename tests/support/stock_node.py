@@ -1,4 +1,5 @@
-"""A stock rclpy node with a context of its own, as a peer of the node under test; import it only where ROS is installed."""
+"""A stock rclpy node with a context of its own, as a peer of the node under test; import it only where ROS is
+installed."""
 
 from __future__ import annotations
 

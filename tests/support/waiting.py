@@ -13,7 +13,8 @@ POLL_PERIOD = 0.005
 
 
 def wait(condition: Callable[[], object], description: str, timeout: float = TIMEOUT) -> float:
-    """Block until ``condition()`` is true; return the time that took [s]. Fails with ``description`` after ``timeout`` [s]."""
+    """Block until ``condition()`` is true; return the time that took [s]. Fails with ``description`` after ``timeout``
+    [s]."""
     start = time.monotonic()
     while not condition():
         assert time.monotonic() < start + timeout, f"waited {timeout:g} s in vain for: {description}"

@@ -97,7 +97,8 @@ class Client:
         return tuple(sorted(self._client.remote_actors))
 
     def actor_pose(self, name: str) -> np.ndarray:
-        """Pose [7] of the base of this client's robot or of a remote one; ``KeyError`` if there is none of that name."""
+        """Pose [7] of the base of this client's robot or of a remote one; ``KeyError`` if there is none of that
+        name."""
         if name != self._client.name and name not in self._client.remote_actors:
             raise KeyError(f"no actor {name!r}; there are: {', '.join((self._client.name, *self.remote_actors))}")
         return self._client.physics.rigid.base_state(name)[0]

@@ -46,8 +46,8 @@ Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterab
 class Simulation:
     """A world that moves when :meth:`step` is called; nothing runs in the background.
 
-    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has been at rest for half a
-    second (``parameters.sleep_duration``) and wakes when something touches it; sleeping trees cost nothing.
+    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has been at rest for half
+    a second (``parameters.sleep_duration``) and wakes when something touches it; sleeping trees cost nothing.
     """
 
     def __init__(
@@ -222,7 +222,8 @@ class Simulation:
         self.wake(int(self.model.body_tree[body]))
 
     def cut(self, body: int) -> None:
-        """Cut a cane at the base of a body: what grows on it falls. The cut is the body's joint, not within a segment."""
+        """Cut a cane at the base of a body: what grows on it falls. The cut is the body's joint, not within a
+        segment."""
         self._check_body(body)
         self.physics.cut(body)
 

@@ -1,4 +1,5 @@
-"""Finger poses of a hand: how far thumb, index, middle, ring and little finger are bent, 0 straight to 1 all the way."""
+"""Finger poses of a hand: how far thumb, index, middle, ring and little finger are bent, 0 straight to 1 all the
+way."""
 
 from __future__ import annotations
 

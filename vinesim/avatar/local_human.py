@@ -39,7 +39,8 @@ class LocalHuman:
         self.physics.move_human(self.name, self.pose)
 
     def update(self, now: float) -> HumanUpdate:
-        """After a step: pose and velocity for other clients; busy hands are where they are, not at their controllers."""
+        """After a step: pose and velocity for other clients; busy hands are where they are, not at their
+        controllers."""
         self.haptics = self._feedback.update()
         self._hand_wrenches, pushing = self.physics.rigid.hand_wrenches(self.name)
         points, before = self.pose.points, self._sent_points

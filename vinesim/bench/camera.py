@@ -98,7 +98,7 @@ def embree_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
     import open3d as o3d
 
     rays = o3d.t.geometry.RaycastingScene()
-    rays.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+    rays.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))  # pyright: ignore[reportArgumentType, reportCallIssue] it does take arrays
     return rays
 
 
@@ -117,7 +117,7 @@ def camera() -> Iterator[Measurement]:
         import open3d as o3d
 
         vertices, faces = triangle_mesh(primitives)
-        scene, rays = embree_scene(vertices, faces), o3d.core.Tensor(_rays(info, pose))
+        scene, rays = embree_scene(vertices, faces), o3d.core.Tensor(_rays(info, pose))  # pyright: ignore[reportArgumentType, reportCallIssue] it does take arrays
         cases.append(lambda: scene.cast_rays(rays))
         peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
     raster, *pictures = median_cpu_times(*cases)

@@ -96,7 +96,8 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
     milliseconds = 1e3 * seconds
     owner = np.array([_stage_owner(name) for name, _ in physics.stages])
     awake, bunches = len(physics.plants.awake), len(model.bunch_body)
-    case = f"{count} robot{'s' * (count > 1)}, {awake} trees awake, {bunches} bunches, {contacts / MEASURED_STEPS:.0f} contacts"
+    robots = f"{count} robot{'s' * (count > 1)}"
+    case = f"{robots}, {awake} trees awake, {bunches} bunches, {contacts / MEASURED_STEPS:.0f} contacts"
     for share, text in (("", "tick"), ("MuJoCo", "MuJoCo's share"), ("ours", "ours"), ("rest", "the rest")):
         of = milliseconds[:, :-1][:, owner == share].sum(1) if share else milliseconds[:, -1]
         for name, percent in (("p50", 50), ("p99", 99)):

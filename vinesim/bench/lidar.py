@@ -67,7 +67,7 @@ def lidar() -> Iterator[Measurement]:
 
     vertices, faces = triangle_mesh(primitives)
     scene = embree_scene(vertices, faces)
-    tensor = o3d.core.Tensor(np.concatenate([np.broadcast_to(_STAND[:3].astype(np.float32), rays.shape), rays], 1))
+    tensor = o3d.core.Tensor(np.concatenate([np.broadcast_to(_STAND[:3].astype(np.float32), rays.shape), rays], 1))  # pyright: ignore[reportArgumentType, reportCallIssue] it does take arrays
     *ours, theirs = median_cpu_times(*cases.values(), lambda: scene.cast_rays(tensor))
     start = time.process_time()
     embree_scene(vertices, faces).cast_rays(tensor)

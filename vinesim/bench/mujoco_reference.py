@@ -24,8 +24,8 @@ from vinesim.scene.values import RobotSpec
 def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None = None) -> mujoco.MjModel:
     """All trees of ``model`` as ball-joint chains under ``integrator="discrete"``, contacts off.
 
-    ``damping`` [body] N m s/rad replaces the model's: our solver subtracts the damping that its scheme adds, MuJoCo does
-    not.
+    ``damping`` [body] N m s/rad replaces the model's: our solver subtracts the damping that its scheme adds, MuJoCo
+    does not.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = dt
@@ -64,8 +64,8 @@ class MujocoScene:
     given to ``rigid``, as to that of a :class:`vinesim.physics.step.Physics`. The scheme of ``discrete`` adds dt K of
     damping, which is subtracted from the model's, down to zero.
 
-    ``contact_time_constant`` [s] of every contact (solref); the default of MuJoCo, 0.02, is soft: at 3 m/s bodies overlap
-    by centimetres.
+    ``contact_time_constant`` [s] of every contact (solref); the default of MuJoCo, 0.02, is soft: at 3 m/s bodies
+    overlap by centimetres.
     """
 
     def __init__(
@@ -87,7 +87,8 @@ class MujocoScene:
                 kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
             made[body].add_geom(
                 type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
-                friction=contact_friction(mine.parameters.friction), solref=[0.02, 1], solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
+                friction=contact_friction(mine.parameters.friction), solref=[0.02, 1],
+                solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
             )  # fmt: skip
         world = spec.compile()
         if contact_time_constant is not None:

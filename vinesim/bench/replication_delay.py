@@ -102,7 +102,7 @@ class Pair:
 
         self.second.replicator.receive = overhear
 
-    def push(self, who: Client, **options: float) -> PushBunch:
+    def push(self, who: Client, **options: Any) -> PushBunch:
         """Let a robot push the bunch, once."""
         rest = _trace(who).centre()
         reach = PushBunch(who.robot, who.side_of(rest), lambda: rest, repeat=False, **options)
@@ -112,7 +112,8 @@ class Pair:
     def take_back(self) -> None:
         """Let whoever touches the tree take it from whoever has it, again and again: the rule that is not ours."""
         for client in self.clients:
-            client.replicator.send = functools.partial(_grab, client, client.replicator.send)
+            rule = functools.partial(_grab, client, client.replicator.send)
+            client.replicator.send = rule  # pyright: ignore[reportAttributeAccessIssue] a bench replaces the method
 
     def tick(self) -> None:
         """One tick of everybody."""
@@ -403,7 +404,7 @@ def _sync(delays: tuple[float, ...], fights: dict[tuple[float, bool], Rows]) -> 
             yield line(f"{at}: copy of a pushed bunch, p{share}", float(np.percentile(mine, share)), "mm")
         if delay == REST_AT:
             rest = 1e3 * np.linalg.norm(rows.bunch[-1, 0] - rows.bunch[-1, 1])
-            yield line(f"{at}: copy of a bunch that was pushed and rests", rest, "mm")
+            yield line(f"{at}: copy of a bunch that was pushed and rests", float(rest), "mm")
         moves = np.abs(rows.speed).max(1) > 0.02
         for what, which in (("shown", 1), ("copy", 2)):
             off = 1e3 * np.abs(rows.joints[moves, 0] - rows.joints[moves, which]).max(1)

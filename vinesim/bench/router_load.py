@@ -145,9 +145,9 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
     yield line("routers' CPU", routers, "cores")
     yield line("clients' CPU", clients, "cores")
     yield line("cores of the machine", len(os.sched_getaffinity(0)), "")
-    yield line("rate of a client's tick, 60 wanted", ticks, "Hz")
-    yield line("poses that reach a client", heard, "1/s")
-    yield line("routers' CPU for a pose delivered", 1e6 * routers / (heard * count), "us")
+    yield line("rate of a client's tick, 60 wanted", float(ticks), "Hz")
+    yield line("poses that reach a client", float(heard), "1/s")
+    yield line("routers' CPU for a pose delivered", float(1e6 * routers / (heard * count)), "us")
     if probe.returncode != 0:
         raise RuntimeError(f"the probe failed: {probe.stderr[-300:]}")
     sent, ages = json.loads(probe.stdout)

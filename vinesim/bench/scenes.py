@@ -110,7 +110,7 @@ def bar(name: str, first: int, count: int) -> RobotSpec:
 
 def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
     """Wake some trees [k] and let no tree fall asleep again."""
-    physics.sleep_monitor.quiet = -1.0
+    physics.sleep_monitor.rate = -1.0
     physics.plants.wake(trees)
     return physics
 

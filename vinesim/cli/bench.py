@@ -121,6 +121,18 @@ class NoSuchBench(ValueError):
     """There is no benchmark of that name; the text lists all."""
 
 
+def _measurements(name: str, plot: pathlib.Path | None) -> Iterator[Measurement]:
+    drawn = {"sync": _sync, "sensors": _sensors}.get(name)
+    try:
+        yield from drawn(plot) if drawn else BENCHES[name]()
+    except ModuleNotFoundError as missing:
+        if not (missing.name or "").startswith("vinesim.bench.support"):
+            raise
+        raise NoSuchBench(
+            f"bench {name} needs load generators that are not installed; run it in a checkout of vinesim"
+        ) from None
+
+
 def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None) -> int:
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
@@ -130,8 +142,7 @@ def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None) -> in
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        drawn = {"sync": _sync, "sensors": _sensors}.get(name)
-        for m in drawn(plot) if drawn else BENCHES[name]():
+        for m in _measurements(name, plot):
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

@@ -67,6 +67,7 @@ def run(
     seen = ground_truth.render_buffers(primitives, info, pose)
     truths = ground_truth.bunch_truths(primitives, view, seen)
     frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
+    assert frame.exact_depth is not None, "a camera that renders by itself gives exact depth"
     images = {
         "rgb": frame.rgb,
         "depth": depth_millimetres(frame.exact_depth),
@@ -113,7 +114,8 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
         x, y, yaw = (*_parse_place("--person", ",".join(parts), 3), 0.0)[:3]
         placed_people.append(PersonPlacement(x, y, yaw, posture))
     for text in crates:
-        crate = CratePlacement(*_parse_place("--crate", text, 4))
+        x, y, yaw, fill = (*_parse_place("--crate", text, 4), 0.0, 0.0)[:4]
+        crate = CratePlacement(x, y, yaw, fill)
         if not 0.0 <= crate.fill <= 1.0:
             raise UsageError(f"--crate {text}: the fill is {crate.fill:g}; give 0 (empty) to 1 (full)")
         placed_crates.append(crate)

@@ -224,7 +224,8 @@ class Client:
             touching |= bool(touched)
             settled = replicator.send(
                 now, pose, touched=touched, moving=moving, read=objects.read_state,
-                grabbed=objects.with_trees(detached), detached=detached, detached_roots=objects.cut_roots, is_changed=objects.is_changed,
+                grabbed=objects.with_trees(detached), detached=detached, detached_roots=objects.cut_roots,
+                is_changed=objects.is_changed,
                 pose_on_support=self.physics.support_tracker.pose_on_support,
                 wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip

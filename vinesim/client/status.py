@@ -24,7 +24,8 @@ class Status:
         sent: Callable[[], dict[str, int]] | None = None,
         task: Task | None = None,
     ) -> None:
-        """``sent`` gives the number of ROS messages sent so far by topic; ``task``: what the robot does, if anything."""
+        """``sent`` gives the number of ROS messages sent so far by topic; ``task``: what the robot does, if
+        anything."""
         self.client, self.rate_loop, self._task = client, rate_loop, task
         self._sent: Callable[[], dict[str, int]] = sent or dict
         self._before: dict[str, int] = {}

@@ -256,7 +256,8 @@ class Physics:
         self._body_q = None
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
-        """Apply in which pose trees rest at their owner, without waking them: ``joint_q`` [body of the tree, 4] each."""
+        """Apply in which pose trees rest at their owner, without waking them: ``joint_q`` [body of the tree, 4]
+        each."""
         for tree, rotations in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(rotations, np.float32))
         self.plants.put_to_sleep(np.array(trees, np.int32))

@@ -56,8 +56,8 @@ class Node:
     which they publish, ``controllers`` those that take trajectories. All topics but /clock stand under the namespace,
     tf too (as Nav2 does with several robots); a second node in the process should be made with ``clock=False``.
 
-    Raises :class:`ros_setup.RosUnavailableError`, :class:`interfaces.InterfacesError`, or :class:`ValueError` for a
-    name that ROS does not allow; each with one line of text.
+    Raises :class:`middleware.RosUnavailableError`, :class:`message_packages.InterfacesError`, or :class:`ValueError`
+    for a name that ROS does not allow; each with one line of text.
     """
 
     def __init__(

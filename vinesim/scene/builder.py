@@ -1,6 +1,7 @@
 """Rods to bodies: how a segment of a rod gets its mass, inertia and joint springs, and trees become a :class:`Model`.
 
-A segment of length h bends by half on either side of its middle, each half a spring 2EI/h. A joint is the two halves that
+A segment of length h bends by half on either side of its middle, each half a spring 2EI/h. A joint is the two halves
+that
 meet there in series: EI/h within a rod, 2EI/h at a clamp, which adds no half (with EI/h the tip is 12.8 % off), and
 between unlike segments what their halves give in series.
 """
@@ -63,7 +64,8 @@ class BunchSegments:
     """[n, max, 3] N m/rad, of the joint where a segment begins; the head's is the peduncle's."""
 
     def compound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, in the head's frame."""
+        """Mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, in the head's
+        frame."""
         along = self.length[:, None] * np.arange(self.mass.shape[1])
         centre = self.com + along[..., None] * [1.0, 0.0, 0.0]
         mass = self.mass.sum(1)
@@ -78,7 +80,8 @@ def segment_bunches(
     mass: np.ndarray, length: np.ndarray, radius: np.ndarray, berry_count: np.ndarray, seed: np.ndarray,
     rachis: plant_parameters.Rachis, stem_share: float,
 ) -> BunchSegments:  # fmt: skip
-    """Cut bunches [n] into segments that weigh what their own berries and stems weigh: a head and four to eight clusters.
+    """Cut bunches [n] into segments that weigh what their own berries and stems weigh: a head and four to eight
+    clusters.
 
     Args:
         mass: [n] kg.
@@ -310,8 +313,8 @@ def segment_properties(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Mass [...] kg, moments of inertia [..., 3] kg m^2 and half springs of tapered round segments of a rod.
 
-    The half springs are [..., 3] N m/rad each, near the start and far from it: twist, and bending by two axes. Each half
-    has the cross-section at its end of the segment, where the joints are.
+    The half springs are [..., 3] N m/rad each, near the start and far from it: twist, and bending by two axes. Each
+    half has the cross-section at its end of the segment, where the joints are.
 
     Args:
         length: [...] m.
@@ -338,7 +341,8 @@ def segment_properties(
 def solve_rest_pose(model: Model) -> Model:
     """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is in equilibrium.
 
-    Each spring must carry the weight that hangs below its joint, so its slack axes are turned by theta = torque / stiffness
+    Each spring must carry the weight that hangs below its joint, so its slack axes are turned by theta = torque /
+    stiffness
     (in joint axes), and ``joint_settled`` turns them back: drawn = rest * settled. Writes both fields of the model and
     returns it. The weight of a bunch with clusters is that of its head and its clusters. :class:`ValueError` if a
     joint has no stiffness.
@@ -375,7 +379,8 @@ def solve_rest_pose(model: Model) -> Model:
 
 
 def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
-    """One :class:`Model` of all trees, in their order; ``others`` are arrays of its further fields (``fixed_start=...``)."""
+    """One :class:`Model` of all trees, in their order; ``others`` are arrays of its further fields
+    (``fixed_start=...``)."""
     counts = {
         "tree": len(trees),
         "body": sum(len(t.bodies) + len(t.clusters) for t in trees),

@@ -39,7 +39,8 @@ def project_points(points: np.ndarray, info: CameraInfo) -> np.ndarray:
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth [height, width] m as the 16UC1 of REP-118: millimetres, 0 where nothing was measured or 16 bits overflow."""
+    """Depth [height, width] m as the 16UC1 of REP-118: millimetres, 0 where nothing was measured or 16 bits
+    overflow."""
     millimetres = np.where(np.isfinite(depth), depth * 1000.0, 0.0)
     return np.where(millimetres < MAX_MILLIMETRES, np.round(millimetres), 0.0).astype(np.uint16)
 

@@ -46,7 +46,8 @@ class CaneBuilder:
     damping_ratio: float | None = None
     """[1] Of the first bending mode (see :meth:`first_mode`); sets ``beta`` = 2 ratio / angular frequency."""
     beta: float | None = None
-    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. 0 unless this or the ratio is given."""
+    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. 0 unless this or the ratio is
+    given."""
     pose: np.ndarray | tuple[float, ...] = _HORIZONTAL
     """[7] m, 1: the base in the world (position, quaternion xyzw); the cane grows along its x axis."""
     base: Literal["clamped", "pinned"] = "clamped"

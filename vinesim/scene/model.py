@@ -37,8 +37,8 @@ class Model(StructOfArrays):
     """Pose in the world of the frame on which the root's joint sits."""
     tree_vine: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
     tree_core: np.ndarray = array("tree", unit="1", dtype=np.int32)
-    """How many of its bodies move while no actor is close; the rest are the berry clusters of its bunches, which are then
-    fused to their bunch as one *compound*. A tree without clusters is all core."""
+    """How many of its bodies move while no actor is close; the rest are the berry clusters of its bunches, which are
+    then fused to their bunch as one *compound*. A tree without clusters is all core."""
 
     # bodies
     body_tree: np.ndarray = array("body", unit="1", dtype=np.int32)

@@ -1,7 +1,8 @@
 """Parameters of the physics: one frozen value with the unit and the source of each number.
 
 It stands beside the scene's file format because a scene may override it, in a table ``[physics]``; the package
-``vinesim.physics`` reads it. Times are in seconds and distances in metres, so all of them keep their meaning when ``dt``
+``vinesim.physics`` reads it. Times are in seconds and distances in metres, so all of them keep their meaning when
+``dt``
 changes. READ: from the source named; DERIVED: computed from others; TUNED: chosen by experiment with this solver;
 GUESSED: nothing better is known.
 """
@@ -24,7 +25,8 @@ class ParameterError(ValueError):
 
 
 class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All numbers of the physics that a user may want to change. Raises :class:`ParameterError` if one is out of range."""
+    """All numbers of the physics that a user may want to change. Raises :class:`ParameterError` if one is out of
+    range."""
 
     # ------------------------------------------------------------------ whole world
     dt: Positive = 0.01
@@ -48,8 +50,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     contact_onset_duration: NotNegative = 0.03
     """[s] A tree is integrated with phi = 1 for so long after a contact with it began. TUNED."""
     stiff_tie_mass: Positive = 10.0
-    """[kg] A tree whose tie has a larger stiffness * dt^2 is integrated with phi = 1. TUNED: with phi below 1 such a tie
-    (1e5 N/m at 10 ms) rings and feeds energy into the cane."""
+    """[kg] A tree whose tie has a larger stiffness * dt^2 is integrated with phi = 1. TUNED: with phi below 1 such a
+    tie (1e5 N/m at 10 ms) rings and feeds energy into the cane."""
     max_held_bodies: Count = 16
     """Plant bodies that hands can hold at once."""
     max_hands_per_body: Count = 4
@@ -117,14 +119,16 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[m] Arm of the rolling resistance of a free bunch. GUESSED: two berries on which it lies are 10 mm apart and give
     way. Without it a bunch of spheres rolls on for ever."""
     bunch_contact_time: Positive = 0.02
-    """[s] Time constant of a free bunch's contacts (MuJoCo's solref). TUNED: with a longer one it never comes to rest."""
+    """[s] Time constant of a free bunch's contacts (MuJoCo's solref). TUNED: with a longer one it never comes to
+    rest."""
     bunch_contact_damping_ratio: Positive = 3.0
-    """[1] Damping ratio of the same. TUNED: with 1, a bunch that fell a metre into a crate leaves it at up to 110 m/s."""
+    """[1] Damping ratio of the same. TUNED: with 1, a bunch that fell a metre into a crate leaves it at up to 110
+    m/s."""
     bunch_pool_size: Count = 12
     """Free bodies that are kept ready for bunches; when all are taken, the world is compiled anew (some 10 ms)."""
     dormant_radius: Positive = 2.5
-    """[m] A dormant free bunch gets its body when an actor is this near on the ground plan. DERIVED: seconds before an arm
-    can reach it."""
+    """[m] A dormant free bunch gets its body when an actor is this near on the ground plan. DERIVED: seconds before an
+    arm can reach it."""
 
     # ------------------------------------------------------------------ robots
     base_slip: Positive = 0.01

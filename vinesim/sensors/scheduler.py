@@ -1,8 +1,9 @@
 """The sensing thread: it takes the latest snapshot, renders the sensors that are due, and drops what is late.
 
-Physics calls :meth:`SensorScheduler.submit` every step and never waits. Warp's launches release the interpreter lock, so
-rendering costs the physics thread the other core, not its step. A camera renders a whole frame at once. A lidar fires at
-every snapshot the shots that are due, and delivers a revolution after its last shot.
+Physics calls :meth:`SensorScheduler.submit` every step and never waits. Warp's launches release the interpreter lock,
+so
+rendering costs the physics thread the other core, not its step. A camera renders a whole frame at once. A lidar fires
+at every snapshot the shots that are due, and delivers a revolution after its last shot.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Actors without physics: scripted poses and trees on a real replicator. What the network does is measured with them.
 
-    python -m vinesim.bench.support.fake_client '{"connect": "tcp/127.0.0.1:7447", "puppets": [{"name": "ada", "place": [1, 0]}]}'
+    python -m vinesim.bench.support.fake_client '{"connect": "tcp/127.0.0.1:7447", "puppets": [{"name": "ada", "place":
+    [1, 0]}]}'
 
 Such a process answers each line on its input, a JSON object, with one line: ``{"who": "ada", "touch": [3]}`` lets it
 act, and every answer is its :meth:`Puppet.report`. It ends with its input.
@@ -130,7 +131,7 @@ class FakeClient:
         for fact, holds in inbox.records:
             self.facts[fact.object] = {"parent": fact.parent, "moving": fact.moving, "holds": holds, "pose": fact.pose}
         self.released += inbox.released
-        self.robots = inbox.robots
+        self.robots = dict(inbox.robots)
         grabbed, self.grabbing = self.grabbing, set()
         picked, self.picking = self.picking, set()
         self.carrying |= picked

@@ -57,7 +57,8 @@ def render(
     Examples:
       vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7
       vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
-      vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick --crate 1.8,0.75,0,0.4
+      vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick
+      --crate 1.8,0.75,0,0.4
     """  # a command line that can be copied
     from vinesim.cli.render import run
 

@@ -148,7 +148,8 @@ def bunch_masses(model: Model) -> np.ndarray:
 
 
 def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int]:
-    """Let the bunches that hang nearest to a crate fall into it until its ``fill`` is reached; returns their indices."""
+    """Let the bunches that hang nearest to a crate fall into it until its ``fill`` is reached; returns their
+    indices."""
     model, rigid = physics.model, physics.rigid
     inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
     wanted = crate.fill * HEAP_DENSITY * float(np.prod(inside))

@@ -1,7 +1,7 @@
 """The client's side of a sensor process, which renders for one robot and runs its ROS node.
 
 Rendering and publishing hold Python's interpreter lock for milliseconds at a time. In threads beside the loop they make
-its steps late (docs/decisions/senses-process.md has the figures), so they run in a process of their own. The loop
+its steps late (docs/decisions/sensor-process.md has the figures), so they run in a process of their own. The loop
 passes it one snapshot a step through shared memory and never waits for an answer.
 """
 

@@ -129,7 +129,8 @@ def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
     fits = (ground_clearance(model, places.reshape(-1, 2)) > BASE_CLEARANCE).reshape(places.shape[:2])
     if not fits.any():
         raise PlacementError(
-            f"no bunch of this vineyard can be pushed: none hangs {PUSH_HEIGHT[0]} to {PUSH_HEIGHT[1]} m high with {BASE_CLEARANCE} m of "
+            f"no bunch of this vineyard can be pushed: none hangs {PUSH_HEIGHT[0]} to {PUSH_HEIGHT[1]} m high "
+            f"with {BASE_CLEARANCE} m of "
             "room for a robot before it; choose another scene or seed"
         )
     distance = np.where(fits, np.linalg.norm(places - near, axis=-1), np.inf)

@@ -22,7 +22,8 @@ BUNCHES_PER_LAYER = 6
 
 
 def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> SwapPlan:
-    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room for it."""
+    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room for
+    it."""
     if max(full, empty) >= len(model.box_pose):
         raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
     here, legs = start[:2], []

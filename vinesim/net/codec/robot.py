@@ -95,5 +95,6 @@ def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     turn = check_rotation_vectors(np.array(base[3:6]) * TURN_LSB, "actor pose")
     velocity = np.frombuffer(payload, "i1", count, joints + 2 * count) * (base[12] * JOINT_RATE_LSB)
     return RobotUpdate(
-        actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:12]) * BASE_VELOCITY_LSB, position, velocity,
+        actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:12]) * BASE_VELOCITY_LSB,
+        position, velocity,
     )  # fmt: skip

@@ -99,7 +99,8 @@ class TreeStates:
 
 
 def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Rotation and rate steps [n, 3] each (whole numbers as floats), rate scales [k], rate units [n, 1] of the bodies."""
+    """Rotation and rate steps [n, 3] each (whole numbers as floats), rate scales [k], rate units [n, 1] of the
+    bodies."""
     if not (np.isfinite(joint_q).all() and np.isfinite(joint_qd).all()):
         raise MessageError("joint state of a tree is not finite")
     fastest = np.maximum.reduceat(np.abs(joint_qd).ravel(), 3 * (np.cumsum(bodies) - bodies))

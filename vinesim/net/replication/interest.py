@@ -66,7 +66,8 @@ def check_radius(near: float) -> float:
     """The radius [m] if a window covers it; ValueError with the bound otherwise."""
     if not 0.0 < near <= MAX_INTEREST_RADIUS:
         raise ValueError(
-            f"near = {near} m: must be above 0 and at most {MAX_INTEREST_RADIUS} m, what 3x3 cells of {CELL_SIZE} m cover"
+            f"near = {near} m: must be above 0 and at most {MAX_INTEREST_RADIUS} m, what 3x3 "
+            f"cells of {CELL_SIZE} m cover"
         )
     return float(near)
 

@@ -132,13 +132,14 @@ class Replicator:
 
         ``pose``: of this actor; its ``time`` is replaced. A spectator passes its viewpoint, without joints.
         ``read(object_id)``: joints ([n, 4], [n, 3] rad/s) of a tree, pose [7] and velocity [6] of another object;
-        called only for objects that a peer may need. ``touched``: objects in contact with this actor; boxes and bunches
-        only while they move in their parent's frame. ``moving``: objects that move by themselves; trees and boxes of
-        other owners are ignored. ``grabbed``: objects that this actor grabbed, picked or cut in this step;
-        ``detached``: those of them that left their plant. ``detached_roots(tree)``: bodies that were cut off a tree.
-        ``pose_on_support(object_id)``: parent frame and pose [7] in it of an object at rest. ``is_changed(tree)``:
-        picks or cuts have changed the tree, so that its state at rest is retained. ``wrenches``: wrench [6] of this
-        actor's hands on other clients' robots in this step, by robot and link.
+        called only for objects that a peer may need.
+        ``touched``: objects in contact with this actor; boxes and bunches only while they move in their parent's frame.
+        ``moving``: objects that move by themselves; trees and boxes of other owners are ignored.
+        ``grabbed``: objects that this actor grabbed, picked or cut in this step; ``detached``: those of them that left
+        their plant. ``detached_roots(tree)``: bodies that were cut off a tree.
+        ``pose_on_support(object_id)``: parent frame and pose [7] in it of an object at rest.
+        ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
+        ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
         """
         state = self._state
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)

@@ -40,7 +40,8 @@ _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LocalStep:
-    """What the own simulation reports about one step; see :meth:`vinesim.net.replication.replicator.Replicator.send`."""
+    """What the own simulation reports about one step; see
+    :meth:`vinesim.net.replication.replicator.Replicator.send`."""
 
     now: float
     """Own clock [s]."""
@@ -150,7 +151,7 @@ class Sender:
         self, stream: TreeStream | ObjectStream, active: tuple[int, ...], entries: list[ObjectRecord],
         listeners: np.ndarray, contact: list[bool], step: LocalStep,
     ) -> np.ndarray:  # fmt: skip
-        """Which objects to publish [k] bool: the prediction is wrong, or a listener, the claim or the contact is new."""
+        """Which objects to publish [k] bool: the prediction is wrong, or a listener, claim or contact is new."""
         silence = step.time - np.array([entry.published_at for entry in entries])
         error = stream.prediction_error(active, silence, step.read, step.detached_roots)
         due = dead_reckoning.needs_update(*error, silence)

@@ -183,11 +183,11 @@ class ObjectStream:
         self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
     ) -> tuple[np.ndarray, np.ndarray]:
         """Errors of the peers' copies by now [k] m and [k] rad; ``silence`` [k] s since the last state."""
-        unknown = np.full(7, np.inf), np.zeros(6)
+        unknown: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
         published = [self._published.get(object_id, unknown) for object_id in active]
         pose, velocity = np.array([pose for pose, _ in published]), np.array([velocity for _, velocity in published])
         pose[:, 3:] = np.where(np.isfinite(pose[:, 3:]), pose[:, 3:], self._pose[:, 3:])
-        predicted = _extrapolate_pose(pose, velocity, dead_reckoning.clamp_age(silence)[:, None])
+        predicted = _extrapolate_pose(pose, velocity, np.asarray(dead_reckoning.clamp_age(silence))[:, None])
         return np.linalg.norm(self._pose[:, :3] - predicted[:, :3], axis=1), dead_reckoning.angle_between(
             self._pose[:, 3:], predicted[:, 3:]
         )

@@ -116,7 +116,8 @@ class Bus(Protocol):
         ...
 
     def query(self, key: str, payload: bytes = b"") -> None:
-        """Send a query to all queryables that match ``key``; :meth:`replies` returns what comes back, if anything does."""
+        """Send a query to all queryables that match ``key``; :meth:`replies` returns what comes back, if anything
+        does."""
 
     def replies(self) -> list[Reply]:
         """Replies that arrived since the last call."""
@@ -163,7 +164,7 @@ class SampleStore:
 
     def take(self) -> list[tuple[str, bytes]]:
         """Remove and return all samples in order of arrival, without those beyond the depth of their key."""
-        taken = []
+        taken: list[tuple[int, str, bytes]] = []
         while True:
             try:
                 taken.append(self._samples.popleft())

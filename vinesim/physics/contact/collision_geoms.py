@@ -25,7 +25,8 @@ class RigidGeoms:
     size: np.ndarray
     """[geom, 3] as MuJoCo writes it for the kind."""
     half: np.ndarray
-    """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`PLANE_HALF_SIZE` and no height."""
+    """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`PLANE_HALF_SIZE` and no
+    height."""
     center: np.ndarray
     """[geom, 3] m, centre of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray

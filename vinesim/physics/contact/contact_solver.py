@@ -1,8 +1,8 @@
 """Contacts of plants with rigid bodies and with each other: one solve a step, shared by plants and rigid bodies.
 
 Both sides predict how fast they would move without contacts, and how an impulse changes that. The impulses that keep
-them apart are then found for both at once, so they feel equal and opposite forces in the same step. Solving them in turn
-with penalty springs instead (a *staggered* scheme) is unstable from 1e4 N/m on.
+them apart are then found for both at once, so they feel equal and opposite forces in the same step. Solving them in
+turn with penalty springs instead (a *staggered* scheme) is unstable from 1e4 N/m on.
 
 Stages: :meth:`ContactSolver.wake_near_trees` (``detection``: broadphase), the prediction of the plants,
 :meth:`ContactSolver.solve` (``detection``: narrowphase; ``impulse_solver``: islands and impulses).
@@ -29,9 +29,11 @@ class ContactSolver:
     ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to; ``solve()`` (after it)
     leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
 
-    Robots, people, boxes and free bunches wake the trees that they are near to. Static geoms (ground, poles, trunks) and
+    Robots, people, boxes and free bunches wake the trees that they are near to. Static geoms (ground, poles, trunks)
+    and
     other plants only hold back what moves already. What overlaps in the scene as generated is in contact only beyond
-    that. All numbers come from ``rigid.parameters``; of more contacts than ``contact_capacity``, the deepest are kept, and
+    that. All numbers come from ``rigid.parameters``; of more contacts than ``contact_capacity``, the deepest are kept,
+    and
     ``dropped_contacts`` and ``overflow_message`` report it.
     """
 
@@ -118,8 +120,8 @@ class ContactSolver:
     def _predict_impacted(self, awake: np.ndarray) -> None:
         """Integrate trees that are about to suffer an impact with phi = 1 from this step on.
 
-        The trapezoidal rule moves a body by the mean of its velocities before and after: a body hit from rest would give
-        way only half as far as it must, overlap, and be thrown out again.
+        The trapezoidal rule moves a body by the mean of its velocities before and after: a body hit from rest would
+        give way only half as far as it must, overlap, and be thrown out again.
         """
         if self.detection.counters[structs.IMPACTED_TREES]:
             impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
@@ -184,7 +186,8 @@ class ContactSolver:
     # ------------------------------------------------------------------ queries and updates between steps
 
     def nearest_body(self, points: np.ndarray, max_distance: float) -> tuple[float, int] | None:
-        """See :func:`vinesim.physics.contact.plant_capsules.nearest_body`; searches all trees near ``points`` [k, 3] m."""
+        """See :func:`vinesim.physics.contact.plant_capsules.nearest_body`; searches all trees near ``points`` [k, 3]
+        m."""
         low, high = points.min(0) - max_distance, points.max(0) + max_distance
         boxes = self.detection.tree_boxes
         trees = np.flatnonzero(((boxes.low <= high) & (low <= boxes.high)).all(1))

@@ -1,8 +1,8 @@
 """Collision detection of plants: boxes of trees and geoms, trees that actors are near, and candidates of contacts.
 
 The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then
-:meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for each
-listing of the rigid world: a bound launch costs a fifth of a plain one.
+:meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for
+each listing of the rigid world: a bound launch costs a fifth of a plain one.
 """
 
 from __future__ import annotations

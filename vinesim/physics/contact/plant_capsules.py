@@ -22,7 +22,8 @@ class PlantCapsules:
     body: np.ndarray
     """[capsule]"""
     bunch: np.ndarray
-    """[capsule] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left of it does not collide."""
+    """[capsule] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left of it does not
+    collide."""
     level: np.ndarray
     """[capsule] 0: always there; 1: while its tree is coarse; 2: while it is fine (see ``State.tree_fine``)."""
     start: np.ndarray
@@ -92,8 +93,8 @@ def nearest_body(
 ) -> tuple[float, int] | None:
     """The plant body nearest to one of some ``points`` [k, 3] m: distance [m] to its surface, and its number.
 
-    Searches ``trees`` [n], whose ``state.body_q`` must be current. Of a bunch the bunch's own body counts, whether or not
-    its clusters move. None if nothing is nearer than ``max_distance`` [m].
+    Searches ``trees`` [n], whose ``state.body_q`` must be current. Of a bunch the bunch's own body counts, whether or
+    not its clusters move. None if nothing is nearer than ``max_distance`` [m].
     """
     c = capsules
     first, end = c.tree_start[trees].tolist(), c.tree_start[trees + 1].tolist()

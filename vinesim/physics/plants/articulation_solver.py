@@ -1,8 +1,8 @@
 """Articulation solver: all plants of a vineyard as trees of bodies on ball joints, stepped with implicit springs.
 
 One step of the plants alone is ``predict()`` then ``integrate()``. A contact solver works in between: it reads
-``state.body_q`` and ``velocity_free``, asks for the ``impulse_response()`` of the bodies in contact, and integrates with
-the wrenches that it found. Trees that sleep cost nothing.
+``state.body_q`` and ``velocity_free``, asks for the ``impulse_response()`` of the bodies in contact, and integrates
+with the wrenches that it found. Trees that sleep cost nothing.
 
 A tree with berry clusters is *coarse* (each bunch one compound, its clusters riding on it) until ``refine()`` lets them
 move and ``coarsen()`` locks them again. ``cut()`` makes a body the floating root of what grows on it. All three are
@@ -48,7 +48,8 @@ def kernel_parameters(
 class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
-    ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than a
+    ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
+    a
     tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a contact
     began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
     ``predict()`` before them.
@@ -124,12 +125,13 @@ class ArticulationSolver:
         model, state = self.model, self.state
         trees, bodies = len(model.tree_first), len(model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """phi asked for each tree [tree]; set it as you like. 1 from the start where a tie is stiff (``stiff_tie_mass``)."""
+        """phi asked for each tree [tree]; set it as you like. 1 from the start where a tie is stiff
+        (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """Fastest joint that the last integration found [tree] rad/s, and m/s of what falls; NaN or above ``fault_rate``
-        for a tree that it stopped."""
+        """Fastest joint that the last integration found [tree] rad/s, and m/s of what falls; NaN or above
+        ``fault_rate`` for a tree that it stopped."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -312,8 +314,8 @@ class ArticulationSolver:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
 
         ``impulse_response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of
-        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees. A view, good until the
-        next call.
+        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees. A view, good until
+        the next call.
         """
         self._require_stepped(bodies)
         return self.launches.impulse_response(bodies)
@@ -463,8 +465,8 @@ class ArticulationSolver:
     def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
 
-        It pulls to ``tie_anchor`` of that tie, which starts where the point is; move it as you like. :class:`ValueError`
-        for a berry cluster, and if too many bodies are held, or this one in too many places.
+        It pulls to ``tie_anchor`` of that tie, which starts where the point is; move it as you like.
+        :class:`ValueError` for a berry cluster, and if too many bodies are held, or this one in too many places.
         """
         if body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]:
             raise ValueError(f"body {body} is a berry cluster, which cannot be held; hold its bunch")

@@ -84,7 +84,8 @@ class BerryClusters:
         solver.forward_kinematics(trees)
 
     def _apply_impact(self, trees: np.ndarray, bodies: np.ndarray, impulse: np.ndarray) -> None:
-        """Change joint rates of trees by impulses [k, 6] N s, N m s on bunches [k], about their origins, in their axes."""
+        """Change joint rates of trees by impulses [k, 6] N s, N m s on bunches [k], about their origins, in their
+        axes."""
         solver, state, launches = self._solver, self._solver.state, self._solver.launches
         solver.forward_kinematics(trees)
         axes = state.body_q[bodies, 3:].astype(float)

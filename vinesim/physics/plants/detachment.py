@@ -81,7 +81,8 @@ class DetachmentMonitor:
         return told
 
     def _detach_overloaded(self) -> None:
-        """Detach the bunches whose peduncles have been overloaded for long enough, on trees that this client simulates."""
+        """Detach the bunches whose peduncles have been overloaded for long enough, on trees that this client
+        simulates."""
         model = self.plants.model
         bunches = self._attached_bunches()
         if self.contact_solver.remote_trees.any():
@@ -161,7 +162,8 @@ class DetachmentMonitor:
     # ------------------------------------------------------------------ one at a time
 
     def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
-        """Detach one bunch; it keeps its pose and velocity. Call it between steps. :class:`ValueError` if it cannot be."""
+        """Detach one bunch; it keeps its pose and velocity. Call it between steps. :class:`ValueError` if it cannot
+        be."""
         if not 0 <= bunch < len(self._overloaded_steps):
             raise ValueError(f"no bunch {bunch}; there are 0 to {len(self._overloaded_steps) - 1}")
         if not self.plants.state.bunch_attached[bunch]:

@@ -50,7 +50,8 @@ class DeviceBuffers:
 
     Args:
         device: see :func:`find_device`.
-        interleave: how many trees lie side by side in copies that kernels work on, 0 for no copies. Unless given, 0 on the
+        interleave: how many trees lie side by side in copies that kernels work on, 0 for no copies. Unless given, 0 on
+        the
             CPU and :data:`WARP_SIZE` with a GPU.
     """
 

@@ -1,6 +1,7 @@
 """Faults: a tree whose motion is not finite or too fast is stopped, put to sleep and reported; the others go on.
 
-``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or beyond ``ArticulationSolver.fault_rate``: its joints stay
+``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or beyond
+``ArticulationSolver.fault_rate``: its joints stay
 where they were when the tick began, the last state that was sound. Here such trees are found after the integration.
 """
 

@@ -90,7 +90,8 @@ class KernelLaunches:
             self.changed = False
 
     def fill(self, struct: Any, **values: Any) -> Any:
-        """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named so."""
+        """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
+        so."""
         filled, arrays = struct(), self.buffers.arrays
         values = {"pitch": self.buffers.pitch} | values
         for field in structs.fields(struct):
@@ -130,7 +131,8 @@ class KernelLaunches:
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
         partitioned = {"index_list": "trees", "partitions": self._threads}
         self.predict = record(
-            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", self._forces, joints, "phi_used",
+            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", self._forces, joints,
+            "phi_used",
             self._bodies, self._factors, scratch, prediction, **partitioned,
         )  # fmt: skip
         self.integrate = record(
@@ -153,7 +155,8 @@ class KernelLaunches:
         joints, scratch = fill(s.JointState), fill(s.Scratch)
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self.factor_impact = self.record(
-            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", self._forces, joints, "impact_phi",
+            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", self._forces, joints,
+            "impact_phi",
             self._bodies, self._factors, scratch, prediction, index_list="trees",
         )  # fmt: skip
         self.apply_impulses = self.record(

@@ -17,7 +17,8 @@ class LevelOfDetail:
     """Refines the trees that an actor is near to or watches, and coarsens them when that is over."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` say when a tree is coarsened."""
+        """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` say when a tree is
+        coarsened."""
         p = parameters
         self.plants, self.rest_rate = plants, p.detail_rate
         self.fine_steps, self.rest_steps = p.steps(p.detail_duration), p.steps(p.detail_rest_duration)

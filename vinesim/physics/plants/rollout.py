@@ -1,14 +1,15 @@
 """Gradients through time: how a loss on the motion of trees depends on their springs, dampers, masses and first state.
 
-The kernels are those that :class:`vinesim.physics.plants.articulation_solver.ArticulationSolver` launches, compiled once more with their adjoints; here
+The kernels are those that :class:`vinesim.physics.plants.articulation_solver.ArticulationSolver` launches, compiled
+once more with their adjoints; here
 each tick has arrays of its own, so that the way back finds what the way there left. Checkpoints bound the memory: a run
 keeps only joints, every ``checkpoint`` ticks; on the way back each segment is run once more before its adjoint is. The
 loss is yours, in NumPy, PyTorch or by hand: :meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient`
 takes the loss's derivatives by them. docs/gradients.md shows it at work.
 
 The gradient is of the scheme as it steps, so it is exact where the scheme is smooth. It is not at the tick in which a
-joint passes ``fast_rate`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme itself
-damps that much, and asking for less changes nothing.
+joint passes ``fast_rate`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme
+itself damps that much, and asking for less changes nothing.
 """
 
 from __future__ import annotations
@@ -83,7 +84,8 @@ class Rollout:
         watch: bodies [k] whose motion the loss looks at; all that move unless given.
         fine: let the berry clusters of bunches move.
         dt: tick [s].
-        phi: see :class:`vinesim.physics.plants.articulation_solver.ArticulationSolver`; likewise ``fast_rate``, ``max_rate``, ``fault_rate`` and ``geometric_stiffness``.
+        phi: see :class:`vinesim.physics.plants.articulation_solver.ArticulationSolver`; likewise ``fast_rate``,
+        ``max_rate``, ``fault_rate`` and ``geometric_stiffness``.
         checkpoint: ticks between two states that the first run keeps. Memory is about 1.2 kB for each body and tick of
             one segment, and 56 B for each body and checkpoint.
         device: ``cpu``, ``cuda`` or ``cuda:N``.

@@ -1,6 +1,7 @@
 """Ties: springs and dampers that hold bodies at points of the world, the model's and those of hands.
 
-The ties of a body are adjacent in the arrays of the kernels. So behind the model's ties there are equal spans for bodies
+The ties of a body are adjacent in the arrays of the kernels. So behind the model's ties there are equal spans for
+bodies
 that are held: a body gets one, its own ties are copied to the front of it, and its hands take the places behind them.
 """
 

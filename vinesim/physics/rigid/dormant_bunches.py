@@ -1,7 +1,7 @@
 """Dormant free bunches: picked bunches that are known and drawn, but have no body while no actor is near.
 
-A client that joins late learns of a thousand picked bunches at once. A body for each would cost milliseconds to make and
-time in every step; an entry here costs nothing until :meth:`DormantBunches.activate` gives it a body.
+A client that joins late learns of a thousand picked bunches at once. A body for each would cost milliseconds to make
+and time in every step; an entry here costs nothing until :meth:`DormantBunches.activate` gives it a body.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Picked bunches as free bodies of MuJoCo: spheres and capsules on a body that is taken from a pool.
 
-Compiling a MuJoCo world takes some ten milliseconds, so each world has a pool of bodies that are asleep and touch nothing.
-A bunch that leaves its vine gets one of them, with all constants that MuJoCo derives from its mass and shapes.
+Compiling a MuJoCo world takes some ten milliseconds, so each world has a pool of bodies that are asleep and touch
+nothing. A bunch that leaves its vine gets one of them, with all constants that MuJoCo derives from its mass and shapes.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ MAX_GEOMS = 12
 PARKING_HEIGHT = -100.0
 """[m] Height of unused bodies of the pool: below the ground, where nothing is."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2]
-"""MuJoCo's constraint impedance. TUNED: with still harder contacts a bunch is held a few micrometres deep, and a hand that
-moves loses contact for a step: fingers that hold with 25 N are then 3 mm further, and the bunch falls."""
+"""MuJoCo's constraint impedance. TUNED: with still harder contacts a bunch is held a few micrometres deep, and a hand
+that moves loses contact for a step: fingers that hold with 25 N are then 3 mm further, and the bunch falls."""
 
 BODY_ARRAYS = (
     "body_mass", "body_ipos", "body_iquat", "body_inertia", "body_subtreemass", "body_sameframe", "body_invweight0",
@@ -131,8 +131,8 @@ def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsPar
 def activate(world: mujoco.MjModel, slot: int, bunch: FreeBunch, derived: mujoco.MjModel) -> None:
     """Give a body of the pool the mass and shapes of a bunch, with all constants that MuJoCo derives from them.
 
-    ``mj_setConst`` would derive some of them, but neither bounding volumes nor the collision bits of whole bodies; so they
-    are copied from ``derived``, the model of :func:`compile_alone`.
+    ``mj_setConst`` would derive some of them, but neither bounding volumes nor the collision bits of whole bodies; so
+    they are copied from ``derived``, the model of :func:`compile_alone`.
     """
     body = world.body(slot_name(slot)).id
     for name in BODY_ARRAYS:

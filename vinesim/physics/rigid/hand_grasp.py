@@ -1,8 +1,9 @@
 """Grasps of people's hands: what a hand holds, whether plant, box, bunch, robot or static geom.
 
-A rigid body is welded to the hand. A plant is held by a spring between the grasped point and the controller: the spring of
-the hand itself, solved implicitly with the plant's own, and the hand is placed on the plant. When a bunch is detached from
-its vine in a hand, the hand goes on holding it as a rigid body.
+A rigid body is welded to the hand. A plant is held by a spring between the grasped point and the controller: the spring
+of
+the hand itself, solved implicitly with the plant's own, and the hand is placed on the plant. When a bunch is detached
+from its vine in a hand, the hand goes on holding it as a rigid body.
 """
 
 from __future__ import annotations

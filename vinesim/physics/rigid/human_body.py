@@ -1,6 +1,7 @@
 """One person in MuJoCo's world: kinematic head, trunk and legs, and two hands on springs.
 
-A hand is a free body. It follows its controller until it touches something; then a spring pulls it to its controller, so
+A hand is a free body. It follows its controller until it touches something; then a spring pulls it to its controller,
+so
 that its force follows from how far it is held back: 100 N/m up to 100 N by default (CANOPIES D6.4, section 3.1.1). It
 holds rigid objects by a weld; what is lifted hangs from the same spring. Gravity does not act on a hand itself.
 
@@ -24,7 +25,8 @@ from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, co
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
 KINEMATIC_MASS = 1e4
-"""[kg, kg m^2] Mass and inertia of the kinematic parts. They are free bodies with a velocity, not bodies without joints:
+"""[kg, kg m^2] Mass and inertia of the kinematic parts. They are free bodies with a velocity, not bodies without
+joints:
 those have no velocity in MuJoCo, and a leg would sink centimetres into what it kicks. No force changes the motion of a
 body as heavy as this within a step, and each step starts from the prescribed poses."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2.0]
@@ -88,7 +90,8 @@ class HumanBody:
         if not (abs(square - 1.0) < 1e-3).all():
             worst = int(np.argmin(abs(square - 1.0) < 1e-3))
             raise HumanError(
-                f"human {self.spec.name!r}: {POINT_NAMES[worst]} is {points[worst]}; give seven finite numbers, position "
+                f"human {self.spec.name!r}: {POINT_NAMES[worst]} is {points[worst]}; give seven finite "
+                f"numbers, position "
                 "and unit quaternion (x, y, z, w)"
             )
         self._fingers = (*pose.left_fingers, *pose.right_fingers)

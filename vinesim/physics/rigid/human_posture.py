@@ -33,7 +33,8 @@ NECK_BELOW_EYES = -0.2
 
 
 def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
-    """Tracked points of a person of this ``height`` [m] who stands on ``root`` [7], hands before the hips, palms down."""
+    """Tracked points of a person of this ``height`` [m] who stands on ``root`` [7], hands before the hips, palms
+    down."""
 
     def at(x: float, y: float, z: float) -> np.ndarray:
         return frames.compose(root, frames.pose(np.array([x, y, z])))
@@ -47,7 +48,8 @@ def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
 
 
 def body_posture(height: float, pose: HumanPose) -> np.ndarray:
-    """Poses [part, 7] of :data:`BODY_PARTS` of a person of this ``height`` [m]; see :meth:`PostureSolver.body_parts`."""
+    """Poses [part, 7] of :data:`BODY_PARTS` of a person of this ``height`` [m]; see
+    :meth:`PostureSolver.body_parts`."""
     return PostureSolver(height).body_parts(pose)
 
 
@@ -110,7 +112,8 @@ class PostureSolver:
         return self._visual_parts.copy()
 
     def difference(self, start: tuple[np.ndarray, ...], goal: tuple[np.ndarray, ...]) -> np.ndarray:
-        """From poses to poses [k, 7]: translation [m], rotation vector [rad] in world axes and in start axes; [3, k, 3].
+        """From poses to poses [k, 7]: translation [m], rotation vector [rad] in world axes and in start axes; [3, k,
+        3].
 
         ``start`` and ``goal`` are given in pieces that are concatenated. The array is reused by the next call.
         """

@@ -44,7 +44,8 @@ def body_shapes(height: float) -> tuple[Shape, ...]:
     sole = 0.5 * ANKLE_HEIGHT * height
     legs = (
         limb(THIGH_LENGTH, 0.07), limb(SHANK_LENGTH, 0.05),
-        Shape("box", (0.13, 0.045, sole), frames.pose(np.array([0.06, 0.0, -0.5 * ANKLE_HEIGHT * height])), CLOTH_COLOR),
+        Shape("box", (0.13, 0.045, sole), frames.pose(np.array([0.06, 0.0, -0.5 * ANKLE_HEIGHT * height])),
+              CLOTH_COLOR),
     )  # fmt: skip
     half = 0.5 * TRUNK_LENGTH * height
     head = frames.pose(np.array([-EYES_TO_HEAD_BACK, 0.0, -EYES_TO_HEAD_DOWN]))

@@ -106,7 +106,8 @@ class WorldCore:
             raise ValueError(f"robot {name!r} has no link {link!r}; it has: {', '.join(robot.bodies)}") from None
 
     def _body_of_object(self, actor: str, link: str) -> int:
-        """MuJoCo body of a link of an actor, of a box (``box/3``), of a free bunch (``bunch/7``) or of the ``world``."""
+        """MuJoCo body of a link of an actor, of a box (``box/3``), of a free bunch (``bunch/7``) or of the
+        ``world``."""
         if actor in self._humans:
             return self._humans[actor].bodies[link]
         if actor in self._robots:
@@ -167,7 +168,8 @@ class WorldCore:
             for slot in range(slots):
                 free_bunch.add_slot(spec, slot)
             mj_model = recompile.compile_without_contacts(spec)
-        # MuJoCo's solver tolerance is relative to it: an actor that joins would change when the solver stops for all others
+        # MuJoCo's solver tolerance is relative to it: an actor that joins would change when the solver stops for all
+        # others
         mj_model.stat.meaninertia = 1.0
         for slot in range(slots):
             free_bunch.disable_collision(mj_model, slot)

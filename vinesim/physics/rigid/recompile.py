@@ -34,7 +34,8 @@ def object_names(m: mujoco.MjModel, address: np.ndarray) -> list[str]:
 def transfer_state(
     old: mujoco.MjModel, old_data: mujoco.MjData, old_contact: np.ndarray, new: mujoco.MjModel, unused: set[str]
 ) -> tuple[mujoco.MjData, np.ndarray]:
-    """State and contact forces [dof] of a new world: those of all joints and bodies of the old, and which of them sleep.
+    """State and contact forces [dof] of a new world: those of all joints and bodies of the old, and which of them
+    sleep.
 
     Args:
         old: MuJoCo's model so far.

@@ -2,8 +2,8 @@
 
 A step is split in two halves, with the contact solve of :mod:`vinesim.physics.contact.contact_solver` between them:
 :meth:`RigidWorld.predict` computes the velocity at the end of the step without contacts with plants,
-:meth:`RigidWorld.impulse_response` how an impulse changes that prediction, and :meth:`RigidWorld.integrate` integrates with
-the contact forces known.
+:meth:`RigidWorld.impulse_response` how an impulse changes that prediction, and :meth:`RigidWorld.integrate` integrates
+with the contact forces known.
 
 MuJoCo's integrator ``discrete`` is implicit in joint damping and in the servos: the effective mass of a step is
 M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where its servos give 40 N.
@@ -114,7 +114,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         return self.human(name).part_poses[_HIPS, :3] if name in self._humans else self.base_state(name)[0][:3]
 
     def penetrations(self) -> list[tuple[str, str, float]]:
-        """Pairs of actors or objects that overlapped when the step began, as :meth:`predict` found them, and depth [m]."""
+        """Pairs of actors or objects that overlapped when the step began, as :meth:`predict` found them, and depth
+        [m]."""
         m, d = self.mj_model, self.mj_data
         found = []
         for contact in d.contact:
@@ -184,7 +185,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         return self._effective_mass.is_constrained(self.mj_data, bodies)
 
     def impulse_response(self, J: np.ndarray) -> np.ndarray:
-        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see :class:`EffectiveMass`."""
+        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see
+        :class:`EffectiveMass`."""
         return self._effective_mass.impulse_response(self.mj_data, J)
 
     def integrate(self, force: np.ndarray | None = None) -> None:

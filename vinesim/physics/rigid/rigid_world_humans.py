@@ -1,4 +1,5 @@
-"""Motion of people and the grasps of their hands, by name; part of :class:`vinesim.physics.rigid.rigid_world.RigidWorld`."""
+"""Motion of people and the grasps of their hands, by name; part of
+:class:`vinesim.physics.rigid.rigid_world.RigidWorld`."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ class HumanAccess(WorldCore):
     # ------------------------------------------------------------------ grasps
 
     def grasp(self, name: str, side: str, actor: str, link: str) -> None:
-        """Weld a hand to a link of an actor, a box or a bunch at its present pose; names are those of ``RigidGeoms``."""
+        """Weld a hand to a link of an actor, a box or a bunch at its present pose; names are those of
+        ``RigidGeoms``."""
         hand, body = self.human(name).hand(side), self._body_of_object(actor, link)
         self.update_kinematics()
         pose = np.concatenate([self.mj_data.xpos[[body, hand.body]], self.mj_data.xquat[[body, hand.body]]], -1)
@@ -65,7 +67,8 @@ class HumanAccess(WorldCore):
         self._update_tables()
 
     def nearest_to_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
-        """What a hand can grasp: gap [m], actor and link of the nearest rigid body; None if none is nearer than ``reach``.
+        """What a hand can grasp: gap [m], actor and link of the nearest rigid body; None if none is nearer than
+        ``reach``.
 
         The ground and the person's own body are left out.
         """

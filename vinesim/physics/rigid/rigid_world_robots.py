@@ -1,4 +1,5 @@
-"""Commands to robots and measurements of them, by name; part of :class:`vinesim.physics.rigid.rigid_world.RigidWorld`."""
+"""Commands to robots and measurements of them, by name; part of
+:class:`vinesim.physics.rigid.rigid_world.RigidWorld`."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ class RobotAccess(WorldCore):
             damping: N m s/rad or N s/m.
             effort: N m or N, added within ``limit``.
             limit: N m or N, of the servos; that of the drive unless a lower one is given.
-            exact: bool, joints that swing with just this damping; the others are damped as if it were larger by dt times
+            exact: bool, joints that swing with just this damping; the others are damped as if it were larger by dt
+            times
                 stiffness, as stiff servos should be.
         """
         self.robot(name).set_gains(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
@@ -70,8 +72,8 @@ class RobotAccess(WorldCore):
     def set_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
         """Apply the wrenches [6] by link with which remote people push a robot, until the next call.
 
-        Force [N] and moment about the link's centre of mass [N m], world axes. :meth:`joint_measurements` counts them as
-        contacts. Raises :class:`RobotError` if a link does not exist.
+        Force [N] and moment about the link's centre of mass [N m], world axes. :meth:`joint_measurements` counts them
+        as contacts. Raises :class:`RobotError` if a link does not exist.
         """
         self.robot(name).set_remote_wrenches(self.mj_data, wrenches)
 
@@ -80,8 +82,8 @@ class RobotAccess(WorldCore):
     def joint_measurements(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Position, velocity, effort and contact effort of the drives, each [joint] in the order of ``spec.drives``.
 
-        The effort is that of the drive in the last step: servo and its share of gravity compensation. The contact effort
-        is J^T f of the contacts with plants and with rigid bodies; at rest the two cancel.
+        The effort is that of the drive in the last step: servo and its share of gravity compensation. The contact
+        effort is J^T f of the contacts with plants and with rigid bodies; at rest the two cancel.
         """
         robot, d = self.robot(name), self.mj_data
         return d.qpos[robot.q], d.qvel[robot.v], robot.transmitted_effort(d), self.contact_force[robot.v]
@@ -96,7 +98,8 @@ class RobotAccess(WorldCore):
         return self.mj_data.qfrc_gravcomp[self.robot(name).v]
 
     def joint_inertia(self, name: str) -> np.ndarray:
-        """[joint] kg m^2 or kg: inertia that each drive sees while the others stand, armature included, in this pose."""
+        """[joint] kg m^2 or kg: inertia that each drive sees while the others stand, armature included, in this
+        pose."""
         return self.mj_data.M[self.robot(name).inertia_index]
 
     def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:

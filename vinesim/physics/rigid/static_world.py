@@ -27,7 +27,8 @@ ALL_BITS = (1 << (LAST_ACTOR + 1)) - 1
 
 
 def contact_friction(coefficient: float, rolling_arm: float = 0.0001) -> list[float]:
-    """Friction of a geom as MuJoCo takes it: sliding [1], torsional [m] and rolling [m]; the last two need condim 4, 6."""
+    """Friction of a geom as MuJoCo takes it: sliding [1], torsional [m] and rolling [m]; the last two need condim 4,
+    6."""
     return [coefficient, 0.005, rolling_arm]
 
 

@@ -2,7 +2,8 @@
 
 Every object has a *support*: the ground, the box in which it lies, or the link of a robot that carries or grips it. An
 object that has been still in its support's frame for ``support_rest_duration`` is at rest, however the support moves: a
-bunch in a box, a box on a robot. It stays at rest until it has moved by more than a band. Then its support is determined
+bunch in a box, a box on a robot. It stays at rest until it has moved by more than a band. Then its support is
+determined
 anew among what it touches, the ground before all others: a box that is pushed along the ground is not supported by what
 pushes it. Hands of people are no supports: their copies on other clients are not exact enough.
 """
@@ -20,9 +21,11 @@ from vinesim.scene.ids import ObjectKind, object_id, parse_object_name
 STILL_BAND = 0.005, float(np.radians(1.0))
 """[m, rad] An object that moves and turns less than this in its support's frame is still. TUNED."""
 CARRIED_BAND = 0.015, float(np.radians(5.0))
-"""[m, rad] The same on a robot's link: what it carries is shaken, and is not sent while it stays near its place. TUNED."""
+"""[m, rad] The same on a robot's link: what it carries is shaken, and is not sent while it stays near its place.
+TUNED."""
 SHAKEN_BAND = 0.05, float(np.radians(30.0))
-"""[m, rad] The same in a box that moves, where bunches rock and roll; in a box at rest :data:`STILL_BAND` counts. TUNED."""
+"""[m, rad] The same in a box that moves, where bunches rock and roll; in a box at rest :data:`STILL_BAND` counts.
+TUNED."""
 
 GROUND = ""
 """Name of the ground as a support; boxes are ``box/3``, links ``actor/link``."""
@@ -34,8 +37,8 @@ _NONE = -1
 class SupportTracker:
     """Poses, velocities and supports of all boxes and free bunches, and which of them are at rest.
 
-    Objects are named by :func:`vinesim.scene.ids.object_id`. Per object, the tracker counts the steps for which it has stayed
-    within its band about an anchor pose in its support's frame.
+    Objects are named by :func:`vinesim.scene.ids.object_id`. Per object, the tracker counts the steps for which it has
+    stayed within its band about an anchor pose in its support's frame.
     """
 
     def __init__(self, rigid: RigidWorld) -> None:
@@ -60,7 +63,8 @@ class SupportTracker:
     # ------------------------------------------------------------------ the tick
 
     def update(self) -> None:
-        """After a step: find out which objects are still in their support's frame; determine the supports of the others."""
+        """After a step: find out which objects are still in their support's frame; determine the supports of the
+        others."""
         self._update_tables()
         d, move_speed = self.rigid.mj_data, self.rigid.parameters.support_move_speed
         self._still_steps += 1
@@ -100,7 +104,8 @@ class SupportTracker:
 
     @property
     def touched(self) -> list[tuple[int, str]]:
-        """(object, actor) for every moving object that is touched by robots, people, boxes (``box/3``) or free bunches."""
+        """(object, actor) for every moving object that is touched by robots, people, boxes (``box/3``) or free
+        bunches."""
         self._update_tables()
         if self._touched is None:
             self._touched = self._list_touched()

@@ -44,7 +44,8 @@ def check(spec: RobotSpec) -> None:
 
 @functools.lru_cache(16)  # robots of one kind share it
 def collision_urdf(urdf: str, driven: frozenset[str]) -> str:
-    """The URDF that MuJoCo compiles: without visuals; joints that are neither ``driven`` nor mimic another are fixed."""
+    """The URDF that MuJoCo compiles: without visuals; joints that are neither ``driven`` nor mimic another are
+    fixed."""
     root = ElementTree.fromstring(urdf)
     for link in root.iter("link"):
         for visual in link.findall("visual"):

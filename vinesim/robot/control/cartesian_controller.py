@@ -231,7 +231,8 @@ def _solve_task_stack(
 
 
 def _damped_inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pseudo-inverse [joint, k] with small singular values damped, and the projector [joint, joint] on its row space."""
+    """Pseudo-inverse [joint, k] with small singular values damped, and the projector [joint, joint] on its row
+    space."""
     u, s, vt = np.linalg.svd(matrix, full_matrices=False)
     damping = np.where(
         s < MIN_SINGULAR_VALUE, (1.0 - (s / MIN_SINGULAR_VALUE) ** 2) * (0.5 * MIN_SINGULAR_VALUE) ** 2, 0.0

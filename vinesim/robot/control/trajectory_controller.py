@@ -23,7 +23,8 @@ from vinesim.robot.drives.controlled_robot import Robot
 
 
 class Outcome(enum.IntEnum):
-    """How a goal ended: error codes of control_msgs/action/FollowJointTrajectory, and two for which ROS has goal states."""
+    """How a goal ended: error codes of control_msgs/action/FollowJointTrajectory, and two for which ROS has goal
+    states."""
 
     SUCCESSFUL = 0
     INVALID_GOAL = -1
@@ -85,7 +86,8 @@ class Trajectory:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ControllerState:
-    """Desired and actual joint states (control_msgs/JointTrajectoryControllerState), each [joint] rad or m, or per s."""
+    """Desired and actual joint states (control_msgs/JointTrajectoryControllerState), each [joint] rad or m, or per
+    s."""
 
     time: float
     joints: tuple[str, ...]

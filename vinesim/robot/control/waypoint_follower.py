@@ -24,7 +24,8 @@ class WaypointFollower:
     """Drives a robot's base along points, one straight leg after the other, forwards or in reverse."""
 
     def __init__(
-        self, robot: Robot, points: np.ndarray, heading: float | None = None, *, speed: float = 0.5, turn_rate: float = 0.4,
+        self, robot: Robot, points: np.ndarray, heading: float | None = None, *, speed: float = 0.5,
+        turn_rate: float = 0.4,
         reverse: bool = False,
     ) -> None:  # fmt: skip
         """``points`` [n, 2] m in the world, ``heading`` [rad] at the end (that of the last leg unless

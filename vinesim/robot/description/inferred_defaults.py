@@ -30,7 +30,8 @@ def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGro
 
 
 def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
-    """A D435 in the first optical frame (colour before others), else in the first link named a camera; adds to ``notes``.
+    """A D435 in the first optical frame (colour before others), else in the first link named a camera; adds to
+    ``notes``.
 
     If there is no optical frame, one is added to ``root``.
     """

@@ -101,7 +101,8 @@ def check_joints(robot: yourdfpy.Robot, file: pathlib.Path) -> None:
 
 
 def check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: pathlib.Path, notes: list[str]) -> None:
-    """Raise :class:`DescriptionError` unless all that moves has mass and inertia, and every inertia is positive definite.
+    """Raise :class:`DescriptionError` unless all that moves has mass and inertia, and every inertia is positive
+    definite.
 
     Inertias that violate the triangle inequality are added to ``notes``.
     """

@@ -1,1 +1,2 @@
-"""Robots in the world: joint servos, base, gripper, cutters, odometry, body sensors; copies of other clients' robots."""
+"""Robots in the world: joint servos, base, gripper, cutters, odometry, body sensors; copies of other clients'
+robots."""

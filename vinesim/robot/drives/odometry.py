@@ -11,7 +11,8 @@ class TrackOdometry:
     """Pose since the start, integrated from the travel of tracks of which the ground loses a constant share."""
 
     def __init__(self, linear_slip: float, angular_slip: float, pose: np.ndarray) -> None:
-        """``linear_slip``, ``angular_slip``: shares of the travel that are lost, 0 to below 1; ``pose`` [7] at start."""
+        """``linear_slip``, ``angular_slip``: shares of the travel that are lost, 0 to below 1; ``pose`` [7] at
+        start."""
         self._gain = 1.0 / (1.0 - linear_slip), 1.0 / (1.0 - angular_slip)
         self._actual = float(pose[0]), float(pose[1]), frames.to_yaw(pose[3:])
         self._measured = 0.0, 0.0, 0.0

@@ -53,7 +53,8 @@ CARRY_POSITION = np.array([0.45, 0.12, 1.20])
 CLEARANCE_ABOVE_RIM = 0.50
 """[m] Height above the rim of the box from which the hand descends. GUESSED"""
 RELEASE_HEIGHT = 0.19
-"""[m] Height of the hand above the bottom of the box at release: vinebot's arm reaches no deeper beside its base, and the lower end of a bunch hangs some 0.12 m below the hand.
+"""[m] Height of the hand above the bottom of the box at release: vinebot's arm reaches no deeper beside its base, and
+the lower end of a bunch hangs some 0.12 m below the hand.
 """
 CARRY_SPEED = 0.20
 """[m/s] Speed of a hand that carries a bunch. GUESSED"""

@@ -1,7 +1,8 @@
 """A monitor of ROS topics: subscribes with stock rclpy and reports counts, rates, latencies and losses.
 
 ``python -m vinesim.ros.tools.topic_monitor --seconds 10`` subscribes to every topic (``--topic`` names some) and
-prints one JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here (the age,
+prints one JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here
+(the age,
 for what was latched), the messages lost (gaps in the publisher's numbering) and whether the stamps ever went back.
 Without ``--seconds`` it runs until its standard input is closed.
 

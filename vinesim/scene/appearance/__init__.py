@@ -1,6 +1,7 @@
 """What people and crates look like: shapes read from ``data/figures``, in the frames of the links that carry them.
 
-An appearance does not depend on the renderer: a part is a few round cones, ellipsoids, boxes, cylinders and lofts (meshes
+An appearance does not depend on the renderer: a part is a few round cones, ellipsoids, boxes, cylinders and lofts
+(meshes
 through rings), each with a colour and a surface by name. The bodies that touch are others, and belong to the physics.
 """
 

@@ -47,7 +47,8 @@ def sample_fruit(
     hull = berries.hull_size(count, seed) * size[..., None]
     drawn = {
         "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,
-        "pull": peduncle.pull.at(uniform(MAX_BUNCHES)), "thick": 0.5 * peduncle.diameter.at(_fraction(mass, fruit.mass_range)),
+        "pull": peduncle.pull.at(uniform(MAX_BUNCHES)),
+        "thick": 0.5 * peduncle.diameter.at(_fraction(mass, fruit.mass_range)),
     }  # fmt: skip
 
     # opposite the third to sixth leaf and one or two nodes further on, never both on one piece's tip

@@ -115,7 +115,8 @@ def _allocate(count: int) -> Bodies:
 
 
 def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
-    """Parents [shoot, segment] of a rod that grows on slot ``first`` [shoot]; ``chain`` [segment - 1] are its own slots."""
+    """Parents [shoot, segment] of a rod that grows on slot ``first`` [shoot]; ``chain`` [segment - 1] are its own
+    slots."""
     return np.concatenate([first[:, None], np.broadcast_to(chain, (len(first), len(chain)))], 1)
 
 

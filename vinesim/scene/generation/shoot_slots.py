@@ -1,6 +1,7 @@
 """Slots of the table of shoots: which column holds which segment, bunch or cluster.
 
-Every shoot has the same slots: main axis, lateral, and for each of two bunches its peduncle, the bunch and its clusters.
+Every shoot has the same slots: main axis, lateral, and for each of two bunches its peduncle, the bunch and its
+clusters.
 """
 
 from __future__ import annotations

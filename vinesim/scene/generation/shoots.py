@@ -115,7 +115,8 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     leaf_uniform = np.moveaxis(uniform(MAX_NODES + LATERAL_NODES, 4), -1, 0)
     return Shoots(
         vine=owner, up=up, points=points, length=length, base=base, has_lateral=has_lateral, lateral_at=lateral_at,
-        lateral_points=lateral_points, has_bunch=chosen, bunch_at=at, peduncle=peduncle, bunch_axis=bunch_axis, bunch_up=bunch_up, fruit=fruit,
+        lateral_points=lateral_points, has_bunch=chosen, bunch_at=at, peduncle=peduncle, bunch_axis=bunch_axis,
+        bunch_up=bunch_up, fruit=fruit,
         nodes=nodes, leaf_normal=leaf_normal, leaf_uniform=leaf_uniform,
     )  # fmt: skip
 

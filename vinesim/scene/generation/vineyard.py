@@ -1,6 +1,7 @@
 """From a scene to a model: poles, wires and old wood stand fixed; every shoot is a tree with leaves and bunches.
 
-Shoots are rows of a table with the same slots each (:mod:`~vinesim.scene.generation.shoot_slots`); what a shoot does not have
+Shoots are rows of a table with the same slots each (:mod:`~vinesim.scene.generation.shoot_slots`); what a shoot does
+not have
 is masked out at the end, so nothing loops over plants except the drawing of random numbers. Each vine rngs from its own
 stream, named by (seed, row, place): the numbers of a vine do not depend on how many others there are.
 """
@@ -38,7 +39,8 @@ def generate(scene: Scene) -> Model:
 
 
 def _assemble_model(
-    scene: Scene, parameters: VineParameters, structure: FixedStructure, shoots: Shoots, bodies: Bodies, leaf: dict[str, np.ndarray],
+    scene: Scene, parameters: VineParameters, structure: FixedStructure, shoots: Shoots, bodies: Bodies,
+    leaf: dict[str, np.ndarray],
     ties: dict[str, np.ndarray],
 ) -> Model:  # fmt: skip
     """Leave out what is masked, number the rest, and make drawn world poses relative."""

@@ -1,7 +1,8 @@
 """RGB-D cameras: a picture, labels, exact depth, and depth as the sensor measures it.
 
 Depth follows REP-118: metres along the optical axis; -Inf nearer than the sensor can measure, +Inf farther than it can,
-which includes the open sky; NaN for a pixel that should have measured and did not (:mod:`vinesim.sensors.camera.stereo`).
+which includes the open sky; NaN for a pixel that should have measured and did not
+(:mod:`vinesim.sensors.camera.stereo`).
 """
 
 from __future__ import annotations

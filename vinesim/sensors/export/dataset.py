@@ -63,7 +63,8 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
     width, height = size or (int(spec.width.value), int(spec.height.value))
     if not (MIN_IMAGE_SIZE <= width <= MAX_IMAGE_SIZE and MIN_IMAGE_SIZE <= height <= MAX_IMAGE_SIZE):
         raise SensorError(
-            f"size is {width}x{height}; give WxH from {MIN_IMAGE_SIZE}x{MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}x{MAX_IMAGE_SIZE}"
+            f"size is {width}x{height}; give WxH from {MIN_IMAGE_SIZE}x{MIN_IMAGE_SIZE} to "
+            f"{MAX_IMAGE_SIZE}x{MAX_IMAGE_SIZE}"
         )
     if size is None:
         return spec.info("camera_optical_frame")

@@ -123,7 +123,8 @@ def render_overview(
 ) -> np.ndarray:
     """A picture of a scene [height, width, 3]; written to ``out`` if given.
 
-    ``pose`` [7] is the optical frame (default :func:`overview_pose`), ``view_angle`` the horizontal field of view [rad].
+    ``pose`` [7] is the optical frame (default :func:`overview_pose`), ``view_angle`` the horizontal field of view
+    [rad].
     """
     primitives = primitives or Primitives(model)
     primitives.update(snapshot)

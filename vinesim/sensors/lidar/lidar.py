@@ -122,7 +122,8 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class RayGrid(Protocol):
-    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer` unless another one is given."""
+    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer` unless
+    another one is given."""
 
     direction: wp.array
     """[column * row] unit vectors in the head's frame."""

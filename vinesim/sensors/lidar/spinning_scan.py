@@ -36,7 +36,8 @@ class PoseHistory:
         del self._times[:old], self._poses[:old]
 
     def interpolate(self, times: np.ndarray) -> np.ndarray:
-        """Poses [k, 7] at ``times`` [k] s, linear between known poses (normalised quaternions), constant beyond them."""
+        """Poses [k, 7] at ``times`` [k] s, linear between known poses (normalised quaternions), constant beyond
+        them."""
         known = np.asarray(self._times)
         poses = np.stack(self._poses)
         after = np.clip(np.searchsorted(known, times), 1, max(len(known) - 1, 1))

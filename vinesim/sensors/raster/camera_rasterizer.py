@@ -1,4 +1,5 @@
-"""Camera rasterisation on the CPU, or by the renderer of the scene: keys, depth, labels and primitive of every pixel."""
+"""Camera rasterisation on the CPU, or by the renderer of the scene: keys, depth, labels and primitive of every
+pixel."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Everything a camera or lidar can see, as analytic primitives carried by plant bodies and rigid bodies.
 
 :class:`Primitives` is built once from a :class:`~vinesim.scene.model.Model` and follows the world through
-:meth:`Primitives.update`: one Warp launch moves the clusters of the trees and rigid bodies that moved, and nothing else.
+:meth:`Primitives.update`: one Warp launch moves the clusters of the trees and rigid bodies that moved, and nothing
+else.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ _SKY_OF_RIGID = 0.7
 
 
 class Primitives:
-    """All primitives of a vineyard and its actors, posed in the world (see :mod:`vinesim.kernels.raster.primitives`)."""
+    """All primitives of a vineyard and its actors, posed in the world (see
+    :mod:`vinesim.kernels.raster.primitives`)."""
 
     def __init__(
         self,
@@ -53,7 +55,8 @@ class Primitives:
         """
         self.model, self.device, self._ripeness = model, device, ripeness
         self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
-        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer` does so itself."""
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`
+        does so itself."""
         bodies = len(model.body_mass)
         self._static_carrier = bodies
         """Carrier of the static scene; those of rigid bodies follow it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from typing import cast
 
 import numpy as np
 
@@ -121,7 +122,7 @@ def _load_mesh(file: str, scale: tuple[float, ...]) -> Mesh:
 
         if not pathlib.Path(file).is_file():
             raise ValueError(f"mesh file {file!r} of a link does not exist; give an absolute path")
-        mesh = trimesh.load(file, force="mesh", process=True)
+        mesh = cast("trimesh.Trimesh", trimesh.load(file, force="mesh", process=True))
         vertices, faces = np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces)
         if np.prod(scale) < 0.0:
             faces = faces[:, ::-1]

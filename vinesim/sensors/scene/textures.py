@@ -164,7 +164,8 @@ def soil_texture() -> np.ndarray:
     for x, y, turn, length in zip(*rng.uniform(size=(4, 90)), strict=True):
         start = np.array([x, y]) * TEXTURE_SIZE
         step = (6.0 + 14.0 * length) * np.array([np.cos(np.pi * turn), np.sin(np.pi * turn)])
-        cv2.line(straw, *(tuple(map(int, p)) for p in (start, start + step)), 1.0, 1, cv2.LINE_AA)
+        end = start + step
+        cv2.line(straw, (int(start[0]), int(start[1])), (int(end[0]), int(end[1])), (1.0,), 1, cv2.LINE_AA)
     height = 0.5 * clods + 0.35 * sod
     slope_y, slope_x = (0.5 * (np.roll(height, -1, axis) - np.roll(height, 1, axis)) for axis in (0, 1))
     tone = np.clip(0.45 + 0.17 * clods + 0.5 * straw, 0.0, 1.0)
