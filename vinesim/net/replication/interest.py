@@ -82,5 +82,5 @@ def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.
 
 
 def is_full_rate(distance: float, now: bool) -> bool:
-    """Whether the poses of an actor at ``distance`` [m] are received at the full rate, given whether they are ``now``."""
+    """Whether an actor at ``distance`` [m] sends its poses at the full rate here, given whether it does ``now``."""
     return distance <= (REDUCED_RATE_DISTANCE if now else FULL_RATE_DISTANCE)

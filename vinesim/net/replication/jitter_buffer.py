@@ -66,7 +66,7 @@ class JitterBuffer:
         return (1.0 - share) * self.rates[before] + share * self.rates[after]
 
     def _between(self, now: float) -> tuple[int, int, float, float]:
-        """Indices of the samples around what is shown (equal at an end), the share between them, time since the first."""
+        """Indices of the two samples around ``now``, equal at an end; the share between them; time since the first."""
         time = now - self.delay
         after = bisect.bisect_right(self.times, time)
         if after in (0, len(self.times)):
