@@ -234,7 +234,7 @@ class Recorder:
                 self._full_rate[name] = publisher, None
 
     def _has_company(self, name: str) -> bool:
-        """Whether another actor may be the subscriber; else it is a recorder, and two would keep each other subscribed."""
+        """Whether another actor may be the subscriber. If not, it is a recorder, and two of them would never end."""
         if name not in self._positions:
             return False
         away = [
