@@ -187,7 +187,7 @@ def test_a_journal_that_is_none_is_left_alone(tmp_path):
 
 
 def test_a_client_of_another_scene_is_refused_by_both_digests():
-    with Server("tcp/127.0.0.1:0", plan=SceneId("vsp", "0123456789abcdef")) as server:
+    with Server("tcp/127.0.0.1:0", scene=SceneId("vsp", "0123456789abcdef")) as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "ada", "--no-ros", "--seconds", "1"]
         refused(vinesim(*arguments), 4, "'ada'", "'demo'", "'vsp'", "0123456789abcdef", "scene and seed")
 

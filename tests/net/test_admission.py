@@ -16,7 +16,7 @@ def ask(agreement, name, digest="D1", *, world="w", session="", scene="vsp", now
     session = session or name
     agreement.on_join(world, name, session)
     hello = messages.encode_hello(Hello(name, scene=scene, digest=digest))
-    return agreement.answer(world, name, session, hello, now)
+    return agreement.decide(world, name, session, hello, now)
 
 
 def test_the_first_decides_the_scene_and_another_is_refused_by_both_names():
@@ -53,23 +53,23 @@ def test_a_server_with_a_scene_lets_in_no_other():
 def test_another_protocol_is_refused_by_both_numbers():
     hello = bytearray(messages.encode_hello(Hello("ada")))
     hello[2] = 9
-    why = AdmissionControl().answer("w", "ada", "s", bytes(hello), 0.0).refused
+    why = AdmissionControl().decide("w", "ada", "s", bytes(hello), 0.0).refused
     assert "version 9" in why
     assert f"version {messages.PROTOCOL}" in why
     inner = messages.encode_hello(msgspec.structs.replace(Hello("ada"), protocol=7))
-    assert "version 7" in AdmissionControl().answer("w", "ada", "s", inner, 0.0).refused
+    assert "version 7" in AdmissionControl().decide("w", "ada", "s", inner, 0.0).refused
 
 
 @pytest.mark.parametrize(
     "greeting", [b"", b"VS", b"nonsense", messages.encode_hello(Hello("ada"))[:-3], bytes(1 << 21)]
 )
 def test_what_is_no_greeting_is_refused_in_words(greeting):
-    assert "cannot be read" in AdmissionControl().answer("w", "ada", "s", greeting, 0.0).refused
+    assert "cannot be read" in AdmissionControl().decide("w", "ada", "s", greeting, 0.0).refused
 
 
 def test_nobody_comes_under_another_name():
     hello = messages.encode_hello(Hello("bob"))
-    assert "introduces itself as 'bob'" in AdmissionControl().answer("w", "ada", "s", hello, 0.0).refused
+    assert "introduces itself as 'bob'" in AdmissionControl().decide("w", "ada", "s", hello, 0.0).refused
 
 
 def test_a_name_has_one_bearer_and_asking_twice_is_no_harm():
@@ -84,7 +84,7 @@ def test_a_name_has_one_bearer_and_asking_twice_is_no_harm():
 
 
 def test_there_is_room_for_so_many():
-    agreement = AdmissionControl(most=2)
+    agreement = AdmissionControl(max_actors=2)
     assert not ask(agreement, "ada").refused
     assert not ask(agreement, "bob", world="another").refused
     assert "room for 2" in ask(agreement, "eve").refused
@@ -94,16 +94,16 @@ def test_there_is_room_for_so_many():
 
 
 def test_who_was_let_in_and_never_came_holds_no_place():
-    agreement = AdmissionControl(most=1)
+    agreement = AdmissionControl(max_actors=1)
     hello = messages.encode_hello(Hello("ghost"))
-    assert not agreement.answer("w", "ghost", "g", hello, 0.0).refused
+    assert not agreement.decide("w", "ghost", "g", hello, 0.0).refused
     assert ask(agreement, "ada", now=1.0).refused
     assert not ask(agreement, "ada", now=PROVISIONAL_TIMEOUT + 1.0).refused
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["D1", "D2"]), st.booleans()), max_size=40))
 def test_all_who_are_in_share_one_vineyard_whoever_comes_and_goes(events):
-    agreement, inside = AdmissionControl(most=2), {}
+    agreement, inside = AdmissionControl(max_actors=2), {}
     for name, digest, leaves in events:
         if leaves:
             agreement.on_leave("w", name, name)

@@ -113,7 +113,7 @@ def test_another_scene_is_refused_by_both_names():
 
 
 def test_the_servers_scene_protocol_and_room_are_held():
-    with Server("tcp/127.0.0.1:0", plan=SceneId("vsp", "D1"), most=1) as server, contextlib.ExitStack() as stack:
+    with Server("tcp/127.0.0.1:0", scene=SceneId("vsp", "D1"), max_actors=1) as server, contextlib.ExitStack() as stack:
         ada, bob = (stack.enter_context(ZenohBus(name, connect=server.endpoint)) for name in ("ada", "bob"))
         with pytest.raises(JoinRejected, match="the server was started for 'vsp' with 'D1'"):
             ada.join(hello("ada", "D2"))
@@ -162,7 +162,7 @@ def test_who_is_in_says_so_again_to_a_server_that_was_started_anew():
             wait(lambda: second._admission.scene_of("vineyard") == SceneId("vsp", "D1"), "ada to say who she is")
             wait(lambda: not ada.status_message, "ada to be well")
             second.close()
-        with Server(endpoint, plan=SceneId("tendone", "D2")):
+        with Server(endpoint, scene=SceneId("tendone", "D2")):
             wait(lambda: "'tendone'" in ada.status_message, "ada to be told that she is in another vineyard now")
 
 
@@ -291,7 +291,7 @@ def test_facts_wait_until_somebody_is_let_into_their_world(monkeypatch):
 SERVE = """
 import pathlib, sys
 from vinesim.net.server.server import Server
-with Server(sys.argv[1], keep=pathlib.Path(sys.argv[2])) as server:
+with Server(sys.argv[1], state_folder=pathlib.Path(sys.argv[2])) as server:
     print(server.endpoint, flush=True)
     server.run()
 """
@@ -365,12 +365,12 @@ def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
 
 
 def test_the_scene_is_kept_with_the_facts(tmp_path):
-    with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("ada", connect=server.endpoint) as ada:
+    with Server("tcp/127.0.0.1:0", state_folder=tmp_path) as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.join(hello("ada"))
         say(ada, (0, 0), box())
         snapshot(ada, (0, 0), 1)
     assert [path.name for path in tmp_path.iterdir()] == ["vineyard.facts"]
-    with Server("tcp/127.0.0.1:0", keep=tmp_path) as server, ZenohBus("bob", connect=server.endpoint) as bob:
+    with Server("tcp/127.0.0.1:0", state_folder=tmp_path) as server, ZenohBus("bob", connect=server.endpoint) as bob:
         with pytest.raises(
             JoinRejected, match=r"facts kept of world 'vineyard' belong to 'vsp' with 'D1'.*--state-dir"
         ):
@@ -455,7 +455,7 @@ def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):
     with pytest.raises(
         ValueError, match=r"only carries: give --state-dir, --scene and --max-clients to the one server"
     ):
-        Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], keep=tmp_path)
+        Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], state_folder=tmp_path)
 
 
 def test_the_configuration_for_stock_routers_is_true():

@@ -34,8 +34,8 @@ def run(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with Server(
-        listen or default_listen(secured=tls is not None), connect=connect or (), keep=state_dir, plan=plan,
-        most=max_clients, quota=Quota(*quota), certificates=tls,
+        listen or default_listen(secured=tls is not None), connect=connect or (), state_folder=state_dir, scene=plan,
+        max_actors=max_clients, quota=Quota(*quota), certificates=tls,
     ) as server:  # fmt: skip
         if status != "json":
             print(f"listening on {', '.join(map(str, server.endpoints))}", flush=True)

@@ -1,1 +1,1 @@
-"""Who hears what and who owns what; messages, buses and the server that only carries them."""
+"""Network: wire formats, transport, replication of objects, the server, and recordings."""

@@ -1,4 +1,4 @@
-"""What crossed the network, and what was not believed: figures for the status line and for tests."""
+"""Counters of network traffic and of rejected messages, for status lines and tests."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 
 @dataclasses.dataclass(slots=True)
 class Traffic:
-    """Messages and payload bytes of one family, each way."""
+    """Messages and payload bytes of one family of keys, each way."""
 
     messages_in: int = 0
     bytes_in: int = 0
@@ -15,33 +15,34 @@ class Traffic:
     bytes_out: int = 0
 
     def count_in(self, payload: bytes) -> None:
-        """One message came."""
+        """Count a received message."""
         self.messages_in += 1
         self.bytes_in += len(payload)
 
     def count_out(self, payload: bytes) -> None:
-        """One message left."""
+        """Count a sent message."""
         self.messages_out += 1
         self.bytes_out += len(payload)
 
 
 @dataclasses.dataclass(slots=True)
 class Counters:
-    """What crossed the network and what was not believed."""
+    """Traffic by family, and rejected messages."""
 
     actor: Traffic = dataclasses.field(default_factory=Traffic)
     """Poses of robots and humans."""
     environment: Traffic = dataclasses.field(default_factory=Traffic)
-    """Moving trees, boxes and loose bunches."""
+    """States of moving trees, boxes and free bunches."""
     event: Traffic = dataclasses.field(default_factory=Traffic)
-    """Claims, corrections and rest."""
+    """Claims, corrections and states at rest."""
     retained: Traffic = dataclasses.field(default_factory=Traffic)
-    """What was picked or cut and where things lie: these leave even if nobody is near, for the server keeps them."""
+    """Retained records: these leave even if no peer is near, because the server keeps them."""
     force: Traffic = dataclasses.field(default_factory=Traffic)
-    """What hands do to robots of other clients."""
+    """Wrenches of hands on robots of other clients."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
-    """Greetings, clock and what the server keeps (received only)."""
+    """Hellos, clock replies and snapshots (received only)."""
     malformed: int = 0
-    """Messages that could not be believed."""
+    """Messages that could not be decoded."""
     dropped: int = 0
-    """Sound messages and records not used: overtaken, of a stranger, too far away, or of a lesser claim."""
+    """Valid messages and states that were not used: outdated, of an unknown peer, too far away, or of a lesser claim.
+    """

@@ -1,1 +1,1 @@
-"""Recorders, replay, and traces of what a client saw."""
+"""Recorder and replay of a world, and traces of single bunches."""

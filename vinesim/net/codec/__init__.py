@@ -1,1 +1,1 @@
-"""What crosses the network, byte by byte."""
+"""Wire formats: one module for each group of messages; ``messages`` offers them all."""

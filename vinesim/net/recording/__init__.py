@@ -1,1 +1,1 @@
-"""Recordings of what crossed the network, as MCAP files."""
+"""Recordings of network messages as MCAP files."""

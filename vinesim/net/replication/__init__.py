@@ -1,1 +1,1 @@
-"""Interest, authority, dead reckoning and retained state: which client sends what to whom."""
+"""Replication of objects between clients: interest, authority, dead reckoning, retained state."""

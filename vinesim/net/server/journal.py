@@ -1,9 +1,9 @@
-"""Facts on disk: one journal a world, to which every fact is appended when it is heard.
+"""Write-ahead log of retained records: one journal file for a world, to which every record is appended on arrival.
 
-A journal starts with ``vsfacts`` and a version, then come records: length, CRC-32, bytes. The first record is the
-world's head (msgpack: its name, its scene), every other one a cell and a FACTS message. What holds no more is left out
-when the journal is written anew, beside the old one, which is then replaced at once. So a process may die at any byte:
-what was appended before is there, and at most the last record is torn.
+A journal starts with ``vsfacts`` and a version; then come frames: length, CRC-32, bytes. The first frame is the header
+(msgpack: world, scene), every other one a cell and a RETAINED message. A journal is compacted by writing it anew beside
+the old one, which is then replaced atomically. So a process may die at any byte: what was appended before is there, and
+at most the last frame is torn.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ VERSION = 1
 SUFFIX = ".facts"
 
 MAX_OBSOLETE_RECORDS = 1000
-"""So many records, and three for each fact that holds, may be outdated before a journal is written anew."""
+"""A journal is compacted when it has more obsolete frames than this plus three for each record that holds."""
 
 _RECORD = struct.Struct("<II")  # length, CRC-32
 _CELL = struct.Struct("<ii")
 
 
 class JournalError(BusError):
-    """What is on disk cannot be used, or nothing can be written there; the text says which file and what to do."""
+    """A journal cannot be used or written; the text says which file and what to do."""
 
 
 class _Header(msgspec.Struct, frozen=True):
@@ -50,19 +50,19 @@ class _Header(msgspec.Struct, frozen=True):
 
 
 class Journal:
-    """The facts of one world, in memory and on disk. A context manager; used by one thread."""
+    """The retained state of one world, in memory and on disk. A context manager; used by one thread."""
 
-    def __init__(self, path: pathlib.Path, world: str, plan: SceneId, facts: RetainedState) -> None:
-        self.path, self.world, self.scene_id, self.state = path, world, plan, facts
+    def __init__(self, path: pathlib.Path, world: str, scene_id: SceneId, state: RetainedState) -> None:
+        self.path, self.world, self.scene_id, self.state = path, world, scene_id, state
         self._file: BinaryIO | None = None
         self._records = 0
         self.rewrite()
 
     @classmethod
     def load(cls, path: pathlib.Path) -> Self:
-        """What a journal holds. A torn one is mended, and kept as it was under another name.
+        """Read a journal. A torn one is repaired and its original kept under another name.
 
-        :class:`NotKept` if it is no journal, or one of another version: then it stays untouched.
+        Raises :class:`JournalError` if it is no journal or one of another version; then the file stays untouched.
         """
         try:
             content = path.read_bytes()
@@ -79,9 +79,9 @@ class Journal:
                 f"{VERSION:02x}: use the release that wrote it, or give another --state-dir"
             )
         head: _Header | None = None
-        facts = RetainedState()
-        sound = len(start)
-        why = "its head is torn"
+        state = RetainedState()
+        valid_end = len(start)
+        reason = "its head is torn"
         try:
             for record, end in _records(content, len(start)):
                 if head is None:
@@ -92,36 +92,36 @@ class Journal:
                             f"{messages.PROTOCOL}: use the release that wrote them, or give another --state-dir"
                         )
                 else:
-                    for fact in messages.decode_records(record[_CELL.size :]):
-                        facts.merge(_CELL.unpack_from(record), fact)
-                sound = end
+                    for retained in messages.decode_records(record[_CELL.size :]):
+                        state.merge(_CELL.unpack_from(record), retained)
+                valid_end = end
         except (msgspec.DecodeError, MessageError, struct.error) as error:
-            why = str(error)
+            reason = str(error)
         if head is None:
             raise JournalError(
-                f"{path}: {why}, so nobody knows whose facts these are: move it away, or give another --state-dir"
+                f"{path}: {reason}, so nobody knows whose facts these are: move it away, or give another --state-dir"
             )
-        if sound < len(content):
-            aside = _free_name(path)
-            _write(aside, content)
+        if valid_end < len(content):
+            backup = _free_name(path)
+            _write(backup, content)
             log.warning(
                 "%s: torn after %d of %d bytes; %d facts before that hold, the file as it was is kept as %s",
-                path, sound, len(content), len(facts), aside.name,
+                path, valid_end, len(content), len(state), backup.name,
             )  # fmt: skip
-        return cls(path, head.world, SceneId(head.scene, head.digest), facts)
+        return cls(path, head.world, SceneId(head.scene, head.digest), state)
 
-    def append(self, cell: Cell, fact: RetainedRecord) -> None:
-        """Write a fact down that :attr:`facts` has taken in. Safe against the end of this process at once."""
+    def append(self, cell: Cell, retained: RetainedRecord) -> None:
+        """Append a record that :attr:`state` has merged. Survives the end of this process at once."""
         assert self._file is not None
         try:
-            self._file.write(_packed(_CELL.pack(*cell) + messages.encode_records([fact])))
+            self._file.write(_packed(_CELL.pack(*cell) + messages.encode_records([retained])))
             self._file.flush()
         except OSError as error:
             raise _cannot_write(self.path, error) from error
         self._records += 1
 
     def sync(self) -> None:
-        """Make what was appended safe against the end of the machine; leave out what holds no more."""
+        """Force what was appended to the disk; compact the file if that is worth it."""
         try:
             if self._records > MAX_OBSOLETE_RECORDS + 4 * len(self.state):
                 self.rewrite()
@@ -131,10 +131,10 @@ class Journal:
             raise _cannot_write(self.path, error) from error
 
     def rewrite(self) -> None:
-        """Write all anew, beside the old file, then put it in its place."""
+        """Write the state to a new file and replace the old one."""
         head = _encoder.encode(_Header(self.world, *self.scene_id))
         parts = [MAGIC + bytes((VERSION,)), _packed(head)]
-        parts += [_packed(_CELL.pack(*cell) + messages.encode_records([fact])) for cell, fact in self.state]
+        parts += [_packed(_CELL.pack(*cell) + messages.encode_records([retained])) for cell, retained in self.state]
         try:
             _write(self.path, b"".join(parts))
             if self._file is not None:
@@ -145,7 +145,7 @@ class Journal:
         self._records = len(self.state)
 
     def close(self) -> None:
-        """Settle and give the file up."""
+        """Sync and close the file."""
         if self._file is not None:
             try:
                 self.sync()
@@ -161,7 +161,7 @@ class Journal:
 
 
 def load_all(folder: pathlib.Path) -> dict[str, Journal]:
-    """The journals of a folder by their worlds; the folder is made if it is not there."""
+    """The journals of a folder by their worlds; the folder is created if necessary. Raises :class:`JournalError`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for rest in folder.glob(f"*{SUFFIX}.part"):
@@ -180,7 +180,7 @@ def load_all(folder: pathlib.Path) -> dict[str, Journal]:
 
 
 def _records(content: bytes, at: int) -> Iterator[tuple[bytes, int]]:
-    """Sound records and where each ends, up to the first that is not."""
+    """Intact frames and where each ends, up to the first that is not intact."""
     while at + _RECORD.size <= len(content):
         length, crc = _RECORD.unpack_from(content, at)
         record = content[at + _RECORD.size : at + _RECORD.size + length]
@@ -195,7 +195,7 @@ def _packed(record: bytes) -> bytes:
 
 
 def _write(path: pathlib.Path, content: bytes) -> None:
-    """All of it or nothing, whatever happens meanwhile."""
+    """Write a file atomically."""
     part = path.with_name(path.name + ".part")
     with part.open("wb") as file:
         file.write(content)
@@ -211,9 +211,9 @@ def _write(path: pathlib.Path, content: bytes) -> None:
 
 def _free_name(path: pathlib.Path) -> pathlib.Path:
     number = 1
-    while (aside := path.with_name(f"{path.name}.torn-{number}")).exists():
+    while (backup := path.with_name(f"{path.name}.torn-{number}")).exists():
         number += 1
-    return aside
+    return backup
 
 
 def _cannot_write(path: pathlib.Path, error: OSError) -> JournalError:

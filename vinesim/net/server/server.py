@@ -1,7 +1,8 @@
-"""The server: a Zenoh router that carries messages, knows who is there, has a clock, and keeps what stays true.
+"""The server: a Zenoh router that admits actors, has the clock, and keeps the retained state for actors that join
+later.
 
-CANOPIES D6.4 section 2.3: "The network server has only the task to manage the synchronization between the clients."
-It simulates nothing. Of the environment it hears facts and nothing else: no motion, no pose.
+CANOPIES D6.4 section 2.3: "The network server has only the task to manage the synchronization between the clients." It
+simulates nothing, and it receives retained records, no states and no poses.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from vinesim.net.transport.zenoh_session import close_session, config, open_sess
 log = logging.getLogger(__name__)
 
 LISTEN = "tcp/0.0.0.0:7447"
-"""All interfaces, Zenoh's port."""
+"""Default endpoint: all interfaces, Zenoh's port."""
 
 LEASE = 1000
-"""A server that is silent for this long is gone [ms]: half of what actors are granted, for it does nothing else."""
+"""A server that is silent for this long is taken to be gone [ms]: half of what actors are granted."""
 
 
 class PortTaken(BusError):
-    """The endpoint cannot be listened on."""
+    """The server cannot listen on the endpoint."""
 
     def __init__(self, endpoint: str, reason: str) -> None:
         protocol = endpoint.partition("/")[0]
@@ -48,35 +49,35 @@ class PortTaken(BusError):
 
 
 class Server:
-    """An embedded router; it carries messages from construction to :meth:`close`. A context manager."""
+    """An embedded router, from construction to :meth:`close`. A context manager."""
 
     def __init__(
         self,
         listen: str | Sequence[str] = LISTEN,
         *,
         connect: Sequence[str] = (),
-        keep: pathlib.Path | None = None,
-        plan: SceneId | None = None,
-        most: int | None = None,
+        state_folder: pathlib.Path | None = None,
+        scene: SceneId | None = None,
+        max_actors: int | None = None,
         quota: Quota = Quota(),
         certificates: pathlib.Path | None = None,
         world: str = WORLD,
     ) -> None:
-        """Listen on endpoints like ``tcp/0.0.0.0:7447``; port 0 takes a free one, see :attr:`endpoint`.
+        """Listen on endpoints like ``tcp/0.0.0.0:7447``; port 0 chooses a free one, see :attr:`endpoint`.
 
-        ``connect``: servers or routers that this one is linked to. It then only carries: of linked servers one, which
-        connects to nobody, answers and keeps. ``keep``: folder for facts, else they live as long as the server.
-        ``plan``: the only scene allowed. ``most``: actors at a time. ``certificates``: folder of a server, see
-        :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, and in it only who has a certificate.
+        ``connect``: routers or servers to link to. A linked server only routes; of linked servers the one that connects
+        to none admits and retains. ``state_folder``: folder of the journals; without one the state lives as long as the
+        server. ``scene``: the only one allowed. ``max_actors``: at a time. ``certificates``: folder of a server, see
+        :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate.
 
-        :class:`PortTaken` if an endpoint is taken, :class:`UsageError` if it is none,
-        :class:`vinesim.net.server.journal.NotKept` and :class:`vinesim.net.transport.access_control.NoCertificate` in
-        words.
+        Raises :class:`PortTaken`, :class:`vinesim.errors.UsageError` for an invalid endpoint or combination,
+        :class:`vinesim.net.server.journal.JournalError` and
+        :class:`vinesim.net.transport.access_control.CertificateError`.
         """
         listen = (listen,) if isinstance(listen, str) else listen
-        safe = certificates is not None
-        linked = [endpoints.parse(text, secured=safe) for text in connect]
-        if linked and (keep is not None or plan is not None or most is not None):
+        is_secured = certificates is not None
+        linked = [endpoints.parse(text, secured=is_secured) for text in connect]
+        if linked and (state_folder is not None or scene is not None or max_actors is not None):
             raise UsageError(
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene and --max-clients "
                 "to the one server that connects to nobody"
@@ -87,77 +88,66 @@ class Server:
 
             settings = tls_config(certificates, SERVER) | acl_config(f"{ROOT}/{world}", roles(certificates))
         try:
-            self.endpoints = endpoints.resolve_ports(listen, secured=safe)
+            self.endpoints = endpoints.resolve_ports(listen, secured=is_secured)
         except OSError as error:
             raise PortTaken(listen[0], str(error.strerror)) from error
         self.pings = 0
-        """How many times the clock was asked."""
-        self._unreadable = 0
-        self._admission = AdmissionControl(plan, most)
+        """Queries of the clock."""
+        self._malformed = 0
+        self._admission = AdmissionControl(scene, max_actors)
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._blamed: set[str] = set()
-        self.store = None if linked else RetainedStore(keep, quota)
-        """What is kept; None where another server keeps."""
+        self._warned: set[str] = set()
+        self.store = None if linked else RetainedStore(state_folder, quota)
+        """The retained state; None if another server keeps it."""
         try:
-            self._session = open_session(
-                config(
-                    "router",
-                    listen__endpoints=[endpoint.locator for endpoint in self.endpoints],
-                    listen__exit_on_failure=True,
-                    connect__endpoints=[endpoint.locator for endpoint in linked],
-                    connect__timeout_ms=-1,
-                    connect__exit_on_failure=False,
-                    connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
-                    transport__link__tx__lease=LEASE,
-                    **settings,
-                )
-            )
-        except zenoh.ZError as error:
+            self._session = _open_router(self.endpoints, linked, settings)
+        except PortTaken:
             if self.store is not None:
                 self.store.close()
-            reason = "address already in use" if "in use" in str(error) else str(error).split(" at /")[0]
-            raise PortTaken(", ".join(map(str, self.endpoints)), reason) from error
+            raise
+        # access control denies declarations that reach beyond the one world
+        self._declared = self._declare(f"{ROOT}/{'*' if certificates is None else world}")
+        log.info("listening on %s", ", ".join(map(str, self.endpoints)))
+
+    def _declare(self, root: str) -> list[object]:
+        """Subscribe to liveliness; where this server decides, declare queryables and subscribe to retained records."""
         session = self._session
-        # under access control a declaration that reaches beyond the one world would be told to nobody
-        where = f"{ROOT}/{'*' if certificates is None else world}"
-        self._declared: list[object] = [
-            session.liveliness().declare_subscriber(f"{where}/live/*/*", self._on_liveliness, history=True)
+        declared: list[object] = [
+            session.liveliness().declare_subscriber(f"{root}/live/*/*", self._on_liveliness, history=True)
         ]
         if self.store is not None:
-            self._declared += [
-                session.declare_queryable(
-                    f"{where}/join/*/*", self._on_join_query
-                ),  # first: who is back joins, then tells
-                session.declare_queryable(f"{where}/clock", self._on_clock_query),
-                session.declare_queryable(f"{where}/snap/*/*", self._on_snapshot_query),
-                session.declare_subscriber(f"{where}/fact/**", self._on_record),
+            declared += [  # join first: an actor that reconnects joins before it publishes
+                session.declare_queryable(f"{root}/join/*/*", self._on_join_query),
+                session.declare_queryable(f"{root}/clock", self._on_clock_query),
+                session.declare_queryable(f"{root}/snap/*/*", self._on_snapshot_query),
+                session.declare_subscriber(f"{root}/fact/**", self._on_record),
             ]
-        log.info("listening on %s", ", ".join(map(str, self.endpoints)))
+        return declared
 
     @property
     def endpoint(self) -> str:
-        """Where the server listens first, with its true port."""
+        """The first endpoint, with its actual port."""
         return str(self.endpoints[0])
 
     @property
     def actors(self) -> list[str]:
-        """Who is there now, as ``world/name``, sorted."""
+        """Actors that are live now, as ``world/name``, sorted."""
         with self._lock:
             return self._admission.actors
 
     @property
     def joined(self) -> int:
-        """How many actors ever came."""
+        """Actors that have ever come."""
         return self._admission.joined
 
     @property
     def malformed(self) -> int:
-        """How many messages and questions could not be understood."""
-        return self._unreadable + (self.store.counters.malformed if self.store is not None else 0)
+        """Messages and queries that could not be decoded."""
+        return self._malformed + (self.store.counters.malformed if self.store is not None else 0)
 
     def figures(self) -> dict[str, Any]:
-        """What a status line says: who is there, and what was counted since the start."""
+        """Content of a status line: live actors, links, and counters since the start."""
         figures: dict[str, Any] = {
             "endpoints": [str(endpoint) for endpoint in self.endpoints],
             "actors": self.actors,
@@ -180,7 +170,7 @@ class Server:
         return figures
 
     def run(self, duration: float | None = None) -> None:
-        """Carry messages until :meth:`stop` (from a signal handler or another thread), at most ``duration`` s."""
+        """Block until :meth:`stop` (from a signal handler or another thread), at most ``duration`` [s]."""
         self._stop.wait(duration)
 
     def stop(self) -> None:
@@ -188,7 +178,7 @@ class Server:
         self._stop.set()
 
     def close(self) -> None:
-        """Stop carrying messages and write down what is kept; the second time nothing happens."""
+        """Close the router and the store. Idempotent."""
         self.stop()
         close_session(self._session)
         if self.store is not None:
@@ -204,10 +194,10 @@ class Server:
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
         world, _, name, session = str(sample.key_expr).split("/")[-4:]
-        there = sample.kind == zenoh.SampleKind.PUT
+        is_live = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
-            (self._admission.on_join if there else self._admission.on_leave)(world, name, session)
-        log.info("%s/%s %s", world, name, "came" if there else "left")
+            (self._admission.on_join if is_live else self._admission.on_leave)(world, name, session)
+        log.info("%s/%s %s", world, name, "came" if is_live else "left")
 
     def _on_record(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT and self.store is not None:
@@ -233,7 +223,7 @@ class Server:
             with self._lock:
                 if (kept := self.store.scene_of(world)) is not None:
                     self._admission.pin_scene(world, kept)
-                welcome = self._admission.answer(world, name, session, _query_payload(query), time.monotonic())
+                welcome = self._admission.decide(world, name, session, _query_payload(query), time.monotonic())
                 if not welcome.refused:
                     self.store.open(world, self._admission.scene_of(world))
             if welcome.refused:
@@ -263,15 +253,38 @@ class Server:
                 query.reply(f"{ROOT}/{world}/snap/{cell[0]}/{cell[1]}", payload)
 
     def _count_malformed(self, key: str, error: MessageError) -> None:
-        """Count what cannot be believed, and say so once for each key."""
-        self._unreadable += 1
-        if key not in self._blamed and len(self._blamed) < 1000:
-            self._blamed.add(key)
-            log.warning("a question to %s cannot be answered (said once): %s", key, error)
+        """Count an invalid query; log the first of each key."""
+        self._malformed += 1
+        if key not in self._warned and len(self._warned) < 1000:
+            self._warned.add(key)
+            log.warning("a question to %s cannot be answered (logged once): %s", key, error)
+
+
+def _open_router(
+    listen: Sequence[endpoints.Endpoint], connect: Sequence[endpoints.Endpoint], settings: dict[str, Any]
+) -> zenoh.Session:
+    """Open a router; :class:`PortTaken` if it cannot listen."""
+    try:
+        return open_session(
+            config(
+                "router",
+                listen__endpoints=[endpoint.locator for endpoint in listen],
+                listen__exit_on_failure=True,
+                connect__endpoints=[endpoint.locator for endpoint in connect],
+                connect__timeout_ms=-1,
+                connect__exit_on_failure=False,
+                connect__retry={"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
+                transport__link__tx__lease=LEASE,
+                **settings,
+            )
+        )
+    except zenoh.ZError as error:
+        reason = "address already in use" if "in use" in str(error) else str(error).split(" at /")[0]
+        raise PortTaken(", ".join(map(str, listen)), reason) from error
 
 
 def _strip_root(key: zenoh.KeyExpr) -> str:
-    """A key without the root: it starts with its world."""
+    """A key without the root: its first chunk is the world."""
     return str(key)[len(ROOT) + 1 :]
 
 

@@ -1,1 +1,1 @@
-"""How messages travel: the bus protocol, its implementations over Zenoh and in memory, links and their security."""
+"""Transport of messages: the bus protocol, buses over Zenoh and in memory, endpoints, TLS and access control."""

@@ -1,9 +1,8 @@
-"""Who may say what where links are secured: denied is what is not allowed by name.
+"""TLS and access control of Zenoh: which certificate may publish, subscribe and query what; everything else is denied.
 
-Every actor has a certificate whose common name is the actor's. Under it an actor hears its whole world, asks, and
-writes only under keys that end with its own name. A spectator only says that it is there, who it is and where its eyes
-are (or nobody would know that somebody looks); about the world it says nothing.
-The settings are Zenoh's; rules are applied by the router, so it is there that a foreign key ends.
+Every actor has a certificate with its name as common name. It may subscribe to its whole world, query, and publish only
+under keys that end with its own name. A spectator publishes only its presence, its hello and its viewpoint. The rules
+are applied by the router, so a foreign key ends there.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ from typing import Any
 from vinesim.net.transport.bus import BusError
 
 SERVER = "server"
-"""Common name of all servers: they carry for everybody, so nothing is denied between them."""
+"""Common name of all servers: nothing is denied between them."""
 
 CA_NAME = "ca"
-"""Common name of whoever signs, and the file of its certificate."""
+"""Common name of the certificate authority, and stem of its files."""
 
 
 class Role(enum.StrEnum):
-    """What a certificate is for."""
+    """Role of the holder of a certificate."""
 
     ROBOT = "robot"
     HUMAN = "human"
@@ -45,7 +44,7 @@ _EVERYTHING = [
 
 
 def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
-    """Settings of a session that shows the certificate of ``name`` and believes only what ``folder/ca.pem`` signed."""
+    """Settings of a session with the certificate of ``name`` that trusts only what ``folder/ca.pem`` signed."""
     authority, certificate, key = (folder / file for file in (f"{CA_NAME}.pem", f"{name}.pem", f"{name}.key"))
     for file in (authority, certificate, key):
         if not file.is_file():
@@ -67,7 +66,7 @@ def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
 
 
 def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
-    """Access control of a router for one world under ``root`` (like ``vs/1/vineyard``); all others do not exist."""
+    """Access control of a router for the one world under ``root`` (like ``vs/1/vineyard``)."""
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
 

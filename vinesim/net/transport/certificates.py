@@ -1,8 +1,8 @@
-"""Certificates for secured links: one authority a folder, one certificate an actor, made where the authority's key is.
+"""Certificates for secured links: one authority for each folder, one certificate for each actor.
 
-``ca.pem`` and ``ca.key`` are the authority, ``server.pem`` and ``server.key`` the server; ``NAME.pem`` and ``NAME.key``
-belong to an actor, who needs only those two and ``ca.pem``. An actor's role is its certificate's organisational unit.
-Keys are elliptic (P-256), readable only by their owner.
+``ca.pem`` and ``ca.key`` belong to the authority, ``server.pem`` and ``server.key`` to the server; ``NAME.pem`` and
+``NAME.key`` to an actor, who needs only those two and ``ca.pem``. The role of an actor is the organisational unit of
+its certificate. Keys are elliptic (P-256), readable only by their owner.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ else:
     _missing = None
 
 AUTHORITY_YEARS = 10
+"""Validity of the certificate of an authority [a]."""
 CERTIFICATE_DAYS = 825
-"""How long an actor's or server's certificate is valid."""
+"""Validity of the certificate of an actor or a server [d]."""
 
 
 class CryptographyMissing(RuntimeError):
-    """The library that makes certificates is not there."""
+    """The library that makes certificates is not installed."""
 
     exit_code = 3
 
@@ -46,10 +47,11 @@ class CryptographyMissing(RuntimeError):
 def create(
     folder: pathlib.Path, name: str, role: Role = Role.ROBOT, hosts: Sequence[str] = (), days: int = CERTIFICATE_DAYS
 ) -> list[pathlib.Path]:
-    """Make the certificate of an actor, and at first use the authority and the server; what was written.
+    """Create the certificate of an actor, and at first use those of the authority and the server; the paths written.
 
-    For ``server`` itself ``hosts`` are the names and addresses under which clients reach it, besides this machine's
-    own; its certificate is replaced. An actor that has one is refused with :class:`NoCertificate`.
+    ``hosts``: for ``server``, names and addresses under which clients reach it, besides those of this machine; its
+    certificate is replaced. Raises :class:`CertificateError` if an actor has one already, and
+    :class:`vinesim.errors.UsageError` for an impossible name or role.
     """
     if _missing is not None:
         raise CryptographyMissing from _missing
@@ -72,7 +74,7 @@ def create(
 
 
 def roles(folder: pathlib.Path) -> dict[str, Role]:
-    """Who has a certificate of this folder's authority, and what for; others in the folder are refused in words."""
+    """Roles of all certificates of this folder, by name; :class:`CertificateError` for one of another authority."""
     if _missing is not None:
         raise CryptographyMissing from _missing
     authority = _read(folder / f"{CA_NAME}.pem")
@@ -123,7 +125,7 @@ def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def _signed(folder: pathlib.Path, name: str, role: Role, hosts: Sequence[str], days: int) -> list[pathlib.Path]:
-    """A key and the certificate for it, signed by the folder's authority."""
+    """Create a key and its certificate, signed by the folder's authority."""
     authority = _read(folder / f"{CA_NAME}.pem")
     try:
         signer = serialization.load_pem_private_key((folder / f"{CA_NAME}.key").read_bytes(), None)

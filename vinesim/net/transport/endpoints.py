@@ -1,7 +1,7 @@
-"""Where a server listens and how a client reaches it: endpoints in words, and the two ways between them; pure.
+"""Endpoints of servers and clients as text, and the two links between them: a stream and datagrams; pure.
 
-``tcp`` and ``tls`` carry everything; ``udp`` and ``quic`` lie beside them, on the same port number, and carry what may
-be lost (poses) at once instead of in line. ``tls`` and ``quic`` ask both ends for certificates.
+``tcp`` and ``tls`` carry everything. ``udp`` and ``quic`` use the same port number and carry best-effort messages
+(poses) without head-of-line blocking. ``tls`` and ``quic`` need certificates on both sides.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import NamedTuple
 from vinesim.errors import UsageError
 
 PORT = 7447
-"""Zenoh's."""
+"""Default port of Zenoh."""
 
 _COUNTERPART = {"tcp": "udp", "udp": "tcp", "tls": "quic", "quic": "tls"}
 _MIXED = {"udp": "?rel=1;mixed_rel=auto", "quic": "?mixed_rel=auto"}
-"""One session over two links: a reliable one, and datagrams. Without ``rel=1`` udp would silently be lossy only."""
+"""Options for one session over two links: a reliable one, and datagrams. Without ``rel=1`` udp would be lossy only."""
 
 
 class Endpoint(NamedTuple):
-    """One place to listen at or connect to."""
+    """A place to listen on or to connect to."""
 
     protocol: str
     host: str
@@ -33,22 +33,22 @@ class Endpoint(NamedTuple):
 
     @property
     def locator(self) -> str:
-        """As Zenoh wants it."""
+        """In Zenoh's notation."""
         return f"{self}{_MIXED.get(self.protocol, '')}"
 
     @property
     def datagrams(self) -> bool:
-        """It carries what may be lost at once, instead of in line."""
+        """Whether it carries best-effort messages as datagrams."""
         return self.protocol in _MIXED
 
     @property
     def secured(self) -> bool:
-        """Both ends show certificates."""
+        """Whether both sides show certificates."""
         return self.protocol in ("tls", "quic")
 
     @property
     def loopback(self) -> bool:
-        """It never leaves the machine."""
+        """Whether it stays on this machine."""
         try:
             return ipaddress.ip_address(self.host.strip("[]")).is_loopback
         except ValueError:
@@ -56,12 +56,12 @@ class Endpoint(NamedTuple):
 
     @property
     def counterpart(self) -> Endpoint:
-        """The other way to the same server: datagrams beside a stream and the reverse."""
+        """The other link to the same server: datagrams for a stream and vice versa."""
         return self._replace(protocol=_COUNTERPART[self.protocol])
 
 
 def parse(text: str, *, secured: bool = False) -> Endpoint:
-    """``PROTOCOL/HOST:PORT``; :class:`UsageError` in words for anything else, or if it is not as safe as asked."""
+    """``PROTOCOL/HOST:PORT``; :class:`vinesim.errors.UsageError` for anything else, or a protocol without TLS."""
     allowed = ("tls", "quic") if secured else ("tcp", "udp")
     protocol, _, address = text.partition("/")
     host, colon, port = address.rpartition(":")
@@ -77,7 +77,7 @@ def parse(text: str, *, secured: bool = False) -> Endpoint:
 
 
 def default_listen(*, secured: bool = False) -> tuple[str, ...]:
-    """Where a server listens unless told otherwise: all interfaces, both ways."""
+    """Endpoints of a server by default: all interfaces, stream and datagrams."""
     return tuple(f"{protocol}/0.0.0.0:{PORT}" for protocol in (("tls", "quic") if secured else ("tcp", "udp")))
 
 
@@ -85,13 +85,13 @@ class Links(NamedTuple):
     """How one client reaches its server."""
 
     bulk: Endpoint
-    """A stream: events, questions, snapshots, whatever is large."""
+    """A stream: events, queries, snapshots, everything large."""
     live: Endpoint | None
-    """Datagrams: poses and motion. None: they take the stream as well."""
+    """Datagrams: poses and states. None: they use the stream, too."""
 
 
 def client_links(connect: str, *, secured: bool = False) -> Links:
-    """To a server elsewhere both, on this machine a stream alone: cheapest; ``udp/`` or ``quic/`` asks for both."""
+    """Both links to a remote server, only a stream on this machine (the cheapest); ``udp/``, ``quic/`` ask for both."""
     endpoint = parse(connect, secured=secured)
     if endpoint.datagrams:
         return Links(endpoint.counterpart, endpoint)
@@ -99,7 +99,7 @@ def client_links(connect: str, *, secured: bool = False) -> Links:
 
 
 def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endpoint, ...]:
-    """Endpoints to listen at, port 0 replaced by one number that is free for streams and datagrams alike."""
+    """Endpoints to listen on, port 0 replaced by one number that is free for streams and datagrams alike."""
     wanted = [parse(text, secured=secured) for text in listen]
     if not wanted:
         raise UsageError("a server that listens nowhere: give --listen at least once")
