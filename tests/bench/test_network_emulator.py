@@ -98,12 +98,15 @@ def test_nothing_stays_behind_even_of_one_that_is_killed():
     victim = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert victim.stdout is not None
     assert victim.stdout.readline() == "ready\n"
-    mine = [space for space in network_emulator._spaces() if f"-{victim.pid}-" in space]
+    mine = [space for space in network_emulator._list_namespaces() if f"-{victim.pid}-" in space]
     assert len(mine) == 2
     victim.send_signal(signal.SIGKILL)
     victim.wait()
     victim.stdout.close()
-    wait(lambda: not [s for s in network_emulator._spaces() if f"-{victim.pid}-" in s], "the carrier to take them away")
+    wait(
+        lambda: not [s for s in network_emulator._list_namespaces() if f"-{victim.pid}-" in s],
+        "the carrier to take them away",
+    )
 
     # and what a carrier that was killed as well left is swept by the next
     gone = subprocess.Popen([sys.executable, "-c", "pass"])
@@ -112,8 +115,8 @@ def test_nothing_stays_behind_even_of_one_that_is_killed():
     subprocess.run(["ip", "netns", "add", left], check=True)
     start = time.monotonic()
     with NetworkEmulator({"a": Link()}):
-        assert left not in network_emulator._spaces()
-    assert not [s for s in network_emulator._spaces() if f"-{os.getpid()}-" in s]
+        assert left not in network_emulator._list_namespaces()
+    assert not [s for s in network_emulator._list_namespaces() if f"-{os.getpid()}-" in s]
     assert time.monotonic() - start < 20.0
 
 

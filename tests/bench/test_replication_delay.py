@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vinesim.bench import replication_delay
-from vinesim.bench.replication_delay import buffered, extrapolation, turns
+from vinesim.bench.replication_delay import buffered, count_reversals, extrapolation
 
 
 def test_a_touch_moves_at_once_here_and_late_through_an_authority_far_away():
@@ -25,4 +25,4 @@ def test_a_touch_moves_at_once_here_and_late_through_an_authority_far_away():
 
 @pytest.mark.parametrize(("signal", "count"), [([0, 1, 0, 1], 2), ([0, 0.5, 0.2, 0.6], 0), ([0, 1, 2, 3], 0), ([1], 0)])
 def test_turns_are_counted_beyond_their_least(signal, count):
-    assert turns(np.array(signal, float), 0.9) == count
+    assert count_reversals(np.array(signal, float), 0.9) == count

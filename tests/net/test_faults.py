@@ -24,7 +24,7 @@ NOTICED = 2.5
 
 
 class Company:
-    """Puppets, each in a process of its own with a clock of its own, that have met."""
+    """Fake clients, each in a process of its own with a clock of its own, that have met."""
 
     def __init__(self, server: Served, stages: dict[str, FakeClientProcess]) -> None:
         self.server, self.stages = server, stages
@@ -33,15 +33,15 @@ class Company:
         return self.stages[name]
 
     def hears(self, name: str, tree: int, since: float) -> bool:
-        """News of a tree came after ``since`` [s] by that puppet's clock."""
-        return self[name].tell()["heard"].get(str(tree), -math.inf) > since
+        """News of a tree came after ``since`` [s] by that fake_client's clock."""
+        return self[name].command()["heard"].get(str(tree), -math.inf) > since
 
     def owners(self, tree: int) -> set:
-        return {stage.tell()["owner"].get(str(tree)) for stage in self.stages.values()}
+        return {stage.command()["owner"].get(str(tree)) for stage in self.stages.values()}
 
     def agree(self, tree: int) -> bool:
         """All hold the same claim and name the same owner."""
-        claims = {str(stage.tell()["claim"].get(str(tree))) for stage in self.stages.values()}
+        claims = {str(stage.command()["claim"].get(str(tree))) for stage in self.stages.values()}
         return len(claims) == 1 and len(self.owners(tree)) == 1
 
 
@@ -58,7 +58,7 @@ def company() -> Iterator[Company]:
             stages = dict(zip(PLACES, pool.map(enter, PLACES), strict=True))
         for stage in stages.values():
             stack.enter_context(stage)
-        wait(lambda: all(len(s.tell()["poses"]) == len(PLACES) - 1 for s in stages.values()), "all to meet")
+        wait(lambda: all(len(s.command()["poses"]) == len(PLACES) - 1 for s in stages.values()), "all to meet")
         yield Company(server, stages)
 
 
@@ -68,33 +68,33 @@ def test_clocks_that_are_seconds_wrong_do_not_matter(company):
     """
     errors = []
     for _ in range(30):
-        report = company["bob"].tell()
+        report = company["bob"].command()
         truth = 0.3 * math.sin(2.0 * (report["now"] + 2.0 + 2.0))
         errors.append(abs(report["poses"]["ada"][0] - truth))
         time.sleep(0.02)
     assert sorted(errors)[len(errors) // 2] < 0.01
-    assert company["ada"].tell()["offset"] - company["bob"].tell()["offset"] == pytest.approx(-4.0, abs=0.05)
+    assert company["ada"].command()["offset"] - company["bob"].command()["offset"] == pytest.approx(-4.0, abs=0.05)
 
 
 def test_two_that_grab_one_thing_at_once_end_with_one_owner(company):
     with ThreadPoolExecutor() as pool:
         for tree in range(4):
-            together = [pool.submit(company[name].tell, grab=[tree], touch=[tree]) for name in ("ada", "bob")]
+            together = [pool.submit(company[name].command, grab=[tree], touch=[tree]) for name in ("ada", "bob")]
             for each in together:
                 each.result()
             wait(lambda tree=tree: company.agree(tree), "one owner everywhere")
             assert company.owners(tree) < {"ada", "bob"}
     for name in ("ada", "bob"):
-        company[name].tell(touch=[])
+        company[name].command(touch=[])
 
 
 def test_a_client_that_is_killed_is_gone_and_what_it_moved_is_a_neighbours_or_rests(company, record_property):
     dan = company.stages["dan"]
-    dan.tell(touch=[5])
+    dan.command(touch=[5])
     wait(lambda: company.owners(5) == {"dan"}, "all to hear who moves the tree")
     dan.process.kill()
     del company.stages["dan"]
-    took = wait(lambda: not any("dan" in s.tell()["others"] for s in company.stages.values()), "dan to be missed")
+    took = wait(lambda: not any("dan" in s.command()["others"] for s in company.stages.values()), "dan to be missed")
     dan.close()
     record_property("missed after [s]", took)
     assert took < NOTICED
@@ -104,33 +104,33 @@ def test_a_client_that_is_killed_is_gone_and_what_it_moved_is_a_neighbours_or_re
 
 def test_a_frozen_client_is_gone_in_two_and_a_half_seconds_and_comes_back(company, record_property):
     ada, bob = company["ada"], company["bob"]
-    ada.tell(touch=[1])
+    ada.command(touch=[1])
     wait(lambda: company.hears("bob", 1, -math.inf), "bob to hear of the tree")
     ada.process.send_signal(signal.SIGSTOP)
-    start = bob.tell()["now"]
-    wait(lambda: "ada" in bob.tell()["went"], "ada to be missed")
-    went = bob.tell()["went"]["ada"]
+    start = bob.command()["now"]
+    wait(lambda: "ada" in bob.command()["left_at"], "ada to be missed")
+    went = bob.command()["left_at"]["ada"]
     ada.process.send_signal(signal.SIGCONT)
     record_property("missed after [s]", went - start)
     assert went - start < NOTICED
-    wait(lambda: bob.tell()["came"]["ada"] > went, "ada to be back")
-    now = bob.tell()["now"]
-    wait(lambda: company.hears("bob", 1, now) or bob.tell()["owner"]["1"] == "bob", "the tree to be told of again")
+    wait(lambda: bob.command()["joined_at"]["ada"] > went, "ada to be back")
+    now = bob.command()["now"]
+    wait(lambda: company.hears("bob", 1, now) or bob.command()["owner"]["1"] == "bob", "the tree to be told of again")
     wait(lambda: company.agree(1), "all to name the same owner")
 
 
 def test_a_server_that_is_killed_and_restarted_carries_again_within_a_second(company, record_property):
     ada, bob = company["ada"], company["bob"]
-    ada.tell(touch=[6])
+    ada.command(touch=[6])
     wait(lambda: company.hears("bob", 6, -math.inf), "bob to hear of the tree")
     company.server.kill()
-    wait(lambda: ada.tell()["trouble"] and bob.tell()["trouble"], "both to notice")
-    ticks = ada.tell()["ticks"]
-    wait(lambda: ada.tell()["ticks"] > ticks + 20, "ada's world to go on without a server")
-    assert ada.tell()["owner"]["6"] == "ada"
+    wait(lambda: ada.command()["trouble"] and bob.command()["trouble"], "both to notice")
+    ticks = ada.command()["ticks"]
+    wait(lambda: ada.command()["ticks"] > ticks + 20, "ada's world to go on without a server")
+    assert ada.command()["owner"]["6"] == "ada"
     company.server.run()
-    ready = bob.tell()["now"]
+    ready = bob.command()["now"]
     took = wait(lambda: company.hears("bob", 6, ready), "the stream to come again")
     record_property("streams again after [s]", took)
     assert took < 1.0 + 0.5, "a second, and half of one for a busy machine"
-    assert bob.tell()["owner"]["6"] == "ada"
+    assert bob.command()["owner"]["6"] == "ada"

@@ -11,8 +11,8 @@ import numpy as np
 
 from tests.support.live_server import Served, wait
 from vinesim.bench import message_fuzz
-from vinesim.bench.message_fuzz import EVIL, storm
-from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, row
+from vinesim.bench.message_fuzz import ATTACKER, storm
+from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, tree_row
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.codec import messages
@@ -26,17 +26,17 @@ from vinesim.scene.spec import load_scene
 
 def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
     """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
-    ada, bob, _, arrived = message_fuzz.play(3_000, seed=11)
-    said = [record.message for record in caplog.records if EVIL in record.message and "dropped" in record.message]
+    ada, bob, _, arrived = message_fuzz.run_storm(3_000, seed=11)
+    said = [record.message for record in caplog.records if ATTACKER in record.message and "dropped" in record.message]
     assert len(said) == 2, "once by each of the two who hear it"
     counters = ada.replicator.counters
     assert arrived > 1_500
     assert counters.malformed > 0.3 * arrived
     assert counters.malformed + counters.dropped <= 2 * arrived
-    for puppet in (ada, bob):
+    for fake_client in (ada, bob):
         for tree in (1, 2):
-            assert puppet.replicator.owner(tree) == "ada"
-        for update in puppet.robots.values():
+            assert fake_client.replicator.owner(tree) == "ada"
+        for update in fake_client.robots.values():
             assert np.isfinite(np.concatenate([update.base_q, update.base_qd, update.position, update.velocity])).all()
     assert bob.heard[2] > 0.0
 
@@ -44,7 +44,7 @@ def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
 def test_one_record_from_the_far_future_does_not_silence_its_author_for_ever():
     """Found by the storm: a time of 1e300 made every later record of that tree, or pose of that actor, an old one."""
     hub = MemoryHub()
-    model = row()
+    model = tree_row()
     ada, bob = (FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0)))
 
     def run(seconds: float) -> None:
@@ -88,7 +88,7 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     client = Client(
         scene, model, load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
     )  # fmt: skip
-    evil = FakeClient(hub.bus(EVIL), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
+    evil = FakeClient(hub.bus(ATTACKER), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
 
     def tick() -> None:
         hub.advance(0.01)
@@ -98,7 +98,7 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     for _ in range(60):
         tick()
         evil.tick(now[0])
-    assert EVIL in client.replicator.peers
+    assert ATTACKER in client.replicator.peers
     wild = storm(model, evil, 3, now[0])
     publishers: dict = {}
     for _ in range(60):
@@ -122,16 +122,16 @@ def test_real_sessions_and_the_server_live_through_a_storm():
         Served("tcp/127.0.0.1:0") as server,
         FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada,
     ):
-        model = row()
-        with ZenohBus(EVIL, connect=server.endpoint) as bus:
+        model = tree_row()
+        with ZenohBus(ATTACKER, connect=server.endpoint) as bus:
             evil = FakeClient(bus, model, (2.0, 0.0))
 
             def met() -> bool:
                 evil.tick(time.monotonic())
-                return EVIL in ada.tell()["others"] and "ada" in evil.robots
+                return ATTACKER in ada.command()["others"] and "ada" in evil.robots
 
             wait(met, "the two to meet")
-            before, ticks = ada.tell()["counters"], ada.tell()["ticks"]
+            before, ticks = ada.command()["counters"], ada.command()["ticks"]
             publishers: dict = {}
             for number, (key, payload) in enumerate(itertools.islice(storm(model, evil, 7), 1_500)):
                 publisher = publishers.get(key) or publishers.setdefault(key, bus.publisher(key, reliable=True))
@@ -139,13 +139,13 @@ def test_real_sessions_and_the_server_live_through_a_storm():
                 if number % 20 == 0:
                     bus.query("clock", payload)
                     time.sleep(0.005)
-            wait(lambda: ada.tell()["counters"]["malformed"] > before["malformed"] + 100, "the broken ones to count")
-            assert ada.tell()["ticks"] > ticks
-        wait(lambda: EVIL in ada.tell()["went"], "the storm to be over")
+            wait(lambda: ada.command()["counters"]["malformed"] > before["malformed"] + 100, "the broken ones to count")
+            assert ada.command()["ticks"] > ticks
+        wait(lambda: ATTACKER in ada.command()["left_at"], "the storm to be over")
         with FakeClientProcess(server.endpoint, [{"name": "bob", "place": [2.0, 0.0]}]) as bob:
-            wait(lambda: "ada" in bob.tell()["poses"], "another to be let in as ever")
-            ada.tell(touch=[3])
-            wait(lambda: bob.tell()["owner"].get("3") == "ada", "the stream to go on")
+            wait(lambda: "ada" in bob.command()["poses"], "another to be let in as ever")
+            ada.command(touch=[3])
+            wait(lambda: bob.command()["owner"].get("3") == "ada", "the stream to go on")
         assert server.process.poll() is None
 
 
@@ -164,4 +164,4 @@ for say in (b"GET / HTTP/1.1\\r\\n\\r\\n", os.urandom(4000), b"", b"\\xff" * 700
         host, port = server.endpoint.removeprefix("tcp/").split(":")
         subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=60)
         with FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
-            assert ada.tell()["trouble"] == ""
+            assert ada.command()["trouble"] == ""

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim import frames
-from vinesim.bench.support.fake_client import FakeClient, row
+from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning
@@ -96,8 +96,8 @@ def test_an_exchange_with_a_buffer_shows_a_swinging_robot_late_and_exactly():
         hub = MemoryHub(delay=0.05, jitter=0.04, seed=3)
         server = hub.bus("server")
         server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
-        model = row(1)
-        hello = Hello("bob", digest="puppets", joints=0)
+        model = tree_row(1)
+        hello = Hello("bob", digest="fake_clients", joints=0)
         ada = FakeClient(hub.bus("ada"), model, (1.0, 0.0))
         bob = Replicator(hub.bus("bob"), hello, model, jitter_buffer=buffer)
         here = RobotUpdate("bob", 0.0, frames.pose([2.0, 0.0, 0.0]), np.zeros(6), np.zeros(0), np.zeros(0))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.shared_vineyard import Server
-from vinesim.bench.support.fake_client import FakeClient, row
+from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.replication import interest
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -32,12 +32,12 @@ class Keeper(Server):
 
 
 class World:
-    """Puppets, a keeper, and a network as bad as it is asked to be."""
+    """Fake clients, a keeper, and a network as bad as it is asked to be."""
 
     def __init__(self, *names: str, **network: float) -> None:
         self.hub = MemoryHub(**network)  # type: ignore[arg-type]
         self.keeper = Keeper(self.hub)
-        self.model = row(6)
+        self.model = tree_row(6)
         self.cast: dict[str, FakeClient] = {}
         for name in names:
             self.come(name)
@@ -52,11 +52,11 @@ class World:
         for _ in range(round(seconds / TICK)):
             self.hub.advance(TICK)
             self.keeper.tick()
-            for puppet in self.cast.values():
-                puppet.tick(self.hub.time)
+            for fake_client in self.cast.values():
+                fake_client.tick(self.hub.time)
 
     def owners(self, number: int) -> set:
-        return {puppet.replicator.owner(number) for puppet in self.cast.values()}
+        return {fake_client.replicator.owner(number) for fake_client in self.cast.values()}
 
 
 names = st.sampled_from(sorted(PLACES))
@@ -72,33 +72,33 @@ stories = st.lists(st.tuples(acts, st.integers(1, 15)), min_size=1, max_size=20)
 
 def play(world: World, name: str, act: str, number: int, picked: set[int]) -> None:
     """One act of a story, as far as it makes sense."""
-    puppet = world.cast.get(name)
+    fake_client = world.cast.get(name)
     if act in ("down", "up"):
         world.hub.down = act == "down"
-    elif act == "come" and puppet is None and not world.hub.down:
+    elif act == "come" and fake_client is None and not world.hub.down:
         world.come(name)
-    elif puppet is None or act == "come":
+    elif fake_client is None or act == "come":
         return
     elif act == "go" and len(world.cast) > 1:
         world.go(name)
     elif act == "touch":
-        puppet.touching.add(number)
+        fake_client.touching.add(number)
     elif act == "let":
-        puppet.touching.discard(number)
+        fake_client.touching.discard(number)
     elif act == "grab":
-        puppet.touching.add(number)
-        puppet.grabbing.add(number)
+        fake_client.touching.add(number)
+        fake_client.grabbing.add(number)
     elif act == "pick":
         # somebody who has not heard of it may pick what another has picked: both believe it, one owns it
-        first = puppet.replicator.record(number) is None and number not in puppet.carrying
-        (puppet.picking if first else puppet.grabbing).add(number)
-        puppet.carrying.add(number)
+        first = fake_client.replicator.record(number) is None and number not in fake_client.carrying
+        (fake_client.picking if first else fake_client.grabbing).add(number)
+        fake_client.carrying.add(number)
         picked.add(number)
     elif act == "lift":
-        puppet.carrying.add(number)
-        puppet.grabbing.add(number)
+        fake_client.carrying.add(number)
+        fake_client.grabbing.add(number)
     elif act == "lay":
-        puppet.carrying.discard(number)
+        fake_client.carrying.discard(number)
 
 
 @given(stories, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]), st.sampled_from([0.0, 0.3]))
@@ -113,10 +113,10 @@ def test_after_any_story_all_agree_and_nothing_picked_hangs_again(story, seed, l
     world.hub.down = False
     world.hub.loss = 0.0
     world.run(2.0)
-    for puppet in world.cast.values():  # of two who carry one thing, the one who does not own it lets go
-        for number in sorted(puppet.carrying):
-            if puppet.replicator.owner(number) != puppet.name:
-                puppet.carrying.discard(number)
+    for fake_client in world.cast.values():  # of two who carry one thing, the one who does not own it lets go
+        for number in sorted(fake_client.carrying):
+            if fake_client.replicator.owner(number) != fake_client.name:
+                fake_client.carrying.discard(number)
     world.run(1.5)
     for number in (0, 1, 2, *BUNCHES, *BOXES):
         owners = world.owners(number)
@@ -127,7 +127,7 @@ def test_after_any_story_all_agree_and_nothing_picked_hangs_again(story, seed, l
         world.come(newcomer)
         world.run(1.5)
     for number in picked:
-        known = [puppet.replicator.record(number) is not None for puppet in world.cast.values()]
+        known = [fake_client.replicator.record(number) is not None for fake_client in world.cast.values()]
         kept = world.keeper.facts.get(number) is not None
         # who picked it alone and left before anybody could hear of it took the story along
         assert all(known) == any(known) == kept
@@ -140,10 +140,10 @@ def test_a_conflict_is_over_within_a_round_trip_and_two_ticks(delay, apart, firs
     world = World("ada", "bob", "cleo", delay=delay)
     world.run(1.0 + 4.0 * delay)
     ada, bob = world.cast["ada"], world.cast["bob"]
-    for puppet, how, pause in ((ada, first, apart), (bob, second, 0)):
-        puppet.touching.add(1)
+    for fake_client, how, pause in ((ada, first, apart), (bob, second, 0)):
+        fake_client.touching.add(1)
         if how == "grab":
-            puppet.grabbing.add(1)
+            fake_client.grabbing.add(1)
         if pause:
             world.run(pause * TICK)
     world.run(TICK)  # the act itself
@@ -163,7 +163,7 @@ def test_a_conflict_is_over_within_a_round_trip_and_two_ticks(delay, apart, firs
 def test_bytes_leave_exactly_when_somebody_is_near(where, tree, near):
     """Interest, as a law: for any places, any tree, any *near*."""
     hub = MemoryHub()
-    model = row(6, apart=3.0)
+    model = tree_row(6, apart=3.0)
     cast = [
         FakeClient(hub.bus(name), model, (x, 0.0), joints=2, near=near)
         for name, x in zip(("ada", "bob", "cleo"), where, strict=True)
@@ -172,20 +172,20 @@ def test_bytes_leave_exactly_when_somebody_is_near(where, tree, near):
     def run(ticks: int) -> None:
         for _ in range(ticks):
             hub.advance(TICK)
-            for puppet in cast:
-                puppet.tick(hub.time)
+            for fake_client in cast:
+                fake_client.tick(hub.time)
 
     run(60)
     cast[0].touching.add(tree)
     run(60)
     middle = cast[0].replicator._state.tree_stream.middle[tree]
-    away = [float(np.hypot(*(puppet.place[:2] - middle[:2]))) for puppet in cast]
+    away = [float(np.hypot(*(fake_client.place[:2] - middle[:2]))) for fake_client in cast]
     sent = cast[0].replicator.counters.environment.bytes_out
     if any(abs(one - near) < 0.01 for one in away):
         return  # a pose is quantised on its way: on the very edge either may be right
     assert (sent > 0) == any(one <= near for one in away[1:])
-    for puppet, one in zip(cast[1:], away[1:], strict=True):
-        heard = tree in puppet.heard
+    for fake_client, one in zip(cast[1:], away[1:], strict=True):
+        heard = tree in fake_client.heard
         assert not (heard and one > near + interest.HYSTERESIS + 0.01)
         assert heard or not one <= near
 
@@ -197,11 +197,11 @@ def test_any_two_clocks_agree_as_far_as_jitter_allows(seed, delay, uneven, skew_
     jitter = uneven * delay
     hub = MemoryHub(delay=delay, jitter=jitter, loss=0.2, seed=seed)
     Keeper(hub)
-    ada, bob = (FakeClient(hub.bus(name), row(1), (x, 0.0), joints=2) for name, x in (("ada", 1.0), ("bob", 2.0)))
+    ada, bob = (FakeClient(hub.bus(name), tree_row(1), (x, 0.0), joints=2) for name, x in (("ada", 1.0), ("bob", 2.0)))
     for _ in range(200):
         hub.advance(TICK)
         ada.tick(hub.time + skew_a)
         bob.tick(hub.time + skew_b)
-    times = [hub.time + skew + puppet.replicator.offset for skew, puppet in ((skew_a, ada), (skew_b, bob))]
+    times = [hub.time + skew + fake_client.replicator.offset for skew, fake_client in ((skew_a, ada), (skew_b, bob))]
     for time in times:
         assert time == pytest.approx(hub.time, abs=jitter + 1e-6)

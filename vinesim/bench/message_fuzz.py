@@ -1,7 +1,8 @@
-"""``vinesim bench fuzz``: a hundred thousand broken messages from an actor that was let in, and what they did.
+"""``vinesim bench fuzz``: a hundred thousand corrupted messages from an admitted actor, and their effect.
 
-Every message begins as a sound one of any kind and is then broken: bits turned over, cut off, extended, spliced with
-another, filled with extremes, sent again later, under the key of another kind, or replaced by noise or by a megabyte.
+Every message begins as a valid one of any kind and is then corrupted: bits flipped, cut off, extended, spliced with
+another, filled with extreme values, sent again later, sent under the key of another kind, or replaced by noise or by a
+megabyte.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vinesim import frames
-from vinesim.bench.support.fake_client import FakeClient, row, swung
+from vinesim.bench.support.fake_client import FakeClient, swinging_state, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.messages import Hello, RetainedRecord
@@ -26,10 +27,10 @@ from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
 from vinesim.scene.values import Measurement
 
-EVIL = "evil"
-STORM = 100_000
-A_TICK = 50
-"""Messages in one tick: 5,000 a second, as much as eighty robots say."""
+ATTACKER = "evil"
+MESSAGE_COUNT = 100_000
+MESSAGES_PER_STEP = 50
+"""Messages in one step: 5,000 a second, as many as eighty robots send."""
 
 _EXTREMES = (
     b"\x00" * 8, b"\xff" * 8, struct.pack("<d", float("nan")), struct.pack("<d", float("inf")),
@@ -37,17 +38,17 @@ _EXTREMES = (
 )  # fmt: skip
 
 
-def sound(model: Model, actor: FakeClient, now: float, chance: random.Random) -> tuple[str, bytes]:
+def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Random) -> tuple[str, bytes]:
     """A family of keys and a message as ``actor`` might send it."""
     kind = chance.choice(("a", "c", "things", "own", "fact", "force", "hello"))
     tree = chance.randrange(len(model.tree_first))
-    claim = Claim(chance.randrange(3), chance.randrange(1 << 16), EVIL)
+    claim = Claim(chance.randrange(3), chance.randrange(1 << 16), ATTACKER)
     if kind == "a":
         return kind, encode_pose(actor.pose(now))
     if kind == "force":
         return kind, encode_wrenches(WrenchMessage(now, {"base_link": np.array([chance.uniform(-50.0, 50.0)] * 6)}))
     if kind == "c":
-        q, qd = swung(model, tree, now)
+        q, qd = swinging_state(model, tree, now)
         flags = np.array([chance.choice((0, messages.TOUCHED, messages.RESTING))])
         record = messages.TreeStates(
             now, np.array([tree]), np.array([claim.ownership]), np.array([claim.authority]), flags,
@@ -65,13 +66,13 @@ def sound(model: Model, actor: FakeClient, now: float, chance: random.Random) ->
     if kind == "own":
         return kind, messages.encode_claims([(tree, claim, chance.random() < 0.5)])
     if kind == "fact":
-        fact = RetainedRecord(object_id(ObjectKind.BUNCH, tree), claim.ownership, claim.authority, EVIL)
+        fact = RetainedRecord(object_id(ObjectKind.BUNCH, tree), claim.ownership, claim.authority, ATTACKER)
         return kind, messages.encode_records([fact])
-    return "own", messages.encode_hello(Hello(EVIL, scene="puppets", digest="puppets"))
+    return "own", messages.encode_hello(Hello(ATTACKER, scene="fake_clients", digest="fake_clients"))
 
 
-def broken(payload: bytes, other: bytes, chance: random.Random) -> bytes:
-    """The same, no longer sound; sometimes untouched."""
+def corrupt(payload: bytes, other: bytes, chance: random.Random) -> bytes:
+    """A corrupted copy of a message; sometimes unchanged."""
     data = bytearray(payload)
     how = chance.randrange(9)
     if how == 0:
@@ -98,13 +99,13 @@ def broken(payload: bytes, other: bytes, chance: random.Random) -> bytes:
 
 
 def storm(model: Model, actor: FakeClient, seed: int, now: float = 0.0) -> Iterator[tuple[str, bytes]]:
-    """Broken messages without end, each with the key it is sent under."""
+    """Corrupted messages without end, each with the key it is sent under."""
     chance = random.Random(seed)
     cells = sorted({interest.cell_of(pose[:3]) for pose in model.tree_pose.astype(float)})
     earlier = [encode_pose(actor.pose(now))]
     while True:
-        family, payload = sound(model, actor, now, chance)
-        bad = broken(payload, chance.choice(earlier), chance)
+        family, payload = valid_message(model, actor, now, chance)
+        bad = corrupt(payload, chance.choice(earlier), chance)
         if len(bad) < 1000:
             earlier = [*earlier[-50:], bad]
         if chance.random() < 0.1:
@@ -113,34 +114,34 @@ def storm(model: Model, actor: FakeClient, seed: int, now: float = 0.0) -> Itera
             family = chance.choice(("a", "c", "own", "fact", "force"))
         x, y = chance.choice(cells)
         if family == "a":
-            key = chance.choice((f"a/{EVIL}", f"a/{EVIL}/far"))
+            key = chance.choice((f"a/{ATTACKER}", f"a/{ATTACKER}/far"))
         else:
-            key = f"force/ada/{EVIL}" if family == "force" else f"{family}/{x}/{y}/{EVIL}"
+            key = f"force/ada/{ATTACKER}" if family == "force" else f"{family}/{x}/{y}/{ATTACKER}"
         now += 0.001
         yield key, bad
 
 
-def play(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.ndarray, int]:
-    """A storm against two honest puppets: both, the time of each tick of the first [s], and how many reached it."""
+def run_storm(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.ndarray, int]:
+    """A storm against two clients: both, the time of each step of the first [s], and how many messages reached it."""
     hub = MemoryHub(delay=0.005, seed=seed)
     server = hub.bus("server")
     server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
-    model = row()
+    model = tree_row()
     ada, bob, evil = (
-        FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0), (EVIL, 3.0))
+        FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0), (ATTACKER, 3.0))
     )
-    cast = (ada, bob, evil)
+    clients = (ada, bob, evil)
     for _ in range(100):
         hub.advance(0.01)
-        for puppet in cast:
-            puppet.tick(hub.time)
-    before = heard(ada)
+        for fake_client in clients:
+            fake_client.tick(hub.time)
+    before = received_count(ada)
     ada.touching = {1}
     wild = storm(model, evil, seed, hub.time)
     publishers = {}
     spent = []
-    for _ in range(-(-count // A_TICK)):
-        for _ in range(A_TICK):
+    for _ in range(-(-count // MESSAGES_PER_STEP)):
+        for _ in range(MESSAGES_PER_STEP):
             key, payload = next(wild)
             publisher = publishers.setdefault(key, evil.bus.publisher(key, reliable=True))
             publisher.put(payload)
@@ -152,23 +153,23 @@ def play(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.ndarray,
     ada.touching = {1, 2}
     for _ in range(300):  # and the world goes on
         hub.advance(0.01)
-        for puppet in (ada, bob):
-            puppet.tick(hub.time)
-    return ada, bob, np.array(spent), heard(ada) - before
+        for fake_client in (ada, bob):
+            fake_client.tick(hub.time)
+    return ada, bob, np.array(spent), received_count(ada) - before
 
 
-def heard(puppet: FakeClient) -> int:
+def received_count(fake_client: FakeClient) -> int:
     """Messages that arrived."""
-    counters = puppet.replicator.counters
+    counters = fake_client.replicator.counters
     return counters.actor.messages_in + counters.environment.messages_in + counters.event.messages_in
 
 
 def fuzz() -> Iterator[Measurement]:
-    """What the storm did."""
-    ada, _, spent, arrived = play(STORM)
+    """Rows of the benchmark."""
+    ada, _, spent, arrived = run_storm(MESSAGE_COUNT)
     counters = ada.replicator.counters
     for case, value, unit in (
-        ("broken messages sent", STORM, ""),
+        ("broken messages sent", MESSAGE_COUNT, ""),
         ("arrived where somebody listens, newest poses only", arrived, ""),
         ("counted as malformed", counters.malformed, ""),
         ("counted as sound and of no use", counters.dropped, ""),

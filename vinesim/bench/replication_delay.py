@@ -1,10 +1,11 @@
-"""``vinesim bench sync``: what delay does to a touch, to copies of bunches and robots, and to two who want one thing.
+"""``vinesim bench sync``: effect of delay on a contact, on copies of bunches and robots, and on two actors at one
+bunch.
 
 Everything but the last rows runs in simulated time over the bus in memory, whose delay, jitter and loss are seeded:
-real clients with their physics, the same figures on every machine. The last rows are processes over Zenoh and emulated
-links, in real time.
+real clients with their physics, and the same figures on every machine. The last rows are processes over Zenoh and
+emulated links, in real time.
 
-Delays are one way. Jitter is a fifth of the delay to both sides, one sample in a hundred is lost.
+Delays are one way. Jitter is a fifth of the delay to both sides, one message in a hundred is lost.
 """
 
 from __future__ import annotations
@@ -44,23 +45,23 @@ DELAYS = (0.0, 0.020, 0.050, 0.100)
 """One way [s]."""
 
 JITTER, LOSS = 0.2, 0.01
-"""Share of the delay, to both sides; chance that a sample vanishes."""
+"""Share of the delay, to both sides; probability that a message is lost."""
 
 LATE = (0.020, 0.050, 0.100, 0.150)
-"""How late a state is known that velocities bring up to now [s]."""
+"""Ages of a state that is extrapolated to now [s]."""
 
 REST_AT = 0.050
 """The delay at which a pushed bunch is followed until it rests [s]."""
 
 BUFFERS, BUFFERED_JITTER = (0.0, 0.050, 0.080, 0.100, 0.150), (0.0, 0.020, 0.040)
-"""Jitter buffers that are tried, and the jitter that they are tried against, at 50 ms of delay [s]."""
+"""Jitter buffers, and the jitter they are tested with, at 50 ms of delay [s]."""
 
 SEEN = 0.001
-"""A bunch visibly moves when a joint of its tree has turned by this [rad]: about half a millimetre."""
+"""Rotation of a joint of its tree from which a bunch visibly moves [rad]: about half a millimetre."""
 
 
 @functools.cache
-def _stage() -> tuple[Scene, Model, RobotDescription]:
+def _load_scene() -> tuple[Scene, Model, RobotDescription]:
     scene = msgspec.structs.replace(load_scene("demo"), boxes=())  # in their place the second robot will stand
     model = generate(scene)
     model.bunch_pull[:] = model.bunch_bend[:] = 1e6  # who fights by the wrong rule would tear the bunch off
@@ -71,7 +72,7 @@ class Pair:
     """Two robots within reach of one bunch, each in a client of its own, on a bus with delay."""
 
     def __init__(self, delay: float, *, jitter: float = JITTER, loss: float = LOSS, seed: int = 1) -> None:
-        self.scene, self.model, robot = _stage()
+        self.scene, self.model, robot = _load_scene()
         self.now = 100.0
         self.hub = MemoryHub(delay=delay, jitter=jitter * delay, loss=loss if delay else 0.0, seed=seed)
         server = self.hub.bus("server")
@@ -96,11 +97,11 @@ class Pair:
         """What the second client was told in its last tick."""
         receive = self.second.replicator.receive
 
-        def overhear(now: float) -> Inbox:
+        def receive_and_keep(now: float) -> Inbox:
             self.inbox = receive(now)
             return self.inbox
 
-        self.second.replicator.receive = overhear
+        self.second.replicator.receive = receive_and_keep
 
     def push(self, who: Client, **options: Any) -> PushBunch:
         """Let a robot push the bunch, once."""
@@ -109,21 +110,21 @@ class Pair:
         who.pre_step.append(reach.control)
         return reach
 
-    def take_back(self) -> None:
-        """Let whoever touches the tree take it from whoever has it, again and again: the rule that is not ours."""
+    def enable_naive_authority(self) -> None:
+        """For comparison: whoever touches the tree takes it from its owner, again and again."""
         for client in self.clients:
             rule = functools.partial(_grab, client, client.replicator.send)
             client.replicator.send = rule  # pyright: ignore[reportAttributeAccessIssue] a bench replaces the method
 
     def tick(self) -> None:
-        """One tick of everybody."""
+        """One step of both clients."""
         for client in self.clients:
             client.tick()
         self.hub.advance(DT)
         self.now += DT
 
     def meet(self) -> None:
-        """Until each has a copy of the other, and the clock is known."""
+        """Step until each has a copy of the other and the clock is known."""
         for _ in range(150):
             self.tick()
         assert self.first.remote_actors
@@ -147,11 +148,11 @@ def _trace(client: Client) -> Trace:
     return client.trace
 
 
-class Authority:
-    """The other way to do it: one simulation far away that moves all plants, and a client that shows what it says.
+class RemoteAuthority:
+    """For comparison: one remote simulation moves all plants, and a client shows what it sends.
 
-    It follows the robot's poses as any client does, but its own physics decides what they touch; every tick it sends
-    all trees that are awake.
+    It follows the poses of the robot as any client does, but its own physics decides what they touch; in every step it
+    sends all trees that are awake.
     """
 
     def __init__(self, pair: Pair) -> None:
@@ -194,8 +195,8 @@ class Authority:
 
 
 @dataclasses.dataclass
-class Rows:
-    """What a run looked like on both clients, one row a tick; ``authority`` only until the touch was seen."""
+class RunRows:
+    """States on both clients, one row a step; ``authority`` only until the contact was seen."""
 
     force: np.ndarray
     """On the bunch, by the first robot where it is at home, by the second where that is [tick, 2] N."""
@@ -212,29 +213,30 @@ class Rows:
 
     @property
     def touch(self) -> int:
-        """The first tick with a force."""
+        """The first step with a force."""
         return int(np.argmax(self.force[:, 0] > 0.0))
 
     def seen(self, who: int) -> float:
-        """From the first force until the bunch visibly moves on client ``who``, 2 the authority's [s]."""
+        """Time from the first force until the bunch visibly moves on client ``who`` [s]; 2: the remote authority's."""
         turned = dead_reckoning.angle_between(self.tree[self.touch :, who], self.tree[self.touch - 1, who]).max(-1)
         return DT * float(np.argmax(turned > SEEN)) if (turned > SEEN).any() else float("nan")
 
     def divergence(self) -> np.ndarray:
-        """Between the clients at the same instant [tick] mm, while the bunch is displaced by 2 mm on one of them."""
+        """Distance between the clients at the same instant [step] mm, while the bunch is displaced by 2 mm on one of
+        them."""
         moved = np.linalg.norm(self.bunch, axis=-1).max(-1) > 0.002
         return 1e3 * np.linalg.norm(self.bunch[moved, 0] - self.bunch[moved, 1], axis=-1)
 
 
-class Recorder:
-    """Notes a row a tick."""
+class RunRecorder:
+    """Records one row a step."""
 
-    def __init__(self, pair: Pair, authority: Authority | None = None) -> None:
+    def __init__(self, pair: Pair, authority: RemoteAuthority | None = None) -> None:
         self.pair, self.authority = pair, authority
         self._rows: list[tuple] = []
 
     def tick(self) -> None:
-        """Tick everybody and note what it led to."""
+        """Step both clients and record a row."""
         pair = self.pair
         pair.tick()
         here = pair.model.bodies_of(pair.tree)
@@ -251,17 +253,17 @@ class Recorder:
         joints = np.stack([position, told, copy])
         self._rows.append((force, bunch, np.stack(shown), states[0].joint_qd[here].astype(float), joints, speed))
 
-    def rows(self) -> Rows:
-        """All of them."""
-        return Rows(*(np.array(column) for column in zip(*self._rows, strict=True)))
+    def rows(self) -> RunRows:
+        """All rows."""
+        return RunRows(*(np.array(column) for column in zip(*self._rows, strict=True)))
 
 
-def one_push(delay: float, *, quiet: float = 0.0) -> Rows:
-    """The first robot pushes the bunch, the second looks on; then both worlds have ``quiet`` [s] at most to rest."""
+def one_push(delay: float, *, quiet: float = 0.0) -> RunRows:
+    """The first robot pushes the bunch, the second looks on; then both clients have ``quiet`` [s] to come to rest."""
     pair = Pair(delay)
     pair.meet()
     reach = pair.push(pair.first, hold_time=0.5)
-    recorder = Recorder(pair, Authority(pair))
+    recorder = RunRecorder(pair, RemoteAuthority(pair))
     until = 0
     for tick in range(2000):
         recorder.tick()
@@ -281,14 +283,14 @@ def one_push(delay: float, *, quiet: float = 0.0) -> Rows:
     return recorder.rows()
 
 
-def both_push(delay: float, *, naive: bool = False, hold: float = 4.0) -> Rows:
-    """Both push the bunch at once, from either side; ``naive``: and take it from each other for ever."""
+def both_push(delay: float, *, naive: bool = False, hold: float = 4.0) -> RunRows:
+    """Both push the bunch at once, from either side; ``naive``: with :meth:`Pair.enable_naive_authority`."""
     pair = Pair(delay)
     if naive:
-        pair.take_back()
+        pair.enable_naive_authority()
     pair.meet()
     reaches = [pair.push(client, hold_time=hold) for client in pair.clients]
-    recorder = Recorder(pair)
+    recorder = RunRecorder(pair)
     for _ in range(2000):
         recorder.tick()
         if all(reach.phase in (Phase.RETREAT, Phase.DONE) for reach in reaches):
@@ -299,7 +301,7 @@ def both_push(delay: float, *, naive: bool = False, hold: float = 4.0) -> Rows:
 # ---------------------------------------------------------------- figures
 
 
-def extrapolation(rows: Rows, ahead: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def extrapolation(rows: RunRows, ahead: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """RMS error of knowing a state ``ahead`` [s] late, with and without its velocity: the tree [rad], the robot [rad].
 
     Over the ticks in which the thing moves at all.
@@ -320,8 +322,8 @@ def extrapolation(rows: Rows, ahead: float) -> tuple[tuple[float, float], tuple[
     return (rms(errors[0][moves]), rms(errors[1][moves])), (rms(robot[0][drives]), rms(robot[1][drives]))
 
 
-def turns(signal: np.ndarray, least: float = 0.010) -> int:
-    """How often a signal [tick] turns round by at least ``least``."""
+def count_reversals(signal: np.ndarray, least: float = 0.010) -> int:
+    """How often a signal [step] reverses by at least ``least``."""
     count, way, extreme = 0, 0, float(signal[0])
     for value in signal.tolist():
         if way == 0:
@@ -334,26 +336,29 @@ def turns(signal: np.ndarray, least: float = 0.010) -> int:
     return count
 
 
-def along(rows: Rows) -> np.ndarray:
-    """Displacement of the bunch on both clients along the line between the robots [tick, 2] m."""
-    start = spawn_pose(_stage()[0], 0)[:2]
-    line = bunch_centres(_stage()[1])[find_reachable_bunch(_stage()[1], spawn_pose(_stage()[0], 0))][:2] - start
+def displacement_along(rows: RunRows) -> np.ndarray:
+    """Displacement of the bunch on both clients along the line between the robots [step, 2] m."""
+    start = spawn_pose(_load_scene()[0], 0)[:2]
+    line = (
+        bunch_centres(_load_scene()[1])[find_reachable_bunch(_load_scene()[1], spawn_pose(_load_scene()[0], 0))][:2]
+        - start
+    )
     return rows.bunch[..., :2] @ (line / np.linalg.norm(line))
 
 
-def tug(rows: Rows) -> tuple[float, float]:
-    """Period [s] with which the bunch goes to and fro while both push (infinite if it does not), and its span [mm]."""
+def oscillation(rows: RunRows) -> tuple[float, float]:
+    """Period [s] with which the bunch oscillates while both push (infinite if it does not), and its span [mm]."""
     both = np.flatnonzero((rows.force > 0.0).any(1))
-    pulled = along(rows)[both[0] + 100 : both[-1]]
-    count = max(turns(pulled[:, who]) for who in (0, 1))
+    pulled = displacement_along(rows)[both[0] + 100 : both[-1]]
+    count = max(count_reversals(pulled[:, who]) for who in (0, 1))
     span = 1e3 * float(np.percentile(pulled, 97.5) - np.percentile(pulled, 2.5))
     return (2.0 * DT * len(pulled) / count if count >= 4 else float("inf")), span
 
 
-def buffered(rows: Rows, delay: float, jitter: float, wait: float, seed: int = 5) -> tuple[float, float]:
-    """What a jitter buffer of ``wait`` [s] does to the robot's joints: RMS off where they are now, and off the path.
+def buffered(rows: RunRows, delay: float, jitter: float, wait: float, seed: int = 5) -> tuple[float, float]:
+    """Effect of a jitter buffer of ``wait`` [s] on the joints of the robot: RMS error to now, and to the path [mrad].
 
-    The path: where they were ``wait`` earlier. Both [mrad], over the moving joints' worst.
+    The path: where they were ``wait`` earlier. Of the joint with the largest error.
     """
     chance = np.random.default_rng(seed)
     own, speed = rows.joints[:, 0], rows.speed
@@ -361,11 +366,11 @@ def buffered(rows: Rows, delay: float, jitter: float, wait: float, seed: int = 5
     tick = np.rint(sent / DT).astype(int)
     arrives = DT * tick + delay + chance.uniform(-jitter, jitter, len(sent))
     arrives[chance.random(len(sent)) < LOSS] = np.inf
-    post = sorted(zip(arrives.tolist(), tick.tolist(), strict=True))
+    mail = sorted(zip(arrives.tolist(), tick.tolist(), strict=True))
     buffer, now_errors, path_errors = JitterBuffer(wait), [], []
     for k in range(len(own)):
-        while post and post[0][0] <= DT * k:
-            _, when = post.pop(0)
+        while mail and mail[0][0] <= DT * k:
+            _, when = mail.pop(0)
             buffer = buffer.insert(DT * when, own[when], speed[when])
         if DT * k < 1.0:
             continue
@@ -376,19 +381,19 @@ def buffered(rows: Rows, delay: float, jitter: float, wait: float, seed: int = 5
 
 
 def sync(delays: tuple[float, ...] = DELAYS, *, plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    """All figures; ``plot``: where to draw them."""
+    """All rows; ``plot``: file to draw them into."""
     lines: list[Measurement] = []
-    fights: dict[tuple[float, bool], Rows] = {}
+    fights: dict[tuple[float, bool], RunRows] = {}
     for line in _sync(delays, fights):
         lines.append(line)
         yield line
     if plot is not None:
         from vinesim.bench.replication_delay_plot import draw
 
-        draw(lines, {key: 1e3 * along(rows) for key, rows in fights.items()}, plot)
+        draw(lines, {key: 1e3 * displacement_along(rows) for key, rows in fights.items()}, plot)
 
 
-def _sync(delays: tuple[float, ...], fights: dict[tuple[float, bool], Rows]) -> Iterator[Measurement]:
+def _sync(delays: tuple[float, ...], fights: dict[tuple[float, bool], RunRows]) -> Iterator[Measurement]:
     def line(case: str, value: float, unit: str, peer: str = "", peer_value: float | None = None) -> Measurement:
         ratio = None if peer_value is None or not value else peer_value / value
         return Measurement("sync", case, float(value), unit, peer, peer_value, ratio)
@@ -428,7 +433,7 @@ def _sync(delays: tuple[float, ...], fights: dict[tuple[float, bool], Rows]) -> 
         yield line(f"{at}: copy of a bunch that two push, p95", theirs, "mm", "one pushes", one)
         yield line(f"{at}: the same if touching took it each time, p95", worse, "mm")
         for what, fought in (("", fight), (" if touching took it each time", naive)):
-            period, span = tug(fought)
+            period, span = oscillation(fought)
             if np.isfinite(period):
                 yield line(f"{at}: tug of war{what}, period", period, "s")
             yield line(f"{at}: tug of war{what}, span", span, "mm")

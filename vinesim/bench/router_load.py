@@ -1,9 +1,9 @@
-"""``vinesim bench load``: many clients on one router, and on two that are linked; processes over Zenoh on loopback.
+"""``vinesim bench load``: many clients on one router, and on two linked ones; processes over Zenoh on loopback.
 
-The clients are puppets: real sessions and exchanges at 60 Hz without physics, several to a process, on a plain so wide
+The clients are fake: real sessions and replicators at 60 Hz without physics, several to a process, on a plain so wide
 that each has the neighbours it would have in a vineyard. A probe, two bare sessions of another process, sends poses
-through the same routers meanwhile and tells delay and loss. Where the clients' processes need all of the machine, the
-figures say what this machine can play, not what the router can carry: both shares of its cores are told.
+through the same routers and measures delay and loss. Where the clients need the whole machine, the figures describe the
+machine, not the router: the shares of both are reported.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from vinesim.scene.values import Measurement, RobotUpdate
 COUNTS = (10, 30, 100)
 PER_PROCESS = 10
 PER_CORE = 15
-"""A core plays so many puppets at 60 Hz; more would measure how they starve, not what a router carries."""
+"""Fake clients that one core runs at 60 Hz; with more, the figures would describe how they starve."""
 
 SECONDS = 6.0
 MEETING = 30.0
-"""How long clients may take to meet [s]."""
+"""Time limit for all clients to meet [s]."""
 
 APART = 8.0
-"""Between neighbours on the plain [m]: each then hears four others at the full rate."""
+"""Distance between neighbours on the plain [m]: each receives four others at the full rate."""
 
 PROBE = """
 import json, struct, sys, threading, time
@@ -58,8 +58,8 @@ with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", 
             time.sleep(0.0005)
 
     over = threading.Event()
-    ear = threading.Thread(target=listen)
-    ear.start()
+    listener = threading.Thread(target=listen)
+    listener.start()
     start = time.monotonic()
     while time.monotonic() < start + seconds:
         publisher.put(struct.pack("d", time.monotonic()) + bytes(200))
@@ -67,7 +67,7 @@ with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", 
         time.sleep(max(0.0, start + sent / 60.0 - time.monotonic()))
     time.sleep(1.0)
     over.set()
-    ear.join()
+    listener.join()
     print(json.dumps([sent, ages]))
 """
 
@@ -100,33 +100,33 @@ def router(*options: str) -> Iterator[tuple[str, subprocess.Popen]]:
 
 
 def cpu(process: subprocess.Popen) -> float:
-    """Time a process and its threads have used [s]."""
+    """CPU time of a process and its threads [s]."""
     with open(f"/proc/{process.pid}/stat") as file:
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measurement]:
-    """``count`` clients, shared out among the routers."""
+    """``count`` clients, distributed over the routers."""
     side = math.ceil(math.sqrt(count))
-    puppets = [{"name": f"p{i}", "place": [APART * (i % side), APART * (i // side)]} for i in range(count)]
-    groups = [puppets[i : i + PER_PROCESS] for i in range(0, count, PER_PROCESS)]
+    fake_clients = [{"name": f"p{i}", "place": [APART * (i % side), APART * (i // side)]} for i in range(count)]
+    groups = [fake_clients[i : i + PER_PROCESS] for i in range(0, count, PER_PROCESS)]
     with contextlib.ExitStack() as stack:
-        stages = [
+        processes = [
             stack.enter_context(FakeClientProcess(ends[i % len(ends)][0], group, trees=1, tick=1.0 / 60.0))
             for i, group in enumerate(groups)
         ]
         start = time.monotonic()
-        while any(len(stage.tell()["others"]) < count - 1 for stage in stages):
+        while any(len(process.command()["others"]) < count - 1 for process in processes):
             if time.monotonic() > start + MEETING:
                 break
             time.sleep(0.2)
-        met = min(len(stage.tell()["others"]) for stage in stages) + 1
+        met = min(len(process.command()["others"]) for process in processes) + 1
         took = time.monotonic() - start
-        before = [cpu(process) for _, process in ends], [stage.tell() for stage in stages], time.monotonic()
+        before = [cpu(process) for _, process in ends], [process.command() for process in processes], time.monotonic()
         arguments = [ends[0][0], ends[-1][0], str(SECONDS)]
         probe = subprocess.run([sys.executable, "-c", PROBE, *arguments], capture_output=True, text=True)
-        after = [cpu(process) for _, process in ends], [stage.tell() for stage in stages], time.monotonic()
+        after = [cpu(process) for _, process in ends], [process.command() for process in processes], time.monotonic()
     wall = after[2] - before[2]
     routers = sum(b - a for a, b in zip(before[0], after[0], strict=True)) / wall
     clients = sum(b["cpu"] - a["cpu"] for a, b in zip(before[1], after[1], strict=True)) / wall
@@ -158,7 +158,7 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
 
 
 def load() -> Iterator[Measurement]:
-    """10, 30 and 100 clients on one router, then shared out between two that are linked, as far as there are cores."""
+    """10, 30 and 100 clients on one router, then on two linked ones, as far as there are cores."""
     most = PER_CORE * len(os.sched_getaffinity(0))
     yield Measurement("load", "clients that the cores of this machine can play", float(most), "")
     with router() as first:

@@ -1,7 +1,7 @@
-"""``vinesim bench link``: a touch seen from far away, by whole clients over Zenoh and emulated links, in real time.
+"""``vinesim bench link``: a contact seen from far away, by whole clients over Zenoh and emulated links, in real time.
 
-Server and clients are processes, each in a network namespace of its own. The picker pushes a bunch again and again,
-the visitor watches the same bunch in its own world; both note it by the host's clock.
+Server and clients are processes, each in a network namespace of its own. The picker pushes a bunch again and again, the
+visitor watches the same bunch in its own simulation; both trace it by the clock of the host.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ LINES = {
     "20 +- 4 ms one way, 1 % lost": Link(LinkProfile(0.010, 0.002, 0.005)),
     "50 +- 10 ms one way, 1 % lost": Link(LinkProfile(0.025, 0.005, 0.005)),
 }
-"""Of each client to the server: from client to client it is twice that."""
+"""Link of each client to the server; from client to client it is twice that."""
 
 SECONDS = 26.0
-"""How long the clients run: some four pushes."""
+"""Running time of the clients [s]: some four pushes."""
 
 START = 150.0
-"""How long a client may take to start and to write what it saw [s]."""
+"""Time limit for a client to start, and to write its trace [s]."""
 
 SEEN = 0.002
-"""A bunch has visibly moved when its centre is so far from where it was at the touch [m]."""
+"""Displacement from which a bunch has visibly moved [m]."""
 
 TOUCHES = 40
-"""Of light clients."""
+"""Contacts of fake clients."""
 
 STILL = 0.001
-"""Only touches count of a bunch that moved by less than this in the 0.3 s before [m]: it swings from the last."""
+"""Only contacts count of a bunch that moved by less than this in the 0.3 s before [m]."""
 
 APART = 1.0
-"""Touches are new when nothing touched for so long [s]."""
+"""A contact is new after so long without one [s]."""
 
 
 def touches(rows: Rows) -> list[int]:
@@ -59,7 +59,8 @@ def touches(rows: Rows) -> list[int]:
 
 
 def moves(rows: Rows, since: float) -> float:
-    """How long after ``since`` [s, host's clock] the bunch visibly moves [s]; infinite if it does not in a second."""
+    """Time from ``since`` [s, clock of the host] until the bunch visibly moves [s]; infinite if it does not within a
+    second."""
     first = int(np.searchsorted(rows.clock, since))
     here = slice(first, int(np.searchsorted(rows.clock, since + 1.0)))
     if first == 0 or here.stop <= first:
@@ -68,8 +69,8 @@ def moves(rows: Rows, since: float) -> float:
     return float(rows.clock[first + int(np.argmax(away > SEEN))] - since) if (away > SEEN).any() else np.inf
 
 
-def watched(line: Link) -> tuple[Rows, Rows]:
-    """What the picker and the visitor saw of the same bunch."""
+def run_clients(line: Link) -> tuple[Rows, Rows]:
+    """Traces of the picker and of the visitor, of the same bunch."""
     scene = load_scene("demo")
     bunch = str(find_reachable_bunch(generate(scene), spawn_pose(scene, 0)))
     client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
@@ -93,10 +94,10 @@ def watched(line: Link) -> tuple[Rows, Rows]:
     return picker, visitor
 
 
-def told(line: Link, touches: int = TOUCHES) -> list[float]:
-    """From the tick of a touch to the tick in which another client is told of it [s]: light clients, see :mod:`puppet`.
+def measure_notification(line: Link, touches: int = TOUCHES) -> list[float]:
+    """Time from the step of a contact to the step in which another client is informed [s]: fake clients.
 
-    Their ticks are kept even on a busy machine, so this is the network's share, and the waiting for two ticks.
+    Their steps are kept even on a busy machine, so this is the share of the network, and the wait for two steps.
     """
     with NetworkEmulator({"ada": line, "bob": line}) as net:
         server = net.start(
@@ -106,37 +107,39 @@ def told(line: Link, touches: int = TOUCHES) -> list[float]:
         assert server.stdout is not None
         server.stdout.readline()
 
-        def stage(name: str, x: float) -> FakeClientProcess:
-            cast = [{"name": name, "place": [x, 0.0]}]
-            return FakeClientProcess(f"tcp/{net.hub(name)}:7447", cast, start=lambda *a, **k: net.start(name, *a, **k))
+        def start_process(name: str, x: float) -> FakeClientProcess:
+            fake_clients = [{"name": name, "place": [x, 0.0]}]
+            return FakeClientProcess(
+                f"tcp/{net.hub(name)}:7447", fake_clients, start=lambda *a, **k: net.start(name, *a, **k)
+            )
 
-        with stage("ada", 1.0) as ada, stage("bob", 2.0) as bob:
+        with start_process("ada", 1.0) as ada, start_process("bob", 2.0) as bob:
             end = time.monotonic() + START
-            while not (bob.tell()["poses"] and ada.tell()["poses"]) and time.monotonic() < end:
+            while not (bob.command()["poses"] and ada.command()["poses"]) and time.monotonic() < end:
                 time.sleep(0.05)
             took = []
             for number in range(touches):
                 tree = str(number % 3)
-                start = ada.tell(touch=[int(tree)])["now"]
-                while bob.tell()["heard"].get(tree, -np.inf) < start and time.monotonic() < end:
+                start = ada.command(touch=[int(tree)])["now"]
+                while bob.command()["heard"].get(tree, -np.inf) < start and time.monotonic() < end:
                     time.sleep(0.01)
-                first = bob.tell()["first"].get(tree, np.inf)
+                first = bob.command()["first"].get(tree, np.inf)
                 took.append(first - start)
-                ada.tell(touch=[])
-                while bob.tell()["owner"].get(tree) is not None and time.monotonic() < end:
+                ada.command(touch=[])
+                while bob.command()["owner"].get(tree) is not None and time.monotonic() < end:
                     time.sleep(0.01)
                 time.sleep(0.037)
     return [one for one in took if 0.0 <= one < 2.0]
 
 
 def link() -> Iterator[Measurement]:
-    """Rows for each line."""
+    """Rows for each link."""
     for case, line in LINES.items():
-        took = 1e3 * np.array(told(line))
+        took = 1e3 * np.array(measure_notification(line))
         for share in (50, 95):
             yield Measurement("link", f"{case}: touch to told, p{share}", float(np.percentile(took, share)), "ms")
     for case, line in LINES.items():
-        picker, visitor = watched(line)
+        picker, visitor = run_clients(line)
         known = [picker.clock[row] for row in touches(picker) if visitor.told.any()]
         both = [(moves(picker, start), moves(visitor, start)) for start in known]
         both = [(1e3 * here, 1e3 * there) for here, there in both if np.isfinite(here) and np.isfinite(there)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -72,7 +71,7 @@ class Status:
             "ticks_touching_when_far": client.interest_audit.ticks_touching,
             "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "malformed": client.replicator.counters.malformed,
-            "network": dataclasses.asdict(client.replicator.counters),
+            "network": client.replicator.counters.to_report(),
             "deadlines_dropped": self.rate_loop.dropped,
         }
         if client.trace is not None:

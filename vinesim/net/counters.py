@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 
 @dataclasses.dataclass(slots=True)
@@ -46,3 +47,7 @@ class Counters:
     dropped: int = 0
     """Valid messages and states that were not used: outdated, of an unknown peer, too far away, or of a lesser claim.
     """
+
+    def to_report(self) -> dict[str, Any]:
+        """All counters under the keys of ``report.json``, where retained records are called ``fact``."""
+        return {"fact" if name == "retained" else name: value for name, value in dataclasses.asdict(self).items()}

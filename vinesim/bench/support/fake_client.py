@@ -1,10 +1,11 @@
-"""Actors without physics: scripted poses and trees on a real replicator. What the network does is measured with them.
+r"""Clients without physics: scripted poses and objects on a real replicator, to measure and test the network.
 
-    python -m vinesim.bench.support.fake_client '{"connect": "tcp/127.0.0.1:7447", "puppets": [{"name": "ada", "place":
-    [1, 0]}]}'
+python -m vinesim.bench.support.fake_client \ '{"connect": "tcp/127.0.0.1:7447", "fake_clients": [{"name": "ada",
+"place": [1, 0]}]}'
 
-Such a process answers each line on its input, a JSON object, with one line: ``{"who": "ada", "touch": [3]}`` lets it
-act, and every answer is its :meth:`Puppet.report`. It ends with its input.
+Such a process answers each line of its input, a JSON object, with one line: ``{"who": "ada", "touch": [3]}`` is a
+command for one client (:meth:`FakeClient.apply`), and every answer is its :meth:`FakeClient.report`. It ends with its
+input.
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from vinesim.scene.ids import is_tree
 from vinesim.scene.model import Model
 from vinesim.scene.values import POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
-TICK = 0.01
-"""A client's tick [s]."""
+STEP_PERIOD = 0.01
+"""Time step of a client [s]."""
 
 ROBOT_JOINTS = 27
-"""As many as vinebot has."""
+"""Joints of a robot, as many as vinebot has."""
 
 SWAY, SWING = 0.12, 1.3
-"""The tip of a touched tree sways by so much [m], so often [Hz]: its owner must then speak 12 to 20 times a second, as
-for a cane that a robot pushes (13 times in the 0.4 s of the push itself, then 14 times in a second of holding it)."""
+"""Amplitude [m] and frequency [Hz] of the tip of a touched tree: its owner must then publish 12 to 20 times a second,
+as for a cane that a robot pushes (measured: 13 messages in the 0.4 s of a push, then 14 in a second of holding)."""
 
 
-def row(count: int = 12, *, apart: float = 1.0) -> Model:
-    """Trees of six bodies and a bunch along x, the first at half their distance [m], and a box below each."""
+def tree_row(count: int = 12, *, apart: float = 1.0) -> Model:
+    """Trees of six bodies with a bunch along x, the first at half their distance [m], and a box below each."""
     trees = []
     for number in range(count):
         tree = TreeBuilder(frames.pose(np.array([(number + 0.5) * apart, 0.0, 1.5])))
@@ -56,11 +57,11 @@ def row(count: int = 12, *, apart: float = 1.0) -> Model:
 
 
 SILENCE = 1.5
-"""After this [s] without news of a tree the next ones begin a new touch."""
+"""Time without news of a tree after which the next message counts as a new contact [s]."""
 
 
 class FakeClient:
-    """The least client: it stands somewhere and swings its arms, touches trees, and believes what it hears."""
+    """The smallest client: it stands somewhere, swings its joints, touches objects, and takes over what it receives."""
 
     def __init__(
         self,
@@ -70,64 +71,64 @@ class FakeClient:
         *,
         kind: str = "robot",
         joints: int = ROBOT_JOINTS,
-        digest: str = "puppets",
+        digest: str = "fake_clients",
         near: float = interest.INTEREST_RADIUS,
         restless: bool = True,
     ) -> None:
-        """Stand at ``place`` [2] m; ``restless`` lets the joints swing, so that no two poses are alike."""
+        """Stand at ``place`` [2] m; ``restless`` lets the joints swing, so that no two poses are equal."""
         joints = 0 if kind == "human" else joints
-        hello = Hello(bus.name, kind=kind, scene="puppets", digest=digest, joints=joints)
+        hello = Hello(bus.name, kind=kind, scene="fake_clients", digest=digest, joints=joints)
         self.bus, self.model, self.name = bus, model, bus.name
         self.replicator = Replicator(bus, hello, model, interest_radius=near)
         self.place = np.array([*place, 0.0])
         self.joints, self.restless = joints, restless
         self.touching: set[int] = set()
-        """Trees it touches."""
+        """Trees it is in contact with."""
         self.swinging: set[int] = set()
-        """Trees that move though it does not touch them."""
+        """Trees that move without contact."""
         self.grabbing: set[int] = set()
-        """Things it grabs in its next tick."""
+        """Objects it grabs in its next step."""
         self.picking: set[int] = set()
-        """Bunches that it takes off their vines in its next tick, and carries then."""
+        """Bunches that it picks in its next step and then carries."""
         self.carrying: set[int] = set()
-        """Boxes and loose bunches that move in its hands; what is let go rests where it is at once."""
+        """Boxes and free bunches that move in its hands; what is released rests at once where it is."""
         self.parents: dict[int, str] = {}
-        """Where what it lets go of comes to lie, if not on the ground."""
+        """Frame in which a released object rests, if not the world."""
         self.sway = SWAY
-        self.came: dict[str, float] = {}
-        self.went: dict[str, float] = {}
+        self.joined_at: dict[str, float] = {}
+        self.left_at: dict[str, float] = {}
         self.heard: dict[int, float] = {}
-        """When each tree was last heard of, by one's own clock [s]."""
+        """When each object was last updated [s, own clock]."""
         self.first: dict[int, float] = {}
-        """When news of each tree last began to come [s]."""
+        """When updates of each tree began after a pause [s, own clock]."""
         self._rested: set[int] = set()
         self.moved: dict[int, np.ndarray] = {}
-        """Where others last moved boxes and loose bunches [7]."""
+        """Last received poses [7] of boxes and free bunches."""
         self.facts: dict[int, dict[str, Any]] = {}
-        """What it was told for good of each thing."""
+        """Retained records that it received, by object."""
         self.released: list[int] = []
         self.reads = 0
         self.ticks = 0
         self.robots: dict[str, RobotUpdate | HumanUpdate] = {}
-        """The others, as last shown."""
+        """The peers as last shown."""
         self._now = 0.0
 
     def tick(self, now: float) -> None:
-        """One tick of a client's share in the network."""
+        """One step of a client."""
         self._now = now
         inbox = self.replicator.receive(now)
         for hello in inbox.joined:
-            self.came[hello.name] = now
+            self.joined_at[hello.name] = now
         for name in inbox.left:
-            self.went[name] = now
+            self.left_at[name] = now
         for update in inbox.trees:
             if now - self.heard.get(update.tree, -np.inf) > SILENCE or update.tree in self._rested:
                 self.first[update.tree] = now
             self.heard[update.tree] = now
             (self._rested.add if update.resting else self._rested.discard)(update.tree)
-        for thing in inbox.objects:
-            if thing.object not in self.moved or not np.array_equal(self.moved[thing.object], thing.pose):
-                self.moved[thing.object], self.heard[thing.object] = thing.pose, now
+        for object_id in inbox.objects:
+            if object_id.object not in self.moved or not np.array_equal(self.moved[object_id.object], object_id.pose):
+                self.moved[object_id.object], self.heard[object_id.object] = object_id.pose, now
         for fact, holds in inbox.records:
             self.facts[fact.object] = {"parent": fact.parent, "moving": fact.moving, "holds": holds, "pose": fact.pose}
         self.released += inbox.released
@@ -137,12 +138,12 @@ class FakeClient:
         self.carrying |= picked
         self.replicator.send(
             now, self.pose(now), touched=self.touching | self.carrying, moving=self.swinging, read=self.read,
-            grabbed=grabbed | picked, detached=picked, pose_on_support=self.lies,
+            grabbed=grabbed | picked, detached=picked, pose_on_support=self.pose_on_support,
         )  # fmt: skip
         self.ticks += 1
 
     def pose(self, now: float) -> RobotUpdate | HumanUpdate:
-        """What it would say of itself at ``now``."""
+        """The own pose at ``now`` [s]."""
         if self.replicator.hello.kind == "human":
             points = np.tile(frames.pose(self.place), (len(POINT_NAMES), 1))
             points[:, 2] = (0.0, 1.65, 1.1 + 0.2 * np.sin(2.0 * now), 1.1, 0.9, 0.1, 0.1)
@@ -153,26 +154,26 @@ class FakeClient:
         speed = 0.6 * np.cos(phase) if self.restless else np.zeros(self.joints)
         return RobotUpdate(self.name, now, frames.pose(self.place), np.zeros(6), 0.3 * np.sin(phase), speed)
 
-    def held(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pose [7] and velocity [6] of what it carries: to and fro above where it stands."""
-        phase = 2.0 * np.pi * SWING * (self._now + self.replicator.offset) + thing
+    def carried_state(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pose [7] and velocity [6] of what it carries: to and fro above its place."""
+        phase = 2.0 * np.pi * SWING * (self._now + self.replicator.offset) + object_id
         pose, velocity = frames.pose(self.place + np.array([0.2 * np.sin(phase), 0.0, 1.0])), np.zeros(6)
         velocity[0] = 0.4 * np.pi * SWING * np.cos(phase)
         return pose, velocity
 
-    def lies(self, thing: int) -> tuple[str, np.ndarray]:
-        """Parent and pose [7] of what was let go."""
-        return self.parents.get(thing, ""), self.held(thing)[0]
+    def pose_on_support(self, object_id: int) -> tuple[str, np.ndarray]:
+        """Parent frame and pose [7] of a released object."""
+        return self.parents.get(object_id, ""), self.carried_state(object_id)[0]
 
-    def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
-        """How a thing it moves stands; a tree swings about one axis of every joint, the same on every clock."""
+    def read(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
+        """State of an object; a tree swings about one axis of every joint, equally on every clock."""
         self.reads += 1
-        if not is_tree(thing):
-            return self.held(thing)
-        return swung(self.model, thing, self._now + self.replicator.offset, self.sway)
+        if not is_tree(object_id):
+            return self.carried_state(object_id)
+        return swinging_state(self.model, object_id, self._now + self.replicator.offset, self.sway)
 
     def report(self) -> dict[str, Any]:
-        """All that a test may want to know."""
+        """Everything that a test may need."""
         replicator = self.replicator
         return {
             "name": self.name,
@@ -181,10 +182,10 @@ class FakeClient:
             "now": self._now,
             "offset": replicator.offset,
             "others": sorted(replicator.peers),
-            "came": self.came,
-            "went": self.went,
-            "owner": {thing: replicator.owner(thing) for thing in sorted(replicator.known)},
-            "claim": {thing: list(replicator.claim(thing)) for thing in sorted(replicator.known)},
+            "joined_at": self.joined_at,
+            "left_at": self.left_at,
+            "owner": {object_id: replicator.owner(object_id) for object_id in sorted(replicator.known)},
+            "claim": {object_id: list(replicator.claim(object_id)) for object_id in sorted(replicator.known)},
             "facts": self.facts,
             "heard": self.heard,
             "first": self.first,
@@ -196,12 +197,13 @@ class FakeClient:
             "trouble": self.bus.status_message,
         }
 
-    def apply(self, order: dict[str, Any]) -> None:
-        """``touch``, ``swing``, ``grab``, ``pick``, ``carry``: things; ``lay``: {thing: parent} of what is let go.
+    def apply(self, command: dict[str, Any]) -> None:
+        """``touch``, ``swing``, ``grab``, ``pick``, ``carry``: object ids; ``lay``: {object id: parent frame} of what
+        is released.
 
         ``place``: [x, y] m; ``sway``: m.
         """
-        for what, value in order.items():
+        for what, value in command.items():
             if what == "touch":
                 self.touching = set(value)
             elif what == "swing":
@@ -213,17 +215,17 @@ class FakeClient:
             elif what == "carry":
                 self.carrying = set(value)
             elif what == "lay":
-                self.parents |= {int(thing): parent for thing, parent in value.items()}
+                self.parents |= {int(object_id): parent for object_id, parent in value.items()}
                 self.carrying -= self.parents.keys()
             elif what == "place":
                 self.place[:2] = value
             elif what == "sway":
                 self.sway = float(value)
             else:
-                raise ValueError(f"puppets do not know {what!r}")
+                raise ValueError(f"fake_clients do not know {what!r}")
 
 
-def swung(model: Model, tree: int, time: float, sway: float = SWAY) -> tuple[np.ndarray, np.ndarray]:
+def swinging_state(model: Model, tree: int, time: float, sway: float = SWAY) -> tuple[np.ndarray, np.ndarray]:
     """Joint rotations [n, 4] and rates [n, 3] rad/s of a tree whose tip sways by ``sway`` [m] for ever."""
     bodies = model.bodies_of(tree)
     length = float(model.body_length[bodies].sum())
@@ -240,40 +242,40 @@ def swung(model: Model, tree: int, time: float, sway: float = SWAY) -> tuple[np.
 
 
 class FakeClientProcess:
-    """Puppets in a process of their own, seen from the one that plays with them. A context manager."""
+    """Fake clients in a process of their own, seen from the process that started it. A context manager."""
 
     def __init__(
         self,
         connect: str,
-        puppets: Iterable[dict[str, Any]],
+        fake_clients: Iterable[dict[str, Any]],
         *,
         start: Callable[..., subprocess.Popen] = subprocess.Popen,
         **options: Any,
     ) -> None:
-        """``start(command, **options of Popen)`` may put it into a namespace; ``options`` as in :func:`play`."""
-        wanted = json.dumps({"connect": connect, "puppets": list(puppets), **options})
+        """``start(command, **options of Popen)`` may start it in a namespace; ``options`` as in :func:`run`."""
+        wanted = json.dumps({"connect": connect, "fake_clients": list(fake_clients), **options})
         self.process = start(
             [sys.executable, "-m", "vinesim.bench.support.fake_client", wanted],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
-        self._hear()
+        self._read_line()
 
-    def tell(self, who: str = "", **order: Any) -> dict[str, Any]:
-        """Order a puppet about; its report of a moment later."""
+    def command(self, who: str = "", **command: Any) -> dict[str, Any]:
+        """Send a command to one client; its report after the next step."""
         assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps({"who": who, **order}) + "\n")
+        self.process.stdin.write(json.dumps({"who": who, **command}) + "\n")
         self.process.stdin.flush()
-        return self._hear()
+        return self._read_line()
 
-    def _hear(self) -> dict[str, Any]:
+    def _read_line(self) -> dict[str, Any]:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
-            raise RuntimeError(f"the puppets' process ended with {self.process.wait()}")
+            raise RuntimeError(f"the fake_clients' process ended with {self.process.wait()}")
         return json.loads(line)
 
     def close(self) -> None:
-        """Let the puppets leave, and wait for it."""
+        """Let the clients leave, and wait for the process."""
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None and not pipe.closed:
                 with contextlib.suppress(BrokenPipeError):
@@ -292,38 +294,38 @@ class FakeClientProcess:
 
 
 def run(
-    connect: str, puppets: list[dict[str, Any]], *, trees: int = 12, apart: float = 1.0, tick: float = TICK,
+    connect: str, fake_clients: list[dict[str, Any]], *, trees: int = 12, apart: float = 1.0, tick: float = STEP_PERIOD,
     skew: float = 0.0,
 ) -> None:  # fmt: skip
-    """Tick puppets over Zenoh and do what the standard input says, until it ends. ``skew`` [s] sets the clock wrong."""
+    """Step clients over Zenoh and apply commands from standard input until it ends. ``skew`` [s]: clock error."""
     from vinesim.net.transport.zenoh_bus import ZenohBus
 
-    model = row(trees, apart=apart)
-    orders: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-    cast: dict[str, FakeClient] = {}
+    model = tree_row(trees, apart=apart)
+    commands: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+    by_name: dict[str, FakeClient] = {}
     late = 0
     try:
-        for one in puppets:
+        for one in fake_clients:
             name, place = one.pop("name"), one.pop("place")
-            cast[name] = FakeClient(ZenohBus(name, connect=connect), model, place, **one)
-        threading.Thread(target=_listen, args=(orders,), daemon=True).start()
-        _say({"ready": True})
+            by_name[name] = FakeClient(ZenohBus(name, connect=connect), model, place, **one)
+        threading.Thread(target=_read_commands, args=(commands,), daemon=True).start()
+        _write_line({"ready": True})
         due = time.monotonic()
         answering: list[str] = []
         while True:
             begin = time.monotonic()
-            for puppet in cast.values():
-                puppet.tick(begin + skew)
+            for fake_client in by_name.values():
+                fake_client.tick(begin + skew)
             for name in answering:
                 load = {"late": late, "cpu": time.process_time(), "clock": time.monotonic()}
-                _say(cast[name].report() | load)
+                _write_line(by_name[name].report() | load)
             answering.clear()
-            while not orders.empty():
-                order = orders.get()
-                if order is None:
+            while not commands.empty():
+                command = commands.get()
+                if command is None:
                     return
-                name = order.pop("who") or next(iter(cast))
-                cast[name].apply(order)
+                name = command.pop("who") or next(iter(by_name))
+                by_name[name].apply(command)
                 answering.append(name)  # after its next tick
             due += tick
             late += time.monotonic() - due > tick
@@ -331,19 +333,19 @@ def run(
                 due = time.monotonic()
             time.sleep(max(0.0, due - time.monotonic()))
     finally:
-        for puppet in cast.values():
-            puppet.bus.close()
+        for fake_client in by_name.values():
+            fake_client.bus.close()
 
 
-def _say(what: dict[str, Any]) -> None:
+def _write_line(what: dict[str, Any]) -> None:
     sys.stdout.write(json.dumps(what) + "\n")
     sys.stdout.flush()
 
 
-def _listen(orders: queue.SimpleQueue) -> None:
+def _read_commands(commands: queue.SimpleQueue) -> None:
     for line in sys.stdin:
-        orders.put(json.loads(line))
-    orders.put(None)
+        commands.put(json.loads(line))
+    commands.put(None)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,14 @@
-"""Links of a wide network on one machine: delay, jitter, loss and cuts between network namespaces, every byte counted.
+"""Emulated links of a wide network on one machine: delay, jitter, loss and cuts between network namespaces.
 
-    with Emulator({"ada": Line(Way(0.05, 0.02, 0.01)), "bob": Line()}) as net:
-        server = net.start("hub", ["vinesim", "server", "--listen", "tcp/0.0.0.0:7447"])
-        client = net.start("ada", ["vinesim", "client", "--connect", f"tcp/{net.hub('ada')}:7447"])
-        sent, received = net.counts("ada")
+with NetworkEmulator({"ada": Link(LinkProfile(0.05, 0.02, 0.01)), "bob": Link()}) as net: server = net.start("hub",
+["vinesim", "server", "--listen", "tcp/0.0.0.0:7447"]) client = net.start("ada", ["vinesim", "client", "--connect",
+f"tcp/{net.hub('ada')}:7447"]) sent, received = net.counts("ada")
 
-Each end of the star is a namespace of its own, joined to the hub's by a pair of TUN devices, and a process between
-them carries the packets: not every kernel has tc-netem, all have TUN. It needs Linux and root, see :func:`unusable`.
+Each end of the star is a namespace of its own, joined to the hub's by a pair of TUN devices, and a process between them
+forwards the packets: not every kernel has tc-netem, all have TUN. It needs Linux and root, see :func:`unusable`.
 
-The namespaces carry the process id of their maker. That process may die in whatever way: the carrier notices and
-takes them away, and should it be killed too, the next emulator does.
+The namespaces carry the process id of the process that created them. If that process dies, the forwarding process
+removes them; if that is killed, too, the next emulator does.
 """
 
 from __future__ import annotations
@@ -31,18 +30,18 @@ import time
 from typing import IO, Any, Self
 
 HUB = "hub"
-"""The end that all lines lead to."""
+"""Name of the end to which all links lead."""
 
 _PREFIX = "vinesim-link"
 _TUNSETIFF, _TUN, _NO_PACKET_INFO = 0x400454CA, 0x0001, 0x1000
-_LARGEST = 2048
+_MAX_PACKET = 2048
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LinkProfile:
     """How packets travel in one direction: uniformly between ``delay`` - ``jitter`` and ``delay`` + ``jitter`` [s].
 
-    They stay in order, as in the queue of a router; ``loss`` is the chance that one vanishes.
+    They stay in order, as in the queue of a router; ``loss`` is the probability that one is lost.
     """
 
     delay: float = 0.0
@@ -56,7 +55,7 @@ class LinkProfile:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Link:
-    """One end's connection with the hub; what comes back travels as what goes there, unless said otherwise."""
+    """The link between one end and the hub; both directions are equal unless ``back`` is given."""
 
     there: LinkProfile = LinkProfile()
     back: LinkProfile | None = None
@@ -68,12 +67,12 @@ class Link:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Count:
-    """What was put on a line in one direction, IP headers and all."""
+    """Packets in one direction, with their IP headers."""
 
     packets: int = 0
     bytes: int = 0
     lost: int = 0
-    """How many of the packets did not arrive."""
+    """Packets that did not arrive."""
 
     def __sub__(self, earlier: Count) -> Count:
         return Count(self.packets - earlier.packets, self.bytes - earlier.bytes, self.lost - earlier.lost)
@@ -106,28 +105,28 @@ class NetworkEmulator:
         for end in lines:
             if end == HUB or not re.fullmatch(r"[a-z0-9]{1,12}", end):
                 raise ValueError(f"end {end!r}: use 1 to 12 small letters and digits, not {HUB!r}")
-        _sweep()
+        _remove_stale_namespaces()
         self._ends = {end: i + 1 for i, end in enumerate(lines)}
         self._started: list[subprocess.Popen] = []
-        made = {end: self._space(end) for end in (HUB, *lines)}
-        self._carrier = subprocess.Popen(
+        made = {end: self._namespace(end) for end in (HUB, *lines)}
+        self._forwarder = subprocess.Popen(
             [sys.executable, "-m", "vinesim.bench.support.network_emulator"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
-        shapes = {end: _plain(line) for end, line in lines.items()}
+        shapes = {end: _to_json(line) for end, line in lines.items()}
         try:
-            self._tell({"spaces": made, "lines": shapes, "seed": seed})
+            self._request({"spaces": made, "lines": shapes, "seed": seed})
         except BaseException:
             self.close()
             raise
 
-    def _space(self, end: str) -> str:
+    def _namespace(self, end: str) -> str:
         return f"{_PREFIX}-{os.getpid()}-{id(self):x}-{end}"
 
-    def _tell(self, what: dict[str, Any]) -> Any:
-        carrier = self._carrier
+    def _request(self, what: dict[str, Any]) -> Any:
+        carrier = self._forwarder
         assert carrier.stdin is not None
         assert carrier.stdout is not None
         carrier.stdin.write(json.dumps(what) + "\n")
@@ -147,25 +146,25 @@ class NetworkEmulator:
 
     def start(self, end: str, command: list[str], **options: Any) -> subprocess.Popen:
         """Run a command in the namespace of an end or of the hub; it ends with the emulator at the latest."""
-        process = subprocess.Popen(["ip", "netns", "exec", self._space(end), *command], **options)
+        process = subprocess.Popen(["ip", "netns", "exec", self._namespace(end), *command], **options)
         self._started.append(process)
         return process
 
     def shape(self, end: str, line: Link) -> None:
-        """Let the line of ``end`` behave otherwise from now on."""
-        self._tell({"shape": end, "line": _plain(line)})
+        """Change the link of ``end`` from now on."""
+        self._request({"shape": end, "line": _to_json(line)})
 
     def disconnect(self, end: str) -> None:
-        """Nothing passes any more, until :meth:`shape`."""
+        """Drop all packets of a link, until :meth:`shape`."""
         self.shape(end, Link(LinkProfile(loss=1.0)))
 
     def counts(self, end: str) -> tuple[Count, Count]:
-        """What ``end`` put on its line so far, and what the hub put on it."""
-        there, back = self._tell({"counts": end})
+        """Packets that ``end`` has sent on its link, and that the hub has sent on it."""
+        there, back = self._request({"counts": end})
         return Count(*there), Count(*back)
 
     def close(self) -> None:
-        """End what was started and take the namespaces away; the second time nothing happens."""
+        """End all started processes and remove the namespaces. Idempotent."""
         for process in self._started:
             if process.poll() is None:
                 process.kill()
@@ -175,11 +174,11 @@ class NetworkEmulator:
                     with contextlib.suppress(OSError):
                         pipe.close()
         self._started.clear()
-        for pipe in (self._carrier.stdin, self._carrier.stdout):
+        for pipe in (self._forwarder.stdin, self._forwarder.stdout):
             if pipe is not None:
                 with contextlib.suppress(OSError):
                     pipe.close()
-        self._carrier.wait()
+        self._forwarder.wait()
 
     def __enter__(self) -> Self:
         return self
@@ -188,7 +187,7 @@ class NetworkEmulator:
         self.close()
 
 
-def _plain(line: Link) -> list[tuple]:
+def _to_json(line: Link) -> list[tuple]:
     return [dataclasses.astuple(way) for way in line.ways()]
 
 
@@ -203,14 +202,14 @@ def _ip(*words: str) -> None:
         raise RuntimeError(f"ip {' '.join(words)}: {done.stderr.strip()}")
 
 
-def _spaces() -> list[str]:
+def _list_namespaces() -> list[str]:
     listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True).stdout
     return [line.split()[0] for line in listed.splitlines() if line.startswith(f"{_PREFIX}-")]
 
 
-def _sweep() -> None:
-    """Take away the namespaces of processes that are no more."""
-    for space in _spaces():
+def _remove_stale_namespaces() -> None:
+    """Remove the namespaces of processes that no longer exist."""
+    for space in _list_namespaces():
         maker = space.split("-")[2]
         if not os.path.exists(f"/proc/{maker}"):
             subprocess.run(["ip", "netns", "del", space], capture_output=True)
@@ -239,7 +238,7 @@ def _device(space: str, name: str, mine: str, other: str) -> int:
     return device
 
 
-def _carry(answers: IO[str]) -> None:
+def _forward(answers: IO[str]) -> None:
     """Make what the first request names, carry packets, answer requests; until nobody asks any more."""
     asking = b""
     while not asking.endswith(b"\n"):  # by the byte: nothing of what select is to see may wait in a buffer
@@ -247,7 +246,7 @@ def _carry(answers: IO[str]) -> None:
             return
         asking += more
     first = json.loads(asking)
-    chance = random.Random(first["seed"])
+    rng = random.Random(first["seed"])
     spaces: dict[str, str] = first["spaces"]
     try:
         for space in spaces.values():
@@ -261,13 +260,13 @@ def _carry(answers: IO[str]) -> None:
             there, back = (LinkProfile(*way) for way in shape)
             lines[end] = _Direction(leaf, hub, there), _Direction(hub, leaf, back)
         print(json.dumps(True), file=answers, flush=True)
-        _loop(answers, lines, chance)
+        _loop(answers, lines, rng)
     finally:
         for space in spaces.values():
             subprocess.run(["ip", "netns", "del", space], capture_output=True)
 
 
-def _loop(answers: IO[str], lines: dict[str, tuple[_Direction, _Direction]], chance: random.Random) -> None:
+def _loop(answers: IO[str], lines: dict[str, tuple[_Direction, _Direction]], rng: random.Random) -> None:
     by_source = {way.source: way for pair in lines.values() for way in pair}
     asked = 0
     pending: list[tuple[float, int, int, bytes]] = []
@@ -290,17 +289,17 @@ def _loop(answers: IO[str], lines: dict[str, tuple[_Direction, _Direction]], cha
             way = direction.way
             while True:
                 try:
-                    packet = os.read(source, _LARGEST)
+                    packet = os.read(source, _MAX_PACKET)
                 except BlockingIOError:
                     break
                 if packet[0] >> 4 != 4:  # IPv6 looks for neighbours on every new device; nobody asked it to
                     continue
                 direction.packets += 1
                 direction.bytes += len(packet)
-                if chance.random() < way.loss:
+                if rng.random() < way.loss:
                     direction.lost += 1
                     continue
-                at = max(direction.last, now + way.delay + chance.uniform(-way.jitter, way.jitter))
+                at = max(direction.last, now + way.delay + rng.uniform(-way.jitter, way.jitter))
                 direction.last = at
                 order += 1
                 heapq.heappush(pending, (at, order, direction.target, packet))
@@ -320,4 +319,4 @@ def _answer(request: dict[str, Any], lines: dict[str, tuple[_Direction, _Directi
 
 
 if __name__ == "__main__":
-    _carry(sys.stdout)
+    _forward(sys.stdout)
