@@ -14,7 +14,7 @@ import vinesim
 from vinesim import frames
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
-from vinesim.net.recording import mcap_file
+from vinesim.net.recording.mcap_writer import RecordingWriter
 
 G = 9.81
 EI = 5e9 * np.pi / 4.0 * 0.004**4
@@ -334,7 +334,7 @@ def test_cameras_and_lidars_see_the_simulation_as_it_moves():
 def test_a_recording_is_read_message_by_message(tmp_path):
     path = tmp_path / "run.mcap"
     hello = messages.encode_hello(messages.Hello(name="ada", kind="spectator", scene="demo", digest="0" * 16, index=1))
-    with mcap_file.RecordingWriter(path, {"scene": "demo"}) as file:
+    with RecordingWriter(path, {"scene": "demo"}) as file:
         file.put(1_000_000_000, "live/ada", b"1")
         file.put(1_500_000_000, "hello/ada", hello)
     recording = vinesim.Recording(path)

@@ -11,7 +11,7 @@ import threading
 import pytest
 
 from vinesim.net.codec import messages
-from vinesim.net.recording.mcap_file import RecordingWriter
+from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus

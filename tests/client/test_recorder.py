@@ -10,10 +10,11 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.support.recorded_world import TICK, Light, vineyard
-from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, Recorder, grid
+from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, Recorder, observer_grid
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
-from vinesim.net.recording.mcap_file import Recording, RecordingWriter, read
+from vinesim.net.recording.mcap_reader import Recording, read_recording
+from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.replication.interest import INTEREST_RADIUS
 from vinesim.net.replication.peers import WorldMismatch
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -61,7 +62,7 @@ class World:
 
     def tape(self) -> Recording:
         self.recording.close()
-        return read(self.recording.path)
+        return read_recording(self.recording.path)
 
 
 def families(tape: Recording) -> set[str]:
@@ -142,7 +143,7 @@ def test_a_recorder_that_asks_for_everything_hears_one_who_is_alone(tmp_path):
     world.clients.remove(world.bob)
     digest = vineyard().digest()
     stand = Observer(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
-    world.recorder.own.add("recorder-1")
+    world.recorder.observers.add("recorder-1")
     world.steps.append(lambda: stand.step(world.hub.time))
     world.run(2.0)
     world.touch()
@@ -226,13 +227,13 @@ def test_the_official_reader_reads_words_and_numbers(tmp_path):
 
 def test_the_grid_leaves_nothing_out():
     for area in ((0.0, 0.0, 1.0, 1.0), (-3.0, -3.0, 25.0, 25.0), (0.0, 0.0, 100.0, 5.0)):
-        stands = np.array(grid(area))
+        stands = np.array(observer_grid(area))
         x, y = np.meshgrid(np.linspace(area[0], area[2], 60), np.linspace(area[1], area[3], 60))
         away = np.hypot(x[..., None] - stands[:, 0], y[..., None] - stands[:, 1]).min(-1)
         assert away.max() <= INTEREST_RADIUS
     for wrong in ((0.0, 0.0, 40.0, 40.0), (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, float("nan"), 1.0)):
         with pytest.raises(AreaTooLarge, match="give"):
-            grid(wrong)
+            observer_grid(wrong)
 
 
 def test_nonsense_is_kept_and_counted(tmp_path):

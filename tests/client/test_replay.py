@@ -13,7 +13,7 @@ from tests.support.recorded_world import TICK, Light, vineyard
 from vinesim.client.recording.replay import Replay, ReplayBus
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
-from vinesim.net.recording.mcap_file import Recording, read
+from vinesim.net.recording.mcap_reader import Recording, read_recording
 from vinesim.net.transport.bus import KEEP_ALL, NameTaken
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
@@ -194,7 +194,7 @@ def test_faster_and_slower(tape):
 def test_a_recording_of_a_replay_is_the_recording(tape, tmp_path):
     """Record what a replay says, and read that: the same messages, stamped anew."""
     from vinesim.client.recording.recorder import Recorder
-    from vinesim.net.recording.mcap_file import RecordingWriter
+    from vinesim.net.recording.mcap_writer import RecordingWriter
 
     stage = Stage(tape)
     with RecordingWriter(tmp_path / "again.mcap") as recording:
@@ -207,7 +207,7 @@ def test_a_recording_of_a_replay_is_the_recording(tape, tmp_path):
 
         stage.viewer.tick = tick
         stage.run()
-    again = read(tmp_path / "again.mcap")
+    again = read_recording(tmp_path / "again.mcap")
 
     def bodies(recorded: Recording) -> list[bytes]:
         return [e.payload[14:] for e in recorded.messages if e.key == "c/0/0/ada"]

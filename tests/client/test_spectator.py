@@ -20,7 +20,8 @@ from vinesim.client.spectator import EYE_HEIGHT, FOLLOW_DISTANCE, Spectator, fol
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
-from vinesim.net.recording.mcap_file import InvalidRecording, Recording, RecordingWriter, read
+from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
+from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
@@ -148,7 +149,7 @@ def options(file: pathlib.Path, out: pathlib.Path, **more) -> dict:
 
 
 def test_a_replay_is_looked_at(robot_tape, tmp_path, capsys):
-    assert read(robot_tape).metadata.items() >= {"scene": "demo", "seed": "7"}.items()
+    assert read_recording(robot_tape).metadata.items() >= {"scene": "demo", "seed": "7"}.items()
     assert replay(**options(robot_tape, tmp_path, end=1.5)) == 0
     assert "picker" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir())[:4] == ["depth.png", "depth_mm.png", "labels.png", "rgb.png"]

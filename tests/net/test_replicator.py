@@ -285,8 +285,8 @@ def test_a_steady_touch_costs_a_heartbeat_and_a_moving_one_what_extrapolation_mi
         run(hub, [ada, bob], TICK)
         if k > 20:
             late = ada.replicator._state.tree_stream
-            silence = dead_reckoning.clamp_age(hub.time - ada.replicator._state.ownership[0].said_at)
-            said = dead_reckoning.extrapolate(late._said_q[bodies], late._said_rate[bodies], silence)
+            silence = dead_reckoning.clamp_age(hub.time - ada.replicator._state.ownership[0].published_at)
+            said = dead_reckoning.extrapolate(late._published_q[bodies], late._published_rate[bodies], silence)
             worst = max(worst, dead_reckoning.angle_between(ada.state.joint_q[bodies].astype(float), said).max())
     moved = ada.replicator.counters.environment.messages_out - before - 10
     assert 20 < moved < 200

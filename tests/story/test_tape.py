@@ -21,7 +21,8 @@ from tests.support.recorded_world import TICK, Light
 from tests.support.waiting import TIMEOUT
 from vinesim.client.recording.recorder import Recorder
 from vinesim.net.codec import messages
-from vinesim.net.recording.mcap_file import InvalidRecording, Recording, RecordingWriter, read
+from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
+from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.server.server import Server
 from vinesim.net.transport.access_control import Role
 from vinesim.net.transport.certificates import create as new_certificate
@@ -71,7 +72,7 @@ def tape_of(path: pathlib.Path) -> Recording | None:
 @functools.lru_cache(maxsize=4)
 def _tape_of_size(path: pathlib.Path, size: int) -> Recording | None:
     try:
-        return read(path)
+        return read_recording(path)
     except InvalidRecording:
         return None
 
@@ -128,7 +129,7 @@ def rests(path: pathlib.Path) -> list[messages.TreeStates]:
 
 def test_a_killed_recorder_loses_at_most_the_last_second(story):
     _, path, killed = story
-    tape = read(path)
+    tape = read_recording(path)
     last = tape.messages[-1].time
     assert killed - 1.0 < last <= killed + 0.1
     assert "killed" in tape.damage
@@ -158,7 +159,7 @@ def test_a_second_recorder_leaves_the_first_ones_file_alone(story):
     assert f"{path} is there already" in said
     assert path.read_bytes() == before
     with second.open("rb") as file:
-        assert make_reader(file).get_summary().statistics.message_count == len(read(second).messages)
+        assert make_reader(file).get_summary().statistics.message_count == len(read_recording(second).messages)
     assert not any("recorder" in key for key in keys(second))
 
 
@@ -197,7 +198,7 @@ def test_what_was_left_is_replayed_to_a_viewer(story, listen):
     assert sorted(viewer.joined) == ["ada", "bob"]
     assert viewer.replicator.counters.malformed == 0
     # events are what they were but for their time, each once and in order; the tree moved
-    before = [entry.payload for entry in read(path).messages if entry.key == "own/0/0/ada"]
+    before = [entry.payload for entry in read_recording(path).messages if entry.key == "own/0/0/ada"]
     after = [payload for key, payload in arrived if key == "own/0/0/ada"]
     assert [stampless(payload) for payload in after] == [stampless(payload) for payload in before]
     assert len(viewer.heard) > 20
@@ -239,7 +240,7 @@ def count(endpoint: str, path: pathlib.Path | None, apart: float) -> list[int]:
                 )
             if recorder is not None:
                 there &= recorder.greetings.keys() == {"ada", "bob"} and bool(recorder.recording.count > 6)
-                there &= apart > 5.0 or recorder._near.get("ada", (None, None))[1] is not None
+                there &= apart > 5.0 or recorder._full_rate.get("ada", (None, None))[1] is not None
             return there
 
         end = time.monotonic() + TIMEOUT
@@ -267,7 +268,7 @@ def test_a_recorder_changes_not_one_byte(tmp_path, apart):
         path = tmp_path / "run.mcap"
         without, beside = count(server.endpoint, None, apart), count(server.endpoint, path, apart)
     assert without == beside
-    recorded = {entry.key for entry in read(path).messages}
+    recorded = {entry.key for entry in read_recording(path).messages}
     assert ("c/0/0/ada" in recorded) == (apart < 5.0)
     assert "a/ada/far" in recorded
 
@@ -295,7 +296,7 @@ def test_a_disk_that_is_full_ends_a_recording_in_one_line(tmp_path):
     assert process.returncode == 4, said
     assert [line for line in said if line.startswith("vinesim: ")] == said[1:]
     assert str(path) in said[1]
-    tape = read(path)
+    tape = read_recording(path)
     assert len(tape.messages) > 0
     assert tape.metadata["scene"] == "rows"
 

@@ -13,7 +13,9 @@ import pathlib
 from collections.abc import Iterator
 from typing import Any
 
-from vinesim.net.recording import mcap_file
+from vinesim.net.keys import sender_of
+from vinesim.net.recording.mcap_reader import read_recording
+from vinesim.net.recording.message_json import describe_message
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -34,8 +36,8 @@ class Recording:
     """A recording that ``vinesim record`` wrote, open for reading."""
 
     def __init__(self, path: str | pathlib.Path) -> None:
-        """Read the file; :class:`~vinesim.net.recording.mcap_file.InvalidRecording` if it is none."""
-        self._recording = mcap_file.read(pathlib.Path(path))
+        """Read the file; :class:`~vinesim.net.recording.mcap_reader.InvalidRecording` if it is none."""
+        self._recording = read_recording(pathlib.Path(path))
 
     @property
     def info(self) -> dict[str, str]:
@@ -64,5 +66,5 @@ class Recording:
     def __iter__(self) -> Iterator[RecordedMessage]:
         """All messages in the order of time."""
         for entry in self._recording.messages:
-            data = mcap_file.describe_message(entry.key, entry.payload)
-            yield RecordedMessage(entry.time - self._recording.start, mcap_file.sender_of(entry.key), entry.key, data)
+            data = describe_message(entry.key, entry.payload)
+            yield RecordedMessage(entry.time - self._recording.start, sender_of(entry.key), entry.key, data)

@@ -11,9 +11,9 @@ import sys
 import threading
 import time
 
-from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, grid
+from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, observer_grid
 from vinesim.errors import UsageError
-from vinesim.net.recording.mcap_file import RecordingWriter, free_path
+from vinesim.net.recording.mcap_writer import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 POLL = 0.004
@@ -29,7 +29,7 @@ def run(
     families = FAMILIES if only is None else tuple(filter(None, only.split(",")))
     if unknown := [family for family in families if family not in FAMILIES] or ([] if families else [only]):
         raise UsageError(f"--only {','.join(map(str, unknown))}: give some of {','.join(FAMILIES)}")
-    stands = grid(area) if area is not None else []
+    stands = observer_grid(area) if area is not None else []
     about = {"world": world, "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
     about["asked"] = "what is sent anyway" if area is None else "area " + " ".join(f"{edge:g}" for edge in area)
     about |= _vineyard(scene, seed)
@@ -55,7 +55,7 @@ def run(
                 break
             if recorder.digest and len(standing) < len(stands):
                 own = f"{name}-{len(standing) + 1}"
-                recorder.own.add(own)
+                recorder.observers.add(own)
                 there = stack.enter_context(ZenohBus(own, connect=connect, world=world, certificates=tls))
                 scene_name = recording.metadata.get("scene", "")
                 standing.append(Observer(there, stands[len(standing)], scene_name, recorder.digest, now))

@@ -15,7 +15,8 @@ import numpy as np
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
-from vinesim.net.recording.mcap_file import InvalidRecording, Recording, read, sender_of
+from vinesim.net.keys import sender_of
+from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
 
 POLL = 0.004
 """Between two looks at what is due [s]."""
@@ -29,7 +30,7 @@ def run(
     """Play a file; 0 when its end is reached, or on Ctrl-C."""
     if sum(way is not None for way in (connect, listen, out)) != 1:
         raise UsageError("give one of --connect (play to a server), --listen (be one) and --out (look at it)")
-    tape = read(file)
+    tape = read_recording(file)
     if tape.damage:
         print(tape.damage, file=sys.stderr, flush=True)
     if not tape.messages:

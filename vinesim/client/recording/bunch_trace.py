@@ -1,4 +1,4 @@
-"""What one client saw of one bunch, tick by tick: the evidence of a touch."""
+"""Force on one bunch and its displacement, step by step, on one client: the evidence of a contact."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from vinesim.scene.model import Model
 
 
 class Trace:
-    """Force on, and displacement of, one bunch. Rows are written into memory set aside beforehand."""
+    """Force on one bunch and its displacement. Rows are written into preallocated arrays."""
 
     def __init__(self, model: Model, bunch: int, rest_q: np.ndarray, capacity: int) -> None:
-        """``rest_q`` [7]: pose of the bunch's body before anybody touched it."""
+        """``rest_q`` [7]: pose of the bunch's body before the contact; ``capacity``: rows."""
         self.bunch = bunch
         self.body = int(model.bunch_body[bunch])
         clusters = int(model.bunch_cluster[bunch]) + np.arange(model.bunch_clusters[bunch])
         self.bodies = frozenset([self.body, *clusters.tolist()])
-        """Its own body, and its berry clusters, which are what a hand meets."""
+        """The body of the bunch and those of its berry clusters, which are what a hand touches."""
         self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
         self._rest = self._centre(rest_q)
         self._clock = np.zeros(capacity)
@@ -51,23 +51,23 @@ class Trace:
         self.length += 1
 
     def centre(self) -> np.ndarray:
-        """Where the bunch's centre was at the end of the newest row, or at rest [3] m."""
+        """Position of the bunch's centre in the newest row, or at rest [3] m."""
         return self._position[self.length - 1].copy() if self.length else self._rest.copy()
 
     @property
     def displacement(self) -> float:
-        """Of the newest row, from rest [m]."""
+        """Distance from rest in the newest row [m]."""
         return float(np.linalg.norm(self._position[self.length - 1] - self._rest)) if self.length else 0.0
 
     def rows(self) -> Rows:
-        """Everything noted so far."""
+        """All rows so far."""
         n = self.length
         return Rows(self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._told[:n])
 
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """A trace as arrays, one row a tick."""
+    """A trace as arrays, one row a step."""
 
     clock: np.ndarray
     """[tick] s, the host's monotonic clock: comparable between processes of one host."""

@@ -1,4 +1,4 @@
-"""The picture of a touch: force and displacement of one bunch on two clients."""
+"""Plot of a contact: force on one bunch and its displacement on several clients."""
 
 from __future__ import annotations
 

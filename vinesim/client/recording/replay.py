@@ -1,103 +1,112 @@
-"""A recording, played: as a bus on which everything happens again, or to a network, by actors of the same names.
+"""Replays a recording: on a bus of its own, or on a network, by actors of the recorded names.
 
-    tape = read(path)
-    bus = ReplayBus(tape, "viewer")
+    recording = read_recording(path)
+    bus = ReplayBus(recording, "viewer")
     client = Spectator(scene, model, bus, pose=pose, clock=lambda: bus.time)
     while not bus.ended:
         bus.play(0.01)
         client.tick()
 
-On the bus, network time is the time of the recording and moves only when it is told to: whoever listens to it sees the
-same at the same tick, every time. On a network messages are stamped anew, as if they had just become true.
+On the bus, network time is the time of the recording and advances only by :meth:`ReplayBus.play`: a client receives the
+same in the same step, every time. On a network, messages get new time stamps, as if they had just been sampled.
 """
 
 from __future__ import annotations
 
 import bisect
 import logging
+import time
 from collections.abc import Callable, Iterable
 
-from vinesim.client.recording.recorder import NetworkClock
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
-from vinesim.net.recording.mcap_file import RecordedMessage, Recording, sender_of
+from vinesim.net.keys import sender_of
+from vinesim.net.recording.mcap_reader import RecordedMessage, Recording
+from vinesim.net.replication.network_clock import NetworkClock
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_LAST_1, Bus, NameTaken, Publisher, Reply, SampleStore, matches
 
 log = logging.getLogger(__name__)
 
 RELIABLE = ("own", "fact")
-"""Families of keys that are sent reliably."""
+"""Families of keys that are published reliably."""
 
 _ANSWERED = ("live", "hello", "snap")
-"""Families of keys that are answers to questions, not said of one's own accord."""
+"""Families of keys that are replies to queries, not publications."""
 
-ENOUGH = 4096
-"""So many bytes of facts make an answer [B]."""
+MAX_REPLY = 4096
+"""A reply with retained records is split beyond this size [B]."""
 
 
 class Playhead:
-    """A place on a tape, and who was there and what was true when it was played so far."""
+    """A position in a recording, with the actors and the retained state at that time."""
 
-    def __init__(self, tape: Recording, start: float = 0.0, end: float | None = None) -> None:
-        """From ``start`` to ``end`` [s] after the first message; what was true at ``start`` is known at once."""
-        self.tape = tape
-        self.time = tape.start + start
-        """Network time [s] up to which the tape has been played."""
-        self.end = tape.start + (tape.length if end is None else min(end, tape.length))
+    def __init__(self, recording: Recording, start: float = 0.0, end: float | None = None) -> None:
+        """From ``start`` to ``end`` [s] after the first message, with the retained state at ``start``."""
+        self.recording = recording
+        self.time = recording.start + start
+        """Network time up to which the recording has been played [s]."""
+        self.end = recording.start + (recording.length if end is None else min(end, recording.length))
         self.live: set[str] = set()
-        """Who is there."""
+        """Names of the actors that are present."""
         self.greetings: dict[str, bytes] = {}
-        """How each introduced itself, as a message, even before it did: the recorder had to ask."""
-        self.facts = RetainedState()
-        """What stays true."""
-        for entry in reversed(tape.messages):
+        """Encoded hello of each actor, even before it was recorded: the recorder had to query it."""
+        self.records = RetainedState()
+        """The retained state."""
+        for entry in reversed(recording.messages):
             if entry.key.startswith("hello/"):
                 self.greetings[sender_of(entry.key)] = entry.payload
-        self._know_before()
-        self._next = bisect.bisect_left(tape.messages, self.time, key=lambda entry: entry.time)
-        for entry in tape.messages[: bisect.bisect_right(tape.messages, self.time, key=lambda entry: entry.time)]:
-            self._note(entry)
+        self._load_initial_records()
+        self._next = bisect.bisect_left(recording.messages, self.time, key=lambda entry: entry.time)
+        for entry in recording.messages[
+            : bisect.bisect_right(recording.messages, self.time, key=lambda entry: entry.time)
+        ]:
+            self._apply(entry)
 
     @property
     def ended(self) -> bool:
-        """Nothing follows."""
+        """Whether the end was reached."""
         return self.time >= self.end
 
     def play(self, until: float) -> list[RecordedMessage]:
-        """All that is new up to network time ``until`` [s], in order."""
+        """All messages up to network time ``until`` [s] since the last call, in order."""
         first = self._next
         self.time = max(self.time, until)
         last = min(self.time, self.end)
-        while self._next < len(self.tape.messages) and self.tape.messages[self._next].time <= last:
-            self._note(self.tape.messages[self._next])
+        while self._next < len(self.recording.messages) and self.recording.messages[self._next].time <= last:
+            self._apply(self.recording.messages[self._next])
             self._next += 1
-        return self.tape.messages[first : self._next]
+        return self.recording.messages[first : self._next]
 
-    def _know_before(self) -> None:
-        """What the server knew when the recording began: what it answered, less what was said only later."""
-        said = {fact for entry in self.tape.messages if entry.key.startswith("fact/") for fact in _facts(entry.payload)}
-        for entry in self.tape.messages:
+    def _load_initial_records(self) -> None:
+        """The server's state when the recording began: its replies without records that were published later."""
+        said = {
+            record
+            for entry in self.recording.messages
+            if entry.key.startswith("fact/")
+            for record in _decode_records(entry.payload)
+        }
+        for entry in self.recording.messages:
             if entry.key.startswith("snap/"):
-                self._add(entry.key, (fact for fact in _facts(entry.payload) if fact not in said))
+                self._merge(entry.key, (record for record in _decode_records(entry.payload) if record not in said))
 
-    def _note(self, entry: RecordedMessage) -> None:
+    def _apply(self, entry: RecordedMessage) -> None:
         family, _, name = entry.key.partition("/")
         if family == "live":
             (self.live.add if entry.payload else self.live.discard)(name)
         elif family == "hello":
             self.greetings[name] = entry.payload
         elif family == "fact":
-            self._add(entry.key, _facts(entry.payload))
+            self._merge(entry.key, _decode_records(entry.payload))
 
-    def _add(self, key: str, facts: Iterable[messages.RetainedRecord]) -> None:
+    def _merge(self, key: str, records: Iterable[messages.RetainedRecord]) -> None:
         cell = _cell(key)
         if cell is not None:
-            for fact in facts:
-                self.facts.merge(cell, fact)
+            for record in records:
+                self.records.merge(cell, record)
 
 
-def _facts(payload: bytes) -> list[messages.RetainedRecord]:
+def _decode_records(payload: bytes) -> list[messages.RetainedRecord]:
     try:
         return messages.decode_records(payload)
     except MessageError:
@@ -117,20 +126,21 @@ def _cell(key: str) -> tuple[int, int] | None:
 
 
 class ReplayBus:
-    """A member of a world that happened already; see :class:`vinesim.net.transport.bus.Bus`. What it says nobody
-    hears."""
+    """A member of a recorded world; see :class:`vinesim.net.transport.bus.Bus`. What it publishes is discarded."""
 
     bytes_out = 0
     status_message = ""
 
-    def __init__(self, tape: Recording, name: str = "viewer", *, start: float = 0.0, end: float | None = None) -> None:
-        """``start``, ``end`` [s] after the first message; :class:`NameTaken` if somebody on the tape has the name."""
-        if name in tape.actors:
-            raise NameTaken(name, str(tape.path))
+    def __init__(
+        self, recording: Recording, name: str = "viewer", *, start: float = 0.0, end: float | None = None
+    ) -> None:
+        """``start``, ``end`` [s] after the first message; :class:`NameTaken` if a recorded actor has the name."""
+        if name in recording.actors:
+            raise NameTaken(name, str(recording.path))
         self.name = name
         self.bytes_in = 0
-        self._cursor = Playhead(tape, start, end)
-        self._begun, self._played = self._cursor.time, 0.0
+        self._playhead = Playhead(recording, start, end)
+        self._begun, self._played = self._playhead.time, 0.0
         self._store = SampleStore()
         self._subscriptions: list[_Subscription] = []
         self._answers: list[Reply] = []
@@ -138,17 +148,17 @@ class ReplayBus:
     @property
     def time(self) -> float:
         """Network time [s]."""
-        return self._cursor.time
+        return self._playhead.time
 
     @property
     def ended(self) -> bool:
-        """All was played."""
-        return self._cursor.ended
+        """Whether the end was reached."""
+        return self._playhead.ended
 
     def play(self, dt: float) -> None:
-        """Let ``dt`` seconds of the recording happen."""
+        """Play the next ``dt`` seconds."""
         self._played += dt
-        for _, key, payload in self._cursor.play(self._begun + self._played):
+        for _, key, payload in self._playhead.play(self._begun + self._played):
             depths = [s.depth for s in self._subscriptions if matches(s.pattern, key)]
             if depths:
                 self.bytes_in += len(payload)
@@ -164,7 +174,7 @@ class ReplayBus:
         pass
 
     def publisher(self, key: str, reliable: bool = False) -> Publisher:
-        return _Unheard()
+        return _NullPublisher()
 
     def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> _Subscription:
         self._subscriptions.append(_Subscription(self._subscriptions, pattern, depth))
@@ -178,14 +188,14 @@ class ReplayBus:
         if family == "clock":
             asked, _ = messages.decode_time(payload)
             self._reply(key, messages.encode_time(asked, self.time))
-        elif family == "hello" and rest in self._cursor.live and rest in self._cursor.greetings:
-            self._reply(key, self._cursor.greetings[rest])
+        elif family == "hello" and rest in self._playhead.live and rest in self._playhead.greetings:
+            self._reply(key, self._playhead.greetings[rest])
         elif family == "snap":
-            facts = self._cursor.facts
+            records = self._playhead.records
             asked = _cell(key)  # of one cell even that there is nothing is an answer
-            cells = {cell for cell, _ in facts if matches(key, f"snap/{cell[0]}/{cell[1]}")}
+            cells = {cell for cell, _ in records if matches(key, f"snap/{cell[0]}/{cell[1]}")}
             for x, y in sorted(cells if asked is None else {asked}):
-                for part in _parts(facts.in_cell((x, y))):
+                for part in _split_records(records.in_cell((x, y))):
                     self._reply(f"snap/{x}/{y}", messages.encode_records(part))
 
     def replies(self) -> list[Reply]:
@@ -196,7 +206,7 @@ class ReplayBus:
         pass
 
     def alive(self) -> frozenset[str]:
-        return frozenset((*self._cursor.live, self.name))
+        return frozenset((*self._playhead.live, self.name))
 
     def close(self) -> None:
         self._subscriptions.clear()
@@ -216,7 +226,7 @@ class _Subscription:
             self._among.remove(self)
 
 
-class _Unheard:
+class _NullPublisher:
     """See :class:`vinesim.net.transport.bus.Publisher`."""
 
     matching = False
@@ -228,17 +238,17 @@ class _Unheard:
         pass
 
 
-def _parts(facts: list[messages.RetainedRecord]) -> Iterable[list[messages.RetainedRecord]]:
-    """Facts in portions, each small enough to travel, at least one."""
+def _split_records(records: list[messages.RetainedRecord]) -> Iterable[list[messages.RetainedRecord]]:
+    """Records in parts that are small enough to send; at least one part, perhaps empty."""
     part: list[messages.RetainedRecord] = []
     size = 0
-    for fact in facts:
-        part.append(fact)
-        size += 64 + 4 * len(fact.cut) + len(fact.trees)
-        if size > ENOUGH:
+    for record in records:
+        part.append(record)
+        size += 64 + 4 * len(record.cut) + len(record.trees)
+        if size > MAX_REPLY:
             yield part
             part, size = [], 0
-    if part or not facts:
+    if part or not records:
         yield part
 
 
@@ -246,54 +256,58 @@ def _parts(facts: list[messages.RetainedRecord]) -> Iterable[list[messages.Retai
 
 
 class Replay:
-    """Plays a tape to a network, each recorded actor through a live bus of its own. Call :meth:`step` often."""
+    """Replays a recording to a network; each actor has a live bus of its own. Call :meth:`step` often."""
 
     def __init__(
-        self, tape: Recording, bus: Bus, live_bus: Callable[[str], Bus], now: float, *,
+        self, recording: Recording, bus: Bus, live_bus: Callable[[str], Bus], now: float, *,
         speed: float = 1.0, start: float = 0.0, end: float | None = None,
     ) -> None:  # fmt: skip
-        """``bus`` is not live: it asks for the time and says what no actor says any more; ``live_bus(name)`` opens
-        one for an actor; ``now`` is any clock [s], as in :meth:`step`.
-        """
-        self.cursor = Playhead(tape, start, end)
+        """``bus`` is not live: it queries the clock and publishes for actors that are absent. ``live_bus(name)`` opens
+        the bus of an actor. ``now`` is any clock [s], as in :meth:`step`."""
+        self.playhead = Playhead(recording, start, end)
         self.sent = 0
-        """Messages that somebody heard."""
+        """Messages that had a subscriber."""
         self._bus, self._live_bus, self._speed = bus, live_bus, speed
-        self._keeper = NetworkClock(bus, now)
+        self._network_clock = NetworkClock(bus, now, time.time() - now)
         self._buses: dict[str, Bus] = {}
         self._publishers: dict[str, Publisher] = {}
-        self._start = self.cursor.time
+        self._start = self.playhead.time
         self._begun: float | None = None
         self._begun_at = 0.0
-        self._before = [(_fact_key(cell, fact), messages.encode_records([fact])) for cell, fact in self.cursor.facts]
+        self._initial_messages = [
+            (_record_key(cell, record), messages.encode_records([record])) for cell, record in self.playhead.records
+        ]
         self._keys: dict[str, list[str]] = {}
-        for key in sorted({entry.key for entry in tape.messages if entry.key.partition("/")[0] not in _ANSWERED}):
+        for key in sorted({entry.key for entry in recording.messages if entry.key.partition("/")[0] not in _ANSWERED}):
             self._keys.setdefault(sender_of(key), []).append(key)
 
     @property
     def ended(self) -> bool:
-        """All was played."""
-        return self.cursor.ended
+        """Whether the end was reached."""
+        return self.playhead.ended
 
     def step(self, now: float) -> None:
-        """Say all that is due at own time ``now`` [s]."""
-        self._keeper.keep(now)
+        """Publish everything that is due at own time ``now`` [s]."""
+        self._network_clock.advance(now)
+        self._network_clock.ping_if_due()
         for key, payload, age in self._bus.replies():
             if key == "clock":
-                self._keeper.hear(payload, age)
-        if not self._keeper.settled:
+                self._network_clock.receive(payload, age)
+        if not self._network_clock.is_settled:
             return
         if self._begun is None:
-            self._begun, self._begun_at = now, self._keeper.time
-        entries = self.cursor.play(self._start + (now - self._begun) * self._speed)
-        self._follow()
+            self._begun, self._begun_at = now, self._network_clock.time
+        entries = self.playhead.play(self._start + (now - self._begun) * self._speed)
+        self._update_actors()
         if self._buses:  # what was true before is said once there is a world and somebody who keeps it
-            self._before = [(key, payload) for key, payload in self._before if not self._say(key, payload)]
+            self._initial_messages = [
+                (key, payload) for key, payload in self._initial_messages if not self._publish(key, payload)
+            ]
         for entry in entries:
             if entry.key.partition("/")[0] not in _ANSWERED:
                 # as old as it was when the recorder had it
                 due = self._begun_at + (entry.time - self._start) / self._speed
-                self._say(entry.key, messages.shift_time(entry.payload, due - entry.time))
+                self._publish(entry.key, messages.shift_time(entry.payload, due - entry.time))
 
     def close(self) -> None:
         """Let all actors leave."""
@@ -301,13 +315,13 @@ class Replay:
             bus.close()
         self._buses.clear()
 
-    def _follow(self) -> None:
-        """Let actors come and go."""
-        for name in sorted(self._buses.keys() - self.cursor.live):
+    def _update_actors(self) -> None:
+        """Let actors join and leave."""
+        for name in sorted(self._buses.keys() - self.playhead.live):
             self._buses.pop(name).close()
             self._publishers = {k: p for k, p in self._publishers.items() if sender_of(k) != name}
-        for name in sorted(self.cursor.live - self._buses.keys()):
-            greeting = self.cursor.greetings.get(name)
+        for name in sorted(self.playhead.live - self._buses.keys()):
+            greeting = self.playhead.greetings.get(name)
             if greeting is not None:
                 bus = self._buses[name] = self._live_bus(name)
                 bus.join(greeting)
@@ -315,14 +329,14 @@ class Replay:
                 for key in self._keys.get(name, ()):
                     self._publishers[key] = bus.publisher(key, key.partition("/")[0] in RELIABLE)
 
-    def _say(self, key: str, payload: bytes) -> bool:
-        """Whether anybody listens."""
+    def _publish(self, key: str, payload: bytes) -> bool:
+        """Whether there was a subscriber."""
         if key not in self._publishers:
             self._publishers[key] = self._bus.publisher(key, key.partition("/")[0] in RELIABLE)
-        heard = self._publishers[key].put(payload)
-        self.sent += heard
-        return heard
+        was_sent = self._publishers[key].put(payload)
+        self.sent += was_sent
+        return was_sent
 
 
-def _fact_key(cell: tuple[int, int], fact: messages.RetainedRecord) -> str:
-    return f"fact/{cell[0]}/{cell[1]}/{fact.author}"
+def _record_key(cell: tuple[int, int], record: messages.RetainedRecord) -> str:
+    return f"fact/{cell[0]}/{cell[1]}/{record.author}"

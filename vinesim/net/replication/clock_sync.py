@@ -1,7 +1,7 @@
-"""The common clock: how far one's own clock is from the server's, from pings; pure.
+"""Offset between the own clock and the server's, estimated from pings; pure.
 
-Of the last eight pings the one with the shortest round trip is believed (it waited least in queues; Cristian 1989),
-and the estimate is slewed, so that network time never jumps backwards under a running simulation.
+Of the last eight pings the one with the shortest round trip is used, because it waited least in queues (F. Cristian,
+Probabilistic clock synchronization, 1989). The estimate is slewed, so that network time never jumps backwards.
 """
 
 from __future__ import annotations
@@ -9,34 +9,34 @@ from __future__ import annotations
 import dataclasses
 
 PING_WINDOW = 8
-"""How many pings are remembered."""
+"""Pings that are remembered."""
 
 MAX_SLEW_RATE = 0.01
-"""Largest change of the offset in use [s/s]."""
+"""Largest rate of change of the offset in use [s/s]. GUESSED."""
 
 STEP_THRESHOLD = 0.5
-"""An estimate this far away [s] is taken at once: it is another server, not drift."""
+"""An estimate farther away than this is taken at once: it is another server, not drift [s]. GUESSED."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Ping:
-    """One question to the server's clock and its answer."""
+    """One query of the server's clock."""
 
     sent: float
-    """Own clock when the question left [s]."""
+    """Own clock when the query was sent [s]."""
     server: float
-    """Server's clock when it answered [s]."""
+    """Server's clock when it replied [s]."""
     received: float
-    """Own clock when the answer came [s]."""
+    """Own clock when the reply arrived [s]."""
 
     @property
     def round_trip(self) -> float:
-        """[s]"""
+        """Time between query and reply [s]."""
         return self.received - self.sent
 
     @property
     def offset(self) -> float:
-        """Server's clock minus own clock [s], wrong by at most half the round trip."""
+        """Server's clock minus own clock [s], in error by at most half the round trip."""
         return self.server - 0.5 * (self.sent + self.received)
 
 
@@ -46,7 +46,7 @@ def estimate(pings: tuple[Ping, ...]) -> float | None:
 
 
 def slew(offset: float, target: float, dt: float) -> float:
-    """The offset in use after ``dt`` seconds on its way to ``target``: at most 10 ms per second, far ones at once."""
+    """Offset [s] after ``dt`` [s] on its way to ``target`` [s]: at most 10 ms per second, far ones at once."""
     away = target - offset
     if abs(away) >= STEP_THRESHOLD:
         return target
@@ -55,21 +55,21 @@ def slew(offset: float, target: float, dt: float) -> float:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ClockEstimate:
-    """Own clock plus an offset; every change makes a new one."""
+    """Offset of the server's clock, immutable."""
 
     pings: tuple[Ping, ...] = ()
     offset: float = 0.0
     """Server's clock minus own clock as used now [s]."""
 
     def with_ping(self, ping: Ping) -> ClockEstimate:
-        """With one more ping. While the first eight come in the best estimate is taken at once, later it is slewed."""
+        """With one more ping. Until the first eight have arrived the best estimate is used at once."""
         settling = len(self.pings) < PING_WINDOW
         pings = (*self.pings, ping)[-PING_WINDOW:]
         best = estimate(pings)
         return ClockEstimate(pings, best if settling and best is not None else self.offset)
 
     def advanced(self, dt: float) -> ClockEstimate:
-        """``dt`` seconds later, slewed towards the estimate."""
+        """``dt`` [s] later, slewed towards the estimate."""
         best = estimate(self.pings)
         if best is None or best == self.offset:
             return self

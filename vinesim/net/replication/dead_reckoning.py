@@ -1,7 +1,7 @@
-"""Dead reckoning and the hiding of corrections: pure functions, the clock is an argument.
+"""Dead reckoning: extrapolation of states between messages, when to send the next one, and error smoothing; pure.
 
-Sender and receiver extrapolate with the same :func:`ahead`, so the sender knows how wrong its copies are and stays
-silent while that error is small. Distances in metres, angles in radians, times in seconds.
+Sender and receiver extrapolate with the same :func:`extrapolate`, so that the sender knows the error of the copies and
+sends nothing while it is small (IEEE 1278.1, dead reckoning). Distances in metres, angles in radians, times in seconds.
 """
 
 from __future__ import annotations
@@ -9,31 +9,32 @@ from __future__ import annotations
 import numpy as np
 
 MAX_EXTRAPOLATION = 0.150
-"""Nobody extrapolates further than this [s]; later the copy stands still."""
+"""States are extrapolated by at most this time [s]; then the copy stands still. GUESSED."""
 
 POSITION_ERROR = 0.005
-"""A record is due when copies are wrong by more than this [m] ..."""
+"""A state is due when copies are wrong by more than this [m] ..."""
 
 ANGLE_ERROR = float(np.radians(1.0))
 """... or by more than this [rad] ..."""
 
 HEARTBEAT_PERIOD = 1.0
-"""... or when nothing was said for this long [s] while awake."""
+"""... or when nothing was published for this long [s] while the object is awake."""
 
 MAX_CLOCK_SKEW = 1.0
-"""Records from further ahead than this [s] count as made then: else a single one would be newer than all to come."""
+"""A state from farther in the future counts as made now + this [s]; otherwise it would be newer than all later ones."""
 
 BLEND_TIME = 0.100
-"""A correction is spread over this time [s] in what is shown (95 % of it); velocities are taken at once."""
+"""Time in which 95 % of a correction is blended into what is shown [s]; velocities are taken at once."""
 
 
 def normalize(q: np.ndarray) -> np.ndarray:
-    """Quaternions [..., 4] brought back to length one (none of them may be zero)."""
+    """Quaternions [..., 4] scaled to unit length (none may be zero)."""
     return q / np.sqrt(np.einsum("...i,...i->...", q, q))[..., None]
 
 
 def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """Time derivative [..., 4] of unit quaternions ``q`` [..., 4] xyzw that turn with ``omega`` [..., 3] rad/s.
+    """Time derivative [..., 4] of unit quaternions ``q`` [..., 4] xyzw at the angular velocity ``omega`` [..., 3]
+    rad/s.
 
     ``omega`` is given in the frame that ``q`` rotates into (world axes for a base, joint-frame axes for a body).
     """
@@ -48,23 +49,23 @@ def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
 
 def clamp_age(age: float | np.ndarray) -> float | np.ndarray:
-    """How far a record of this ``age`` [s] is extrapolated [s]: never back in time, never past the cap."""
+    """Time [s] by which a state of ``age`` [s] is extrapolated: from 0 to :data:`MAX_EXTRAPOLATION`."""
     return np.minimum(np.maximum(age, 0.0), MAX_EXTRAPOLATION)
 
 
 def extrapolate(q: np.ndarray, rate: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
-    """Quaternions [..., 4] after ``dt`` [s] (a number, or one with a trailing axis) at the rate of :func:`spin`.
+    """Quaternions [..., 4] after ``dt`` [s] (a number, or with a trailing axis) at a :func:`quaternion_rate`.
 
-    First order, normalised: it turns by 2 atan(|omega| dt / 2), within 0.4 degrees of exact at 3 rad/s and 150 ms.
+    First order and normalised: turns by 2 atan(|omega| dt / 2), within 0.4 degrees of exact at 3 rad/s and 150 ms.
     """
     return normalize(q + rate * dt)
 
 
 def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle [...] rad between rotations ``a`` and ``b`` [..., 4].
+    """Angle [...] rad between the rotations ``a`` and ``b`` [..., 4].
 
-    By the chord, not the dot product: the arccosine would make 0.04 degrees of the rounding of single-precision
-    states, and a chain of bodies adds that up to a record nobody needs.
+    Computed from the chord: the arccosine of the dot product would turn the rounding of single-precision states into
+    0.04 degrees, and a chain of bodies sums that up to an unnecessary message.
     """
     same, opposite = a - b, a + b
     chord = np.minimum(np.einsum("...i,...i->...", same, same), np.einsum("...i,...i->...", opposite, opposite))
@@ -72,13 +73,13 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def needs_update(position_error: np.ndarray, angle_error: np.ndarray, silence: np.ndarray) -> np.ndarray:
-    """Which things must be sent again [k] bool: copies wrong by 5 mm or 1 degree, or silent for a heartbeat."""
+    """Which objects are due [k] bool: copies wrong by 5 mm or 1 degree, or silent for a heartbeat."""
     return (position_error > POSITION_ERROR) | (angle_error > ANGLE_ERROR) | (silence >= HEARTBEAT_PERIOD - 1e-9)
 
 
 def blend_weight(age: float | np.ndarray) -> float | np.ndarray:
-    """How much of a correction is still hidden ``age`` seconds after it: 1 falling to 5 % in 100 ms, and on to 0.
+    """Share of a correction that is still hidden ``age`` [s] after it: 1, falling to 5 % in 100 ms.
 
-    Exponential, because it must not matter that the next pose arrives, and the fading starts anew, every 17 ms.
+    Exponential, so that it does not matter that the next pose arrives, and blending restarts, every 17 ms.
     """
     return np.exp(-3.0 * np.maximum(age, 0.0) / BLEND_TIME)

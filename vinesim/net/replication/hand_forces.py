@@ -1,8 +1,9 @@
-"""How people push robots of other clients: the client of whoever touches computes the wrench, the robot's applies it.
+"""Wrenches of people's hands on robots of other clients: computed by the client of the person, applied by the robot's.
 
-``force/<robot>/<person>``: the mean wrench of a sixtieth of a second on each link, best effort, while somebody touches;
-then one empty message, and silence. A robot's client believes the last message for :data:`STALE`, and there the copies
-of people's hands do not touch robots: no touch is counted twice (``docs/decisions/forces-between-clients.md``).
+Key ``force/<robot>/<person>``: the mean wrench on each link over a sixtieth of a second, best effort, during contact;
+then one empty message and silence. The robot's client applies the last message for :data:`MAX_AGE`, and in its
+simulation copies of people's hands do not collide with robots: no contact counts twice
+(``docs/decisions/forces-between-clients.md``).
 """
 
 from __future__ import annotations
@@ -15,75 +16,75 @@ from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wr
 from vinesim.net.transport.bus import KEEP_LAST_1, Bus, Publisher
 
 SEND_PERIOD = 1.0 / 60.0
-"""Between two messages about one robot [s]."""
+"""Time between two messages about one robot [s]."""
 
 MAX_AGE = 0.1
-"""A wrench is applied for so long after it arrived [s], unless news come."""
+"""A wrench is applied for so long after it arrived [s], unless a newer one does."""
 
 
 @dataclasses.dataclass(slots=True)
 class _PushedRobot:
-    """One robot that I push: what was felt since the last message."""
+    """One robot that the own hands are in contact with, and the wrenches since the last message."""
 
     publisher: Publisher
     due: float
     total: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     ticks: int = 0
-    told: bool = False
+    is_active: bool = False
     """The last message was not empty."""
 
 
 class WrenchSync:
-    """One actor's share: what its hands do to others' robots, and what others' hands do to it."""
+    """Wrenches of the own hands on others' robots, and of others' hands on the own robot."""
 
     def __init__(self, bus: Bus, name: str) -> None:
         self._bus, self._name = bus, name
-        self._touched: dict[str, _PushedRobot] = {}
-        self._heard: dict[str, tuple[float, WrenchMessage]] = {}
+        self._pushed: dict[str, _PushedRobot] = {}
+        self._received: dict[str, tuple[float, WrenchMessage]] = {}
         bus.subscribe(f"force/{name}/*", KEEP_LAST_1)
 
     def receive(self, payload: bytes, sender: str, now: float) -> bool:
-        """Take what ``sender`` says it does to me; False if it is not newer. :class:`MessageError` if it cannot be."""
-        push = decode_wrenches(payload)
-        if sender in self._heard and push.time <= self._heard[sender][1].time:
+        """Take a message of ``sender``; False if it is not newer. Raises :class:`MessageError` if it is invalid."""
+        message = decode_wrenches(payload)
+        if sender in self._received and message.time <= self._received[sender][1].time:
             return False
-        self._heard[sender] = now, push
+        self._received[sender] = now, message
         return True
 
     def net_wrenches(self, now: float) -> dict[str, np.ndarray]:
-        """Wrenches [6] on my links of all who push me, by link: see :class:`Push`."""
+        """Sum of the wrenches [6] of all people on each own link, by link name."""
         links: dict[str, np.ndarray] = {}
-        for sender in sorted(self._heard):
-            arrived, push = self._heard[sender]
+        for sender in sorted(self._received):
+            arrived, message = self._received[sender]
             if now - arrived > MAX_AGE:
                 continue
-            for link, wrench in push.wrenches.items():
+            for link, wrench in message.wrenches.items():
                 links[link] = links.get(link, 0.0) + wrench
         return links
 
     def remove_peer(self, name: str) -> None:
-        """An actor left."""
-        self._heard.pop(name, None)
-        if (touch := self._touched.pop(name, None)) is not None:
-            touch.publisher.close()
+        """An actor has sent."""
+        self._received.pop(name, None)
+        if (robot_state := self._pushed.pop(name, None)) is not None:
+            robot_state.publisher.close()
 
     def publish(self, wrenches: dict[str, dict[str, np.ndarray]], now: float, time: float) -> list[bytes]:
-        """Tell robots, by name, what my hands did to their links in the last tick; the messages that left."""
-        left = []
-        for robot in wrenches.keys() - self._touched.keys():
-            self._touched[robot] = _PushedRobot(self._bus.publisher(f"force/{robot}/{self._name}"), now)
-        for robot, touch in sorted(self._touched.items()):
-            if not (touch.told or touch.ticks or robot in wrenches):
+        """Publish wrenches of this step on others' robots, by robot and link; the messages that sent."""
+        sent = []
+        for robot in wrenches.keys() - self._pushed.keys():
+            self._pushed[robot] = _PushedRobot(self._bus.publisher(f"force/{robot}/{self._name}"), now)
+        for robot, robot_state in sorted(self._pushed.items()):
+            if not (robot_state.is_active or robot_state.ticks or robot in wrenches):
                 continue
-            touch.ticks += 1
+            robot_state.ticks += 1
             for link, wrench in wrenches.get(robot, {}).items():
-                touch.total[link] = touch.total.get(link, 0.0) + wrench
-            if now < touch.due - 1e-9:
+                robot_state.total[link] = robot_state.total.get(link, 0.0) + wrench
+            if now < robot_state.due - 1e-9:
                 continue
-            mean = {link: total / touch.ticks for link, total in touch.total.items()}
+            mean = {link: total / robot_state.ticks for link, total in robot_state.total.items()}
             payload = encode_wrenches(WrenchMessage(time, mean))
-            touch.due = max(touch.due, now - SEND_PERIOD) + SEND_PERIOD
-            touch.total, touch.ticks, touch.told = {}, 0, bool(mean)
-            if touch.publisher.put(payload):
-                left.append(payload)
-        return left
+            robot_state.due = max(robot_state.due, now - SEND_PERIOD) + SEND_PERIOD
+            robot_state.total, robot_state.ticks, robot_state.is_active = {}, 0, bool(mean)
+            if robot_state.publisher.put(payload):
+                sent.append(payload)
+        return sent

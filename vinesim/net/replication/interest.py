@@ -1,11 +1,12 @@
-"""Who hears what (CANOPIES D6.4 section 5.1): cells, windows of cells, and the exact distance; pure.
+"""Interest management: cells of the ground, windows of cells around actors, and exact distances; pure.
 
-The ground is cut into square cells. Whoever owns a moving tree publishes under the cell of that tree, and whoever
-wants to hear subscribes to the 3x3 cells around itself: a publisher without a subscriber sends nothing at all.
+The ground is divided into square cells. The owner of a moving object publishes under the object's cell; whoever needs
+states subscribes to the 3x3 cells around itself. A publisher without a subscriber sends nothing (CANOPIES D6.4, section
+5.1).
 
 A cell is 6 m wide. With 1 m of hysteresis 3x3 cells then guarantee 5 m on all sides: an arm, a bunch and a camera's
-good range, about two vines of a tendone. Larger cells reach further but carry more that is not near anybody: for ten
-robots and five people on 60 x 40 m, each moving five trees, a client hears 7.9 kB/s of trees with cells of 6 m and
+good range, about two vines of a tendone. Larger cells reach farther but carry more that is not near anybody: with ten
+robots and five people on 60 x 40 m, each moving five trees, a client receives 7.9 kB/s of trees with cells of 6 m and
 15.1 kB/s with cells of 8 m. Smaller ones would not cover 5 m. Inside the window the exact distance decides.
 """
 
@@ -14,19 +15,19 @@ from __future__ import annotations
 import numpy as np
 
 CELL_SIZE = 6.0
-"""Edge of a cell [m]; the same for everybody, it is part of the keys."""
+"""Edge of a cell [m]; equal for everybody, because cells are part of the keys."""
 
 HYSTERESIS = 1.0
-"""A window moves only when its owner is this far [m] outside of the middle cell."""
+"""A window moves only when its actor is this far outside of the middle cell [m]."""
 
 MAX_INTEREST_RADIUS = CELL_SIZE - HYSTERESIS
-"""The window covers at least this distance [m] on all sides, wherever its owner stands in it."""
+"""Distance that a window covers on all sides, wherever in its hysteresis the actor is [m]."""
 
 INTEREST_RADIUS = 5.0
-"""Default of the setting *near* [m]: nearer than this to a tree one sees it moved by others."""
+"""Default distance within which an actor receives states of objects that peers move [m]."""
 
 FULL_RATE_DISTANCE = 10.0
-"""Actors nearer than this [m] hear each other's poses at the full rate."""
+"""Actors nearer than this receive each other's poses at the full rate [m] ..."""
 
 REDUCED_RATE_DISTANCE = 12.0
 """... until they are this far apart [m]."""
@@ -50,7 +51,7 @@ def cell_window(middle: Cell) -> frozenset[Cell]:
 
 
 def move_window(middle: Cell | None, position: np.ndarray) -> Cell:
-    """The middle cell of the window of somebody at ``position`` m, until now ``middle``: it clings by 1 m."""
+    """Middle cell of the window of an actor at ``position`` [m] whose middle cell was ``middle``, with hysteresis."""
     if middle is not None:
         inside = all(
             CELL_SIZE * middle[axis] - HYSTERESIS <= position[axis] <= CELL_SIZE * (middle[axis] + 1) + HYSTERESIS
@@ -62,7 +63,7 @@ def move_window(middle: Cell | None, position: np.ndarray) -> Cell:
 
 
 def check_radius(near: float) -> float:
-    """``near`` [m] if the window can cover it; :class:`ValueError` with the bound otherwise."""
+    """The radius [m] if a window covers it; ValueError with the bound otherwise."""
     if not 0.0 < near <= MAX_INTEREST_RADIUS:
         raise ValueError(
             f"near = {near} m: must be above 0 and at most {MAX_INTEREST_RADIUS} m, what 3x3 "
@@ -72,7 +73,7 @@ def check_radius(near: float) -> float:
 
 
 def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.ndarray:
-    """How many ``actors`` [a, 3] m are within ``near`` m, on the ground plan, of each middle [k, 3] m: [k] int."""
+    """Number of ``actors`` [a, 3] m within ``near`` [m], on the ground, of each position [k, 3] m: [k] int."""
     if not len(actors) or not len(middles):
         return np.zeros(len(middles), np.int64)
     x = middles[:, None, 0] - actors[None, :, 0]
@@ -81,5 +82,5 @@ def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.
 
 
 def is_full_rate(distance: float, now: bool) -> bool:
-    """Whether an actor at ``distance`` [m] is heard at the full rate, given whether it is so ``now``: hysteresis."""
+    """Whether an actor at ``distance`` [m] sends its poses at the full rate here, given whether it does ``now``."""
     return distance <= (REDUCED_RATE_DISTANCE if now else FULL_RATE_DISTANCE)

@@ -1,8 +1,8 @@
-"""A buffer against jitter: what others say is shown a fixed while later, between two things they said; pure.
+"""Jitter buffer: poses of a peer are shown after a fixed delay, interpolated between two received ones; pure.
 
-Extrapolation shows others where they should be by now, and is wrong when they turn meanwhile. A buffer waits: as long
-as every sample comes within its delay, what is shown is exactly what was, however unevenly it came. The price is that
-delay, on everything, always. Off by default: a hand that is seen late is touched where it no longer is.
+Extrapolation shows peers where they should be now and is wrong when they turn meanwhile. A buffer waits: while every
+sample arrives within its delay, what is shown is exactly the motion of the peer, however unevenly samples arrive. The
+price is that delay. Off by default, because a hand that is shown late is touched where it no longer is.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ import numpy as np
 from vinesim.net.replication import dead_reckoning
 
 MAX_DELAY = 0.5
-"""No buffer waits longer than this [s]."""
+"""Longest delay [s]."""
 
 MAX_SAMPLES = 64
-"""Samples that are remembered: half a second at the full rate, and as much again."""
+"""Samples that are kept: twice as many as arrive in the longest delay at the full rate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class JitterBuffer:
-    """What one actor said, in the order of its times; every sample more makes a new one."""
+    """Samples of one peer in the order of their times; immutable."""
 
     delay: float = 0.0
-    """How much later all is shown [s]; 0 extrapolates to now instead."""
+    """Delay of what is shown [s]; 0 extrapolates to now instead."""
     times: tuple[float, ...] = ()
-    """[s], strictly increasing."""
+    """Network times of the samples [s], strictly increasing."""
     states: tuple[np.ndarray, ...] = ()
     rates: tuple[np.ndarray, ...] = ()
-    """Their change [1/s], for the time after the newest."""
+    """Their time derivatives [1/s], used after the newest sample."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.delay <= MAX_DELAY:
             raise ValueError(f"jitter buffer of {1e3 * self.delay:g} ms: give 0 to {1e3 * MAX_DELAY:g} ms")
 
     def insert(self, time: float, state: np.ndarray, rate: np.ndarray) -> JitterBuffer:
-        """With one more sample, whenever it comes; the first of two of the same time is kept."""
+        """With one more sample, in whatever order they arrive; of two of the same time the first is kept."""
         at = bisect.bisect_left(self.times, time)
         if at < len(self.times) and self.times[at] == time:
             return self
@@ -49,9 +49,9 @@ class JitterBuffer:
         return JitterBuffer(self.delay, put(self.times, time), put(self.states, state), put(self.rates, rate))
 
     def sample(self, now: float) -> np.ndarray:
-        """The state to show at ``now``: what was ``delay`` earlier, on a straight line between two samples.
+        """The state to show at ``now`` [s]: that of ``delay`` earlier, interpolated linearly between two samples.
 
-        Before the first sample it is that one; after the newest it is extrapolated, as without a buffer.
+        Before the first sample it is that one; after the newest it is extrapolated as without a buffer.
         """
         before, after, share, since = self._between(now)
         if before == after:
@@ -59,14 +59,14 @@ class JitterBuffer:
         return (1.0 - share) * self.states[before] + share * self.states[after]
 
     def rate(self, now: float) -> np.ndarray:
-        """The change of what is shown at ``now`` [1/s]: said by its author, not found by differences."""
+        """Time derivative of what is shown at ``now`` [1/s]: as sent by the peer, not a finite difference."""
         before, after, share, since = self._between(now)
         if before == after:
             return self.rates[before] * float(0.0 <= since <= dead_reckoning.MAX_EXTRAPOLATION)
         return (1.0 - share) * self.rates[before] + share * self.rates[after]
 
     def _between(self, now: float) -> tuple[int, int, float, float]:
-        """The samples around what is shown (one twice at an end), how far between them, how long after the first."""
+        """Indices of the two samples around ``now``, equal at an end; the share between them; time since the first."""
         time = now - self.delay
         after = bisect.bisect_right(self.times, time)
         if after in (0, len(self.times)):

@@ -1,7 +1,6 @@
-"""What one client knows of who owns what: the greatest claim on each thing, and what follows from it.
+"""Claims on all objects as one client knows them, and what follows: who owns, who is silent, what to correct.
 
-The order of claims is :mod:`vinesim.net.replication.authority`'s. Here are the rules around it: what counts as heard,
-who is silent, who takes over, and which claims deserve a correction. Times are network time [s].
+The order of claims is defined in :mod:`vinesim.net.replication.authority`. Times are network time [s].
 """
 
 from __future__ import annotations
@@ -14,66 +13,69 @@ from vinesim.net.replication import authority, dead_reckoning
 from vinesim.net.replication.authority import NOBODY, UNTOUCHED, Claim
 
 CORRECTION_PERIOD = 0.2
-"""Between two corrections of the same thing [s]."""
+"""Shortest time between two corrections of one object [s]. GUESSED."""
 
 OWNER_TIMEOUT = 3.0
-"""An owner that says nothing of its thing for so long [s] (three heartbeats) is believed to own it no more."""
+"""An owner that has sent nothing about its object for so long no longer counts as its owner [s]: three heartbeats."""
 
 LONG_AGO = -1e9
 
 
 @dataclasses.dataclass(slots=True)
 class ObjectRecord:
-    """What was last said of one thing, by me or by its owner."""
+    """The claim on one object, and when its state was last sent or received."""
 
     claim: Claim = UNTOUCHED
+    """The greatest claim that was made or received."""
     touching: bool = False
-    """Whether its owner is in contact with it."""
-    before: Claim = UNTOUCHED
-    """What held before I took it."""
+    """Whether the owner is in contact with the object."""
+    previous: Claim = UNTOUCHED
+    """The claim before this client took the object."""
     announced: bool = False
-    """Whether anybody else can have heard of the claim."""
+    """Whether a peer can know the claim."""
     silent: bool = False
-    """Its owner is gone, or was not heard for long: the claim holds, should it come back, but it owns no more."""
-    said_at: float = LONG_AGO
-    """When the newest record was made."""
-    heard_at: float = LONG_AGO
-    said_to: int = 0
-    """How many were near when I last spoke of it."""
-    answered: float = LONG_AGO
+    """The owner has left or timed out: the claim still holds, in case it returns, but it owns nothing."""
+    published_at: float = LONG_AGO
+    """Time of the newest state."""
+    received_at: float = LONG_AGO
+    """When the newest message about it arrived."""
+    listener_count: int = 0
+    """Peers within the interest radius when its state was last published."""
+    corrected_at: float = LONG_AGO
+    """When the claim was last repeated as a correction."""
 
 
 class Ownership:
-    """The claims on all things that anybody ever touched."""
+    """The claims on all objects that were ever touched."""
 
-    def __init__(self, me: str, live: Container[str]) -> None:
-        """``live``: the other actors who are here, kept by somebody else."""
-        self.name = me
+    def __init__(self, name: str, live: Container[str]) -> None:
+        """``name``: of the own actor; ``live``: names of the peers that are present, a view that the caller keeps."""
+        self.name = name
         self._live = live
         self._known: collections.defaultdict[int, ObjectRecord] = collections.defaultdict(ObjectRecord)
         self.owned: set[int] = set()
         self.remote: set[int] = set()
-        self._lost: list[tuple[int, Claim]] = []
+        self._losing_claims: list[tuple[int, Claim]] = []
 
     # ------------------------------------------------------------ questions
 
     @property
     def known(self) -> list[int]:
-        """All things that anybody ever touched."""
+        """Ids of all objects that were ever claimed."""
         return list(self._known)
 
-    def __getitem__(self, thing: int) -> ObjectRecord:
-        return self._known[thing]
+    def __getitem__(self, object_id: int) -> ObjectRecord:
+        return self._known[object_id]
 
-    def claim(self, thing: int) -> Claim:
-        """The greatest claim that was made or heard."""
-        return self._known[thing].claim if thing in self._known else UNTOUCHED
+    def claim(self, object_id: int) -> Claim:
+        """The greatest claim that was made or received."""
+        return self._known[object_id].claim if object_id in self._known else UNTOUCHED
 
-    def owner(self, thing: int) -> str | None:
-        """Who owns a thing now: a live actor's name (perhaps one's own), or None."""
-        if thing not in self._known:
+    def owner(self, object_id: int) -> str | None:
+        """Name of the live actor that owns an object now (perhaps the own one), or None."""
+        if object_id not in self._known:
             return None
-        known = self._known[thing]
+        known = self._known[object_id]
         owner = known.claim.owner
         if owner == self.name:
             return owner
@@ -81,136 +83,140 @@ class Ownership:
 
     # ------------------------------------------------------------ what I do
 
-    def touch(self, thing: int) -> None:
-        """I am in contact with it: mine, unless its living owner touches it as well."""
-        known = self._known[thing]
-        taken = authority.claim_by_touch(known.claim, self.name, self.owner(thing) is not None and known.touching)
-        if taken is not known.claim:
-            self._take(thing, taken)
+    def touch(self, object_id: int) -> None:
+        """Claim an object by contact, unless its live owner is in contact with it, too."""
+        known = self._known[object_id]
+        claim = authority.claim_by_touch(known.claim, self.name, self.owner(object_id) is not None and known.touching)
+        if claim is not known.claim:
+            self._take(object_id, claim)
 
-    def grab(self, thing: int) -> None:
-        """I grabbed, picked or cut it: mine, whoever had it."""
-        self._take(thing, authority.claim_by_grab(self.claim(thing), self.name))
+    def grab(self, object_id: int) -> None:
+        """Claim an object by grabbing, picking or cutting it, whoever owns it."""
+        self._take(object_id, authority.claim_by_grab(self.claim(object_id), self.name))
 
-    def take_over(self, thing: int) -> None:
-        """Its owner is gone or there is none: mine."""
-        self._take(thing, authority.claim_by_touch(self.claim(thing), self.name, False))
+    def take_over(self, object_id: int) -> None:
+        """Claim an object that has no live owner."""
+        self._take(object_id, authority.claim_by_touch(self.claim(object_id), self.name, False))
 
-    def _take(self, thing: int, claim: Claim) -> None:
-        known = self._known[thing]
-        if thing not in self.owned or known.announced:
-            known.before = known.claim
-        known.claim, known.touching, known.announced, known.silent, known.said_to = claim, True, False, False, 0
-        self.owned.add(thing)
+    def _take(self, object_id: int, claim: Claim) -> None:
+        known = self._known[object_id]
+        if object_id not in self.owned or known.announced:
+            known.previous = known.claim
+        known.claim, known.touching, known.announced, known.silent, known.listener_count = claim, True, False, False, 0
+        self.owned.add(object_id)
 
-    def release(self, thing: int) -> Claim:
-        """What I moved lies still; the claim under which I say so."""
-        known = self._known[thing]
+    def release(self, object_id: int) -> Claim:
+        """Release an object at rest; the claim under which to publish that."""
+        known = self._known[object_id]
         held = known.claim
-        self.owned.discard(thing)
+        self.owned.discard(object_id)
         known.claim, known.touching = authority.release(held), False
         return held
 
-    def increment(self, thing: int) -> None:
-        """Count one up, still mine: a fact about it is coming, and no two facts share a claim."""
-        known = self._known[thing]
+    def increment(self, object_id: int) -> None:
+        """Increment the own claim before a retained record is published, because no two records share a claim."""
+        known = self._known[object_id]
         known.claim = known.claim._replace(authority=(known.claim.authority + 1) % authority.SEQUENCE_COUNT)
 
-    def rollback(self, thing: int) -> None:
-        """Nobody ever heard of the claim: as if it had not been, so that sequences only count what was said."""
-        known = self._known[thing]
-        known.claim = authority.release(known.before) if known.before.owner == self.name else known.before
+    def rollback(self, object_id: int) -> None:
+        """Undo a claim that no peer knows, so that sequences count only published claims."""
+        known = self._known[object_id]
+        known.claim = authority.release(known.previous) if known.previous.owner == self.name else known.previous
         known.silent = True
 
     # ------------------------------------------------------------ what others say
 
-    def receive_state(self, thing: int, claim: Claim, touching: bool, said_at: float, time: float) -> bool:
-        """Judge a record by its claim; whether its state is to be believed. The name of a thing at rest is nobody's."""
-        known = self._known[thing]
-        said_at = min(said_at, time + dead_reckoning.MAX_CLOCK_SKEW)
-        fresh = said_at > known.said_at
+    def receive_state(self, object_id: int, claim: Claim, touching: bool, published_at: float, time: float) -> bool:
+        """Merge the claim of a received state; whether the state is to be accepted.
+
+        ``published_at`` [s]: time in the message; ``time`` [s]: now. At rest the claim has no owner.
+        """
+        known = self._known[object_id]
+        published_at = min(published_at, time + dead_reckoning.MAX_CLOCK_SKEW)
+        fresh = published_at > known.published_at
         if claim != known.claim and not authority.wins(claim, known.claim):
             if fresh and claim.owner != NOBODY:
-                self._lost.append((thing, claim))
+                self._losing_claims.append((object_id, claim))
             return False
         if not fresh and claim == known.claim:
             return False
-        self._adopt(thing, claim, touching)
-        known.said_at, known.heard_at = said_at, time
+        self._adopt(object_id, claim, touching)
+        known.published_at, known.received_at = published_at, time
         return True
 
-    def receive_claim(self, thing: int, claim: Claim, touching: bool, sender: str, time: float) -> None:
-        """A claim, made by its sender or repeated by it as a correction."""
-        known = self._known[thing]
+    def receive_claim(self, object_id: int, claim: Claim, touching: bool, sender: str, time: float) -> None:
+        """Merge a claim that its owner made, or that ``sender`` repeated as a correction."""
+        known = self._known[object_id]
         if claim == known.claim and claim.owner != sender:
             return
         if claim == known.claim or authority.wins(claim, known.claim):
-            self._adopt(thing, claim, touching)
-            known.heard_at = time
+            self._adopt(object_id, claim, touching)
+            known.received_at = time
         elif claim.owner == sender:
-            self._lost.append((thing, claim))
+            self._losing_claims.append((object_id, claim))
 
-    def receive_retained(self, thing: int, claim: Claim, touching: bool, time: float) -> bool:
-        """A claim that comes with a fact; whether where it says the thing is holds now."""
-        known = self._known[thing]
+    def receive_retained(self, object_id: int, claim: Claim, touching: bool, time: float) -> bool:
+        """Merge the claim of a retained record; whether its pose holds now."""
+        known = self._known[object_id]
         if claim != known.claim and not authority.wins(claim, known.claim):
             return False
-        self._adopt(thing, claim, touching)
-        known.heard_at = time
+        self._adopt(object_id, claim, touching)
+        known.received_at = time
         return True
 
-    def _adopt(self, thing: int, claim: Claim, touching: bool) -> None:
-        """Hold a claim that somebody else made or reported."""
-        known = self._known[thing]
+    def _adopt(self, object_id: int, claim: Claim, touching: bool) -> None:
+        """Hold a claim that a peer made or repeated."""
+        known = self._known[object_id]
         known.claim, known.touching, known.announced, known.silent = claim, touching, True, False
         if claim.owner == self.name:
-            self.owned.add(thing)
+            self.owned.add(object_id)
             return
-        self.owned.discard(thing)
+        self.owned.discard(object_id)
         if claim.owner != NOBODY:
-            self.remote.add(thing)
+            self.remote.add(object_id)
 
     # ------------------------------------------------------------ what follows
 
-    def remove_actor(self, name: str, time: float, heir: Callable[[int], str]) -> None:
-        """An actor is gone: what it still moved goes to its ``heir``.
+    def remove_actor(self, name: str, time: float, successor: Callable[[int], str]) -> None:
+        """An actor has left: what it still moved goes to ``successor(object_id)``.
 
-        Its claims still hold, should it come back; only its silence counts, or two would never agree again.
+        Its claims still hold, in case it returns; it is only marked silent. Otherwise two clients might never agree
+        again.
         """
-        for thing in sorted(thing for thing, known in self._known.items() if known.claim.owner == name):
-            known = self._known[thing]
-            recent = not known.silent and time - known.heard_at < OWNER_TIMEOUT
+        for object_id in sorted(object_id for object_id, known in self._known.items() if known.claim.owner == name):
+            known = self._known[object_id]
+            recent = not known.silent and time - known.received_at < OWNER_TIMEOUT
             known.silent = True
-            if recent and heir(thing) == self.name:
-                self.take_over(thing)
+            if recent and successor(object_id) == self.name:
+                self.take_over(object_id)
 
     def expire(self, time: float) -> None:
-        """Owners who fell silent own no more, until they are heard again: their claim still holds."""
-        for thing in self.remote:
-            known = self._known[thing]
-            if time - known.heard_at > OWNER_TIMEOUT:
+        """Mark owners as silent that have timed out; their claims still hold."""
+        for object_id in self.remote:
+            known = self._known[object_id]
+            if time - known.received_at > OWNER_TIMEOUT:
                 known.silent = True
 
     def released(self) -> list[int]:
-        """Things another actor owned until now and nobody does any more."""
-        free = []
-        for thing in sorted(self.remote):
-            if thing in self.owned or self.owner(thing) is None:
-                self.remote.discard(thing)
-                if thing not in self.owned:
-                    free.append(thing)
-        return free
+        """Objects that have lost their remote owner since the last call."""
+        released = []
+        for object_id in sorted(self.remote):
+            if object_id in self.owned or self.owner(object_id) is None:
+                self.remote.discard(object_id)
+                if object_id not in self.owned:
+                    released.append(object_id)
+        return released
 
     def corrections(self, time: float) -> list[int]:
-        """Things that somebody claimed from old knowledge: saying what holds is how everybody agrees after a loss."""
-        lost, self._lost = self._lost, []
-        wrong = []
-        for thing, claim in lost:
-            known = self._known[thing]
+        """Objects that were claimed with outdated sequences: repeating the claim restores agreement after a loss."""
+        losing, self._losing_claims = self._losing_claims, []
+        corrections = []
+        for object_id, claim in losing:
+            known = self._known[object_id]
             if claim == known.claim or authority.wins(claim, known.claim):
                 continue
-            mine_to_say = self.owner(thing) in (self.name, None) or authority.is_outdated(claim, known.claim)
-            if mine_to_say and time - known.answered >= CORRECTION_PERIOD:
-                known.answered = time
-                wrong.append(thing)
-        return wrong
+            is_mine_to_correct = self.owner(object_id) in (self.name, None) or authority.is_outdated(claim, known.claim)
+            if is_mine_to_correct and time - known.corrected_at >= CORRECTION_PERIOD:
+                known.corrected_at = time
+                corrections.append(object_id)
+        return corrections

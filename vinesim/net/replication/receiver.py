@@ -73,7 +73,7 @@ class Receiver:
         for name in inbox.left:
             state.ownership.remove_actor(name, time, state.successor_of)
             state.wrench_sync.remove_peer(name)
-        inbox.joined, replies = peers.process_replies(now)
+        inbox.joined, replies = peers.process_replies()
         for reply in replies:
             self._receive_snapshot(reply, step)
         early = [message for hello in inbox.joined for message in self._early.pop(hello.name, ())]

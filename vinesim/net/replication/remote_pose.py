@@ -1,4 +1,4 @@
-"""Another actor between two of its messages: dead reckoning of its pose, and the hiding of corrections."""
+"""The pose of one peer between two messages: dead reckoning, error smoothing and, if wanted, a jitter buffer."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from vinesim.net.transport.bus import Subscription
 from vinesim.scene.values import POINT_NAMES, HumanUpdate, RobotUpdate
 
 TELEPORT_DISTANCE = 1.0
-"""Who is this far [m] from where he was taken to be has been put there: it is shown at once, not blended."""
+"""A correction larger than this is shown at once instead of blended [m]. GUESSED."""
 
-FAR_BLEND_TIME = 0.1
-"""Of who is far away nothing is heard for 200 ms: what is shown of him is computed anew only so often [s]."""
+FAR_SAMPLE_PERIOD = 0.1
+"""Poses of peers that are not near are computed anew only so often [s]; their messages arrive every 200 ms."""
 
 _BASE = np.arange(3, 7)[None]
 _HIPS = slice(7 * POINT_NAMES.index("hips"), 7 * POINT_NAMES.index("hips") + 3)
@@ -24,10 +24,10 @@ _TURNS = 7 * np.arange(len(POINT_NAMES))[:, None] + _BASE
 
 
 class RemotePose:
-    """Another actor and the last that is known of its pose."""
+    """One peer and the last pose received from it."""
 
     def __init__(self, hello: Hello, buffer: float = 0.0) -> None:
-        """``buffer`` [s]: its poses are shown so much later, see :class:`Buffer`; 0 extrapolates them to now."""
+        """``buffer`` [s]: delay of the :class:`JitterBuffer`; 0 extrapolates poses to now."""
         self.hello = hello
         self._buffer = JitterBuffer(buffer)
         self.joints = hello.joints
@@ -35,14 +35,15 @@ class RemotePose:
         self.near: Subscription | None = None
         self.moved_at = -1e9
         self._turns = _TURNS if hello.kind == "human" else _BASE
-        """Where in the numbers of a pose its quaternions are [k, 4]."""
+        """Indices of the quaternions in the flat pose [k, 4]."""
         self._place = _HIPS if hello.kind == "human" else slice(3)
-        """Where the place is by which one sees that it was put elsewhere."""
-        self._state = self._rate = self._off = np.zeros(0)
-        self._seen: RobotUpdate | HumanUpdate | None = None
+        """Slice of the flat pose with the position that shows a teleport."""
+        self._state = self._rate = self._correction = np.zeros(0)
+        self._cached: RobotUpdate | HumanUpdate | None = None
 
     def receive(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
-        """Take a newer pose at network ``time``; False if it is not newer."""
+        """Take a pose at network ``time`` [s]; False if it is not newer. Raises :class:`MessageError` if it does not
+        fit the peer."""
         if (self.hello.kind == "human") != isinstance(update, HumanUpdate):
             raise MessageError(f"pose of a {type(update).__name__} by {update.actor!r}, which is a {self.hello.kind}")
         if update.time > time + dead_reckoning.MAX_CLOCK_SKEW:
@@ -55,45 +56,47 @@ class RemotePose:
             if len(update.position) != self.joints:
                 raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
         shown = None if self.update is None else self._shown(time)
-        self.update, self._seen = update, None
+        self.update, self._cached = update, None
         self._state, self._rate = _numbers(update)
-        self._off = np.zeros(0)
+        self._correction = np.zeros(0)
         if self._buffer.delay > 0.0:
-            self._keep(update.time)
+            self._buffer_sample(update.time)
         elif shown is not None:
             here = self._shown(time)
             turn = shown[self._turns]
             shown[self._turns] = np.copysign(1.0, (turn * here[self._turns]).sum(1, keepdims=True)) * turn
             if float(np.linalg.norm((shown - here)[self._place])) < TELEPORT_DISTANCE:
-                self._off = shown - here
+                self._correction = shown - here
             self.moved_at = time
         return True
 
     def sample(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
-        """The pose at network ``time``, to be shown ``now``; of an actor that is not near, at most 100 ms old."""
-        if self._seen is None or self.near is not None or not 0.0 <= now - self._seen.time < FAR_BLEND_TIME:
-            self._seen = self._at(time, now)
-        return self._seen
+        """The pose at network ``time``, to be shown at own time ``now`` [s]; of a distant peer up to 100 ms old."""
+        if self._cached is None or self.near is not None or not 0.0 <= now - self._cached.time < FAR_SAMPLE_PERIOD:
+            self._cached = self._at(time, now)
+        return self._cached
 
     def _at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
-        heard, shown = self.update, self._shown(time)
-        assert heard is not None
-        going = 1.0 if time - heard.time <= dead_reckoning.MAX_EXTRAPOLATION else 0.0
+        update, shown = self.update, self._shown(time)
+        assert update is not None
+        moving = 1.0 if time - update.time <= dead_reckoning.MAX_EXTRAPOLATION else 0.0
         turn = shown[self._turns]
         shown[self._turns] = turn / np.sqrt((turn * turn).sum(1, keepdims=True))
-        if self._buffer.delay > 0.0 and isinstance(heard, RobotUpdate):
+        if self._buffer.delay > 0.0 and isinstance(update, RobotUpdate):
             rate = self._buffer.rate(time)
-            twist = np.concatenate([rate[:3], heard.base_qd[3:]])
-            return RobotUpdate(heard.actor, now, shown[:7], twist, shown[7:], rate[7:])
-        if isinstance(heard, HumanUpdate):
-            return HumanUpdate(heard.actor, now, heard.pose.with_points(shown.reshape(-1, 7)), heard.velocity * going)
+            twist = np.concatenate([rate[:3], update.base_qd[3:]])
+            return RobotUpdate(update.actor, now, shown[:7], twist, shown[7:], rate[7:])
+        if isinstance(update, HumanUpdate):
+            return HumanUpdate(
+                update.actor, now, update.pose.with_points(shown.reshape(-1, 7)), update.velocity * moving
+            )
         return dataclasses.replace(
-            heard, time=now, base_q=shown[:7], base_qd=heard.base_qd * going, position=shown[7:],
-            velocity=heard.velocity * going,
+            update, time=now, base_q=shown[:7], base_qd=update.base_qd * moving, position=shown[7:],
+            velocity=update.velocity * moving,
         )  # fmt: skip
 
-    def _keep(self, time: float) -> None:
-        """One more sample for the buffer, its quaternions on the side of those before."""
+    def _buffer_sample(self, time: float) -> None:
+        """Insert the newest pose into the jitter buffer, its quaternions on the same side as the previous ones."""
         if self._buffer.states:
             before, turns = self._buffer.states[-1], self._turns
             side = np.copysign(1.0, (before[turns] * self._state[turns]).sum(1, keepdims=True))
@@ -106,8 +109,8 @@ class RemotePose:
         if self._buffer.delay > 0.0:
             return self._buffer.sample(time).copy()
         shown = self._state + self._rate * dead_reckoning.clamp_age(time - self.update.time)
-        if len(self._off):
-            shown += self._off * dead_reckoning.blend_weight(time - self.moved_at)
+        if len(self._correction):
+            shown += self._correction * dead_reckoning.blend_weight(time - self.moved_at)
         return shown
 
 

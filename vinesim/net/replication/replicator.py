@@ -6,9 +6,8 @@ is near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong
 (:mod:`~vinesim.net.replication.dead_reckoning`).
 
 Keys: ``a/<actor>`` poses, ``c/<x>/<y>/<actor>`` states of what moves in a cell, ``own/<x>/<y>/<actor>`` claims and
-states at
-rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, and the queries ``snap/<x>/<y>``
-(records of a cell), ``hello/<actor>`` and ``clock``.
+states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, and the queries
+``snap/<x>/<y>`` (records of a cell), ``hello/<actor>`` and ``clock``.
 """
 
 from __future__ import annotations
@@ -53,7 +52,6 @@ class Replicator:
         self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer)
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
-        self._now: float | None = None
         self._last_sent = -1e9
 
     @property
@@ -112,9 +110,7 @@ class Replicator:
 
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
-        peers = self._state.peers
-        peers.clock = peers.clock.advanced(now - self._now if self._now is not None else 0.0)
-        self._now = now
+        self._state.peers.clock.advance(now)
         return self._receiver.receive(now, self.offset)
 
     def send(

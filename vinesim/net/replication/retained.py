@@ -1,9 +1,10 @@
-"""What stays true when everybody has gone: the greatest fact about each thing, and in which cell it lies; pure.
+"""Retained state: the record with the greatest claim of each object, and the cell it belongs to; a CRDT; pure.
 
-The server keeps one of these for those who come later, every client one for what it has heard. Adding is a join of a
-semilattice: whatever the order, whatever came twice, equal sets of facts make equal stores. Of two facts about one
-thing the one with the greater claim holds (:func:`authority.wins`), whoever said it first; an author therefore never
-says two different things under one claim. What was cut off a tree stays cut: the winner takes the loser's cuts over.
+A last-writer-wins map: merging is a join of a semilattice, so that equal sets of records give equal maps, in whatever
+order and however often they arrive. Of two records of one object the one with the greater claim holds
+(:func:`authority.wins`); an author therefore never publishes two different records under one claim. Cuts accumulate:
+the winner takes over the loser's. The server keeps one such map for a world, every client one of what it has received.
+Source: M. Shapiro et al., Conflict-free Replicated Data Types, 2011.
 """
 
 from __future__ import annotations
@@ -18,47 +19,47 @@ from vinesim.net.replication.interest import Cell
 
 
 class RetainedState:
-    """The winning fact of every thing. A thing has one fact over all cells: it lies where the greatest claim says."""
+    """The winning record of every object. An object is in one cell: that of its greatest claim."""
 
     def __init__(self) -> None:
         self._cell_of: dict[int, Cell] = {}
-        self._facts: dict[Cell, dict[int, RetainedRecord]] = {}
+        self._records: dict[Cell, dict[int, RetainedRecord]] = {}
 
-    def merge(self, cell: Cell, fact: RetainedRecord) -> bool:
-        """Hear a fact that was said under ``cell``; whether anything is known now that was not before."""
-        held = self.get(fact.object)
+    def merge(self, cell: Cell, record: RetainedRecord) -> bool:
+        """Merge a record that was published under ``cell``; whether that changed anything."""
+        held = self.get(record.object)
         if held is None:
-            self._put(cell, fact)
+            self._put(cell, record)
             return True
-        cuts = tuple(sorted({*held.cut, *fact.cut}))
-        if authority.wins(fact.claim, held.claim):
-            self._facts[self._cell_of[fact.object]].pop(fact.object)
+        cuts = tuple(sorted({*held.cut, *record.cut}))
+        if authority.wins(record.claim, held.claim):
+            self._records[self._cell_of[record.object]].pop(record.object)
         elif cuts != held.cut:
-            cell, fact = self._cell_of[fact.object], held
+            cell, record = self._cell_of[record.object], held
         else:
             return False
-        self._put(cell, fact if cuts == fact.cut else msgspec.structs.replace(fact, cut=cuts))
+        self._put(cell, record if cuts == record.cut else msgspec.structs.replace(record, cut=cuts))
         return True
 
-    def get(self, thing: int) -> RetainedRecord | None:
-        """What is known of a thing."""
-        cell = self._cell_of.get(thing)
-        return None if cell is None else self._facts[cell][thing]
+    def get(self, object_id: int) -> RetainedRecord | None:
+        """The record of an object, or None."""
+        cell = self._cell_of.get(object_id)
+        return None if cell is None else self._records[cell][object_id]
 
     def in_cell(self, cell: Cell) -> list[RetainedRecord]:
-        """The facts about all things that lie in a cell, in the order of their numbers."""
-        here = self._facts.get(cell, {})
-        return [here[thing] for thing in sorted(here)]
+        """Records of all objects in a cell, in the order of their ids."""
+        here = self._records.get(cell, {})
+        return [here[object_id] for object_id in sorted(here)]
 
     def __iter__(self) -> Iterator[tuple[Cell, RetainedRecord]]:
-        """All facts and their cells, in the order of the things' numbers."""
-        for thing in sorted(self._cell_of):
-            cell = self._cell_of[thing]
-            yield cell, self._facts[cell][thing]
+        """All cells and records, in the order of object ids."""
+        for object_id in sorted(self._cell_of):
+            cell = self._cell_of[object_id]
+            yield cell, self._records[cell][object_id]
 
     def __len__(self) -> int:
         return len(self._cell_of)
 
-    def _put(self, cell: Cell, fact: RetainedRecord) -> None:
-        self._cell_of[fact.object] = cell
-        self._facts.setdefault(cell, {})[fact.object] = fact
+    def _put(self, cell: Cell, record: RetainedRecord) -> None:
+        self._cell_of[record.object] = cell
+        self._records.setdefault(cell, {})[record.object] = record

@@ -1,7 +1,7 @@
-"""Facts on their way: mine until somebody hears them, others' as they come, and the server's when a cell comes near.
+"""Retained records between a client and the server: published until received, received from peers, queried by cell.
 
-A fact leaves even when nobody is near, for the server keeps it; it leaves once. What I said is said again when the
-server was gone and is back: it may be another one, that knows nothing.
+A record is published once, wherever the peers are, because the server keeps it. After the server was gone the client
+publishes all of its own records again, for the new one may know nothing.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL, Bus, Publisher, Subscription
 
 QUERY_TIMEOUT = 0.5
-"""The server is asked again after this [s], then after twice as long, and so on ..."""
+"""Time after which the server is asked again, doubled each time [s] ..."""
 
 MAX_QUERY_PERIOD = 8.0
-"""... up to this [s], until it has answered."""
+"""... up to this time [s], until it has replied."""
 
 TYPICAL_RECORD_SIZE = 110
-"""A fact about a box or a bunch takes no more [B]; about a tree, its state comes on top."""
+"""Upper estimate of an encoded record without the state of a tree [B]."""
 
 
 class RetainedSync:
-    """What this client knows for good, and what of it others must still hear."""
+    """The retained state as one client knows it, and what it still has to publish."""
 
     def __init__(self, bus: Bus, counters: Counters) -> None:
         self.bus, self.counters = bus, counters
@@ -36,37 +36,41 @@ class RetainedSync:
         self._publishers: dict[Cell, Publisher] = {}
         self._subscriptions: dict[Cell, Subscription] = {}
         self._asked: dict[Cell, tuple[float, float]] = {}
-        self._apart = False
+        self._is_disconnected = False
 
-    def publish(self, cell: Cell, fact: RetainedRecord) -> None:
-        """A fact that I am the author of, about something that is in ``cell``."""
-        self.state.merge(cell, fact)
-        if fact.object in self._authored:
-            before = self._authored[fact.object][0]
-            self._pending.get(before, {}).pop(fact.object, None)
-        self._authored[fact.object] = cell, fact
-        self._pending.setdefault(cell, {})[fact.object] = fact
+    def publish(self, cell: Cell, record: RetainedRecord) -> None:
+        """Queue an own record about an object in ``cell``."""
+        self.state.merge(cell, record)
+        if record.object in self._authored:
+            before = self._authored[record.object][0]
+            self._pending.get(before, {}).pop(record.object, None)
+        self._authored[record.object] = cell, record
+        self._pending.setdefault(cell, {})[record.object] = record
 
-    def merge(self, cell: Cell, fact: RetainedRecord) -> bool:
-        """A fact that somebody else said, or the server kept; whether it is news."""
-        news = self.state.merge(cell, fact)
-        if news and fact.author != self.bus.name:
-            held = self.state.get(fact.object)
-            if held is not None and held.author != self.bus.name and fact.object in self._authored:
-                mine, _ = self._authored.pop(fact.object)
-                self._pending.get(mine, {}).pop(fact.object, None)
-        return news
+    def merge(self, cell: Cell, record: RetainedRecord) -> bool:
+        """Merge a record of a peer or the server; whether that changed anything."""
+        is_new = self.state.merge(cell, record)
+        if is_new and record.author != self.bus.name:
+            held = self.state.get(record.object)
+            if held is not None and held.author != self.bus.name and record.object in self._authored:
+                cell_before, _ = self._authored.pop(record.object)
+                self._pending.get(cell_before, {}).pop(record.object, None)
+        return is_new
 
     def update_window(self, window: Iterable[Cell], now: float) -> None:
-        """Hear the facts of these cells from now on, and ask what was known of those that are new."""
-        wanted, apart = set(window), bool(self.bus.status_message)
-        if not self._asked and apart == self._apart and wanted == self._subscriptions.keys() == self._publishers.keys():
+        """Subscribe to records of these cells and query the server for those that are new."""
+        wanted, is_disconnected = set(window), bool(self.bus.status_message)
+        if (
+            not self._asked
+            and is_disconnected == self._is_disconnected
+            and wanted == self._subscriptions.keys() == self._publishers.keys()
+        ):
             return
-        if self._apart and not apart:
-            for thing, (cell, fact) in self._authored.items():
-                self._pending.setdefault(cell, {})[thing] = fact
+        if self._is_disconnected and not is_disconnected:
+            for object_id, (cell, record) in self._authored.items():
+                self._pending.setdefault(cell, {})[object_id] = record
             self._asked = dict.fromkeys(wanted, (now, QUERY_TIMEOUT))
-        self._apart = apart
+        self._is_disconnected = is_disconnected
         for cell in sorted(self._subscriptions.keys() - wanted):
             self._subscriptions.pop(cell).close()
             self._asked.pop(cell, None)
@@ -77,35 +81,35 @@ class RetainedSync:
             self._publishers.pop(cell).close()
         for cell in sorted(wanted - self._publishers.keys()):
             self._publishers[cell] = self._publisher(cell)
-        if not apart:
-            for cell, (due, pause) in sorted(self._asked.items()):
+        if not is_disconnected:
+            for cell, (due, period) in sorted(self._asked.items()):
                 if now >= due:
-                    self._asked[cell] = now + pause, min(2.0 * pause, MAX_QUERY_PERIOD)
+                    self._asked[cell] = now + period, min(2.0 * period, MAX_QUERY_PERIOD)
                     self.bus.query(f"snap/{cell[0]}/{cell[1]}")
 
     def mark_answered(self, cell: Cell) -> None:
-        """The server told what it knows of a cell."""
+        """The server has replied for a cell."""
         self._asked.pop(cell, None)
 
     def flush(self) -> None:
-        """Send what was not said yet, a message for each cell; what nobody listens to waits."""
+        """Send queued records, one message for each cell; without a subscriber they wait."""
         for cell in sorted(self._pending):
             waiting = self._pending[cell]
-            voice = self._publishers.get(cell)
-            if voice is None:
-                voice = self._publishers[cell] = self._publisher(cell)
-            if waiting and voice.matching:
-                chosen, room = [], messages.MAX_DATAGRAM
-                for thing in sorted(waiting):
-                    room -= TYPICAL_RECORD_SIZE + len(waiting[thing].trees)
-                    if room < 0 and chosen:
+            publisher = self._publishers.get(cell)
+            if publisher is None:
+                publisher = self._publishers[cell] = self._publisher(cell)
+            if waiting and publisher.matching:
+                batch, free_bytes = [], messages.MAX_DATAGRAM
+                for object_id in sorted(waiting):
+                    free_bytes -= TYPICAL_RECORD_SIZE + len(waiting[object_id].trees)
+                    if free_bytes < 0 and batch:
                         break
-                    chosen.append(thing)
-                payload = messages.encode_records([waiting[thing] for thing in chosen])
-                if voice.put(payload):
+                    batch.append(object_id)
+                payload = messages.encode_records([waiting[object_id] for object_id in batch])
+                if publisher.put(payload):
                     self.counters.retained.count_out(payload)
-                    for thing in chosen:
-                        del waiting[thing]
+                    for object_id in batch:
+                        del waiting[object_id]
             if not waiting:
                 del self._pending[cell]
 

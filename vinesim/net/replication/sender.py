@@ -122,7 +122,7 @@ class Sender:
         contact = [object_id in touched for object_id in active]
         if not listeners.any():
             for entry, touching in zip(entries, contact, strict=True):
-                entry.said_to, entry.touching = 0, touching
+                entry.listener_count, entry.touching = 0, touching
             return
         due = self._find_due(stream, active, entries, listeners, contact, step)
         cells = stream.cells(active)
@@ -145,21 +145,20 @@ class Sender:
                 put_counted(states, payload, state.counters.environment)
             for row in rows:
                 entry = entries[row]
-                entry.announced, entry.said_at, entry.said_to = True, step.time, int(listeners[row])
+                entry.announced, entry.published_at, entry.listener_count = True, step.time, int(listeners[row])
 
     def _find_due(
         self, stream: TreeStream | ObjectStream, active: tuple[int, ...], entries: list[ObjectRecord],
         listeners: np.ndarray, contact: list[bool], step: LocalStep,
     ) -> np.ndarray:  # fmt: skip
-        """Which objects to publish [k] bool: the prediction is wrong, or a listener, the claim or the contact is
-        new."""
-        silence = step.time - np.array([entry.said_at for entry in entries])
+        """Which objects to publish [k] bool: the prediction is wrong, or a listener, claim or contact is new."""
+        silence = step.time - np.array([entry.published_at for entry in entries])
         error = stream.prediction_error(active, silence, step.read, step.detached_roots)
         due = dead_reckoning.needs_update(*error, silence)
         for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
-            due[row] |= listeners[row] > entry.said_to or entry.touching != touching
+            due[row] |= listeners[row] > entry.listener_count or entry.touching != touching
             entry.touching = touching
-            entry.said_to = min(entry.said_to, int(listeners[row]))
+            entry.listener_count = min(entry.listener_count, int(listeners[row]))
         return due & (listeners > 0)
 
     # ------------------------------------------------------------ rest and retained records
@@ -199,7 +198,7 @@ class Sender:
             self._publish_tree_record(cell, record, step)
         if listened is not None:
             put_counted(listened, payload, state.counters.event)
-        entry.announced, entry.said_at = True, step.time
+        entry.announced, entry.published_at = True, step.time
         return update
 
     def _publish_object_at_rest(self, object_id: int, step: LocalStep) -> None:

@@ -1,7 +1,7 @@
-"""What moves, between two messages: what was last said of it, how wrong that has become, and what to say instead.
+"""What was last published of each moving object, how wrong the copies are by now, and the messages that correct them.
 
-:class:`TreeStream` for trees, which stay in their cells, :class:`ThingStream` for boxes and loose bunches, which do
-not. Sender and receiver remember the same quantised values and extrapolate them alike
+:class:`TreeStream` for trees, which stay in their cells, :class:`ObjectStream` for boxes and free bunches, which do
+not. Sender and receiver keep the same quantised values and extrapolate them alike
 (:mod:`vinesim.net.replication.dead_reckoning`).
 """
 
@@ -21,23 +21,23 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import ObjectUpdate, TreeUpdate
 
 StateReader = Callable[[int], tuple[np.ndarray, np.ndarray]]
-"""State and rate of one thing: joints of a tree ([n, 4], [n, 3] rad/s), pose and velocity of any other ([7], [6])."""
+"""State and rate of one object: joints of a tree ([n, 4], [n, 3] rad/s), pose and velocity of another ([7], [6])."""
 
 DetachedRoots = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Numbers [k] in their tree of bodies that were cut off it, where they are [k, 3] m, how fast [k, 3] m/s."""
+"""Bodies that were cut angle a tree: indices [k] in the tree, positions [k, 3] m, velocities [k, 3] m/s."""
 
 NO_ROOTS: DetachedRoots = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ClaimColumns:
-    """By whom and with what right the things of one message are moved, thing by thing."""
+    """Claims and flags of the objects of one message."""
 
     claims: list[Claim]
     flags: list[int]
 
     def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ownership, authority and flags [k] each."""
+        """Ownership, authority and flags, [k] each."""
         return (
             np.array([claim.ownership for claim in self.claims]),
             np.array([claim.authority for claim in self.claims]),
@@ -46,7 +46,7 @@ class ClaimColumns:
 
 
 class TreeStream:
-    """Trees that move."""
+    """Published and received states of trees."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -54,27 +54,27 @@ class TreeStream:
         self.cell = [tuple(cell) for cell in interest.cells_of(self.middle).tolist()]
         body_count = len(model.body_mass)
         self._bodies = [model.bodies_of(tree) for tree in range(len(model.tree_first))]
-        self._reach = _lever_arms(model)
-        self._said_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (body_count, 1))
-        self._said_rate = np.zeros((body_count, 4))
-        self._said_roots: dict[int, DetachedRoots] = {}
+        self._lever_arm = _lever_arms(model)
+        self._published_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (body_count, 1))
+        self._published_rate = np.zeros((body_count, 4))
+        self._published_roots: dict[int, DetachedRoots] = {}
         self._active: tuple[int, ...] | None = None
         self._sizes = self._starts = self._order = np.zeros(0, np.int64)
         self._q = self._qd = np.zeros((0, 4))
         self._roots: list[DetachedRoots] = []
 
     def positions(self, active: tuple[int, ...], read: StateReader) -> np.ndarray:
-        """Where these trees are [k, 3] m."""
+        """Positions of these trees [k, 3] m."""
         return self.middle[list(active)]
 
     def cells(self, active: tuple[int, ...]) -> list[Cell]:
-        """Under which cells they are said [k]."""
+        """Cells under which they are published [k]."""
         return [self.cell[tree] for tree in active]
 
     def prediction_error(
         self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How far off everybody's copies are by now [k] m and [k] rad; ``silence`` [k] s since the last record."""
+        """Errors of the peers' copies by now [k] m and [k] rad; ``silence`` [k] s since the last state."""
         if self._active != active:
             self._active = active
             self._sizes = self.model.tree_size[list(active)].astype(np.int64)
@@ -86,41 +86,41 @@ class TreeStream:
         self._roots = [cut(tree) for tree in active]
         bodies, horizon = self._order, dead_reckoning.clamp_age(silence)
         dt = np.repeat(horizon, self._sizes)[:, None]
-        off = dead_reckoning.angle_between(
-            self._q, dead_reckoning.extrapolate(self._said_q[bodies], self._said_rate[bodies], dt)
+        angle = dead_reckoning.angle_between(
+            self._q, dead_reckoning.extrapolate(self._published_q[bodies], self._published_rate[bodies], dt)
         )
-        position = np.add.reduceat(off * self._reach[bodies], self._starts)
+        position = np.add.reduceat(angle * self._lever_arm[bodies], self._starts)
         for row, (tree, roots) in enumerate(zip(active, self._roots, strict=True)):
             if len(roots[0]):
-                said = self._said_roots.get(tree, NO_ROOTS)
-                if len(said[0]) != len(roots[0]):
+                published = self._published_roots.get(tree, NO_ROOTS)
+                if len(published[0]) != len(roots[0]):
                     position[row] = np.inf
                 else:
-                    there = said[1] + said[2] * np.atleast_1d(horizon)[row]
-                    position[row] += np.linalg.norm(roots[1] - there, axis=1).max()
-        return position, np.maximum.reduceat(off, self._starts)
+                    predicted = published[1] + published[2] * np.atleast_1d(horizon)[row]
+                    position[row] += np.linalg.norm(roots[1] - predicted, axis=1).max()
+        return position, np.maximum.reduceat(angle, self._starts)
 
-    def encode(self, rows: list[int], said: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
-        """Messages about some rows of the trees that were last judged; from now on this is what was said."""
+    def encode(self, rows: list[int], published: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
+        """Messages about some rows of the trees that were last judged; they become the last published state."""
         assert self._active is not None
         here = [self._active[row] for row in rows]
         part: slice | np.ndarray = slice(None)
         if len(rows) < len(self._active):
             part = np.concatenate([np.arange(self._starts[r], self._starts[r] + self._sizes[r]) for r in rows])
-        batch = TreeStates(time, np.array(here), *said.columns(), self._sizes[rows], self._q[part], self._qd[part])
-        payloads, heard = messages.encode_trees(with_roots(batch, [self._roots[row] for row in rows]))
-        self._remember(self._order[part], heard, heard.updates(""))
+        batch = TreeStates(time, np.array(here), *published.columns(), self._sizes[rows], self._q[part], self._qd[part])
+        payloads, received = messages.encode_trees(with_roots(batch, [self._roots[row] for row in rows]))
+        self._remember(self._order[part], received, received.updates(""))
         return payloads
 
-    def _remember(self, bodies: np.ndarray, heard: TreeStates, updates: Iterable[TreeUpdate]) -> None:
-        self._said_q[bodies] = heard.joint_q
-        self._said_rate[bodies] = dead_reckoning.quaternion_rate(heard.joint_q, heard.joint_qd)
-        if len(heard.root):
+    def _remember(self, bodies: np.ndarray, received: TreeStates, updates: Iterable[TreeUpdate]) -> None:
+        self._published_q[bodies] = received.joint_q
+        self._published_rate[bodies] = dead_reckoning.quaternion_rate(received.joint_q, received.joint_qd)
+        if len(received.root):
             for update in updates:
-                self._said_roots[update.tree] = update.root, update.root_x, update.root_xd
+                self._published_roots[update.tree] = update.root, update.root_x, update.root_xd
 
     def extrapolated(self, news: dict[int, tuple[TreeStates, str]], now: float, time: float) -> list[TreeUpdate]:
-        """The last record of each tree, now; what was said is remembered for the next prediction."""
+        """The last state of each tree in ``news``, extrapolated to now; it becomes the last known state."""
         found: dict[int, TreeUpdate] = {}
         for trees, sender in {id(batch[0]): batch for batch in news.values()}.values():
             rate = dead_reckoning.quaternion_rate(trees.joint_q, trees.joint_qd)
@@ -133,98 +133,103 @@ class TreeStream:
                     root_x=trees.root_x + age * trees.root_xd,
                 )
             first = 0
-            for heard, update in zip(trees.updates(sender), here.updates(sender), strict=True):
+            for received, update in zip(trees.updates(sender), here.updates(sender), strict=True):
                 last = first + len(update.joint_q)
                 if news.get(update.tree, (None,))[0] is trees:
                     found[update.tree] = update
                     bodies = self._bodies[update.tree]
-                    self._said_q[bodies], self._said_rate[bodies] = trees.joint_q[first:last], rate[first:last]
-                    self._said_roots[update.tree] = heard.root, heard.root_x, heard.root_xd
+                    self._published_q[bodies], self._published_rate[bodies] = (
+                        trees.joint_q[first:last],
+                        rate[first:last],
+                    )
+                    self._published_roots[update.tree] = received.root, received.root_x, received.root_xd
                 first = last
         return [found[tree] for tree in sorted(found)]
 
 
 class ObjectStream:
-    """Boxes and loose bunches that move."""
+    """Published and received states of boxes and free bunches."""
 
     def __init__(self) -> None:
-        self._said: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._heard: dict[int, ObjectUpdate] = {}
+        self._published: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._received: dict[int, ObjectUpdate] = {}
         self._cell: dict[int, Cell] = {}
         self._pose = self._velocity = np.zeros((0, 7))
         self._active: tuple[int, ...] = ()
 
-    def cell(self, thing: int) -> Cell | None:
-        """Under which cell a thing was last said."""
-        return self._cell.get(thing)
+    def cell(self, object_id: int) -> Cell | None:
+        """Cell under which an object was last published, or None."""
+        return self._cell.get(object_id)
 
-    def position(self, thing: int) -> np.ndarray:
-        """Where a thing was when it was last spoken of [3] m."""
-        return self._said[thing][0][:3] if thing in self._said else np.zeros(3)
+    def position(self, object_id: int) -> np.ndarray:
+        """Last known position of an object [3] m."""
+        return self._published[object_id][0][:3] if object_id in self._published else np.zeros(3)
 
     def positions(self, active: tuple[int, ...], read: StateReader) -> np.ndarray:
-        """Where these things are [k, 3] m."""
+        """Read and return the positions of these objects [k, 3] m."""
         self._active = active
-        state = [read(thing) for thing in active]
+        state = [read(object_id) for object_id in active]
         self._pose = np.array([pose for pose, _ in state], float)
         self._velocity = np.array([velocity for _, velocity in state], float)
-        for thing, cell in zip(active, interest.cells_of(self._pose).tolist(), strict=True):
-            self._cell[thing] = tuple(cell)
+        for object_id, cell in zip(active, interest.cells_of(self._pose).tolist(), strict=True):
+            self._cell[object_id] = tuple(cell)
         return self._pose[:, :3]
 
     def cells(self, active: tuple[int, ...]) -> list[Cell]:
-        """Under which cells they are said [k]."""
-        return [self._cell[thing] for thing in active]
+        """Cells under which they are published [k]."""
+        return [self._cell[object_id] for object_id in active]
 
     def prediction_error(
         self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How far off everybody's copies are by now [k] m and [k] rad; ``silence`` [k] s since the last record."""
-        nothing: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
-        said = [self._said.get(thing, nothing) for thing in active]
-        pose, velocity = np.array([pose for pose, _ in said]), np.array([velocity for _, velocity in said])
+        """Errors of the peers' copies by now [k] m and [k] rad; ``silence`` [k] s since the last state."""
+        unknown: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
+        published = [self._published.get(object_id, unknown) for object_id in active]
+        pose, velocity = np.array([pose for pose, _ in published]), np.array([velocity for _, velocity in published])
         pose[:, 3:] = np.where(np.isfinite(pose[:, 3:]), pose[:, 3:], self._pose[:, 3:])
-        there = _extrapolate_pose(pose, velocity, np.asarray(dead_reckoning.clamp_age(silence))[:, None])
-        return np.linalg.norm(self._pose[:, :3] - there[:, :3], axis=1), dead_reckoning.angle_between(
-            self._pose[:, 3:], there[:, 3:]
+        predicted = _extrapolate_pose(pose, velocity, np.asarray(dead_reckoning.clamp_age(silence))[:, None])
+        return np.linalg.norm(self._pose[:, :3] - predicted[:, :3], axis=1), dead_reckoning.angle_between(
+            self._pose[:, 3:], predicted[:, 3:]
         )
 
-    def encode(self, rows: list[int], said: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
-        """Messages about some rows of the things that were last judged; from now on this is what was said."""
+    def encode(self, rows: list[int], published: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
+        """Messages about some rows of the objects that were last judged; they become the last published state."""
         ids = np.array([self._active[row] for row in rows])
-        batch = ObjectStates(time, ids, *said.columns(), self._pose[rows], self._velocity[rows])
-        payloads, heard = messages.encode_objects(batch, cell)
-        for thing, pose, velocity in zip(ids.tolist(), heard.pose, heard.velocity, strict=True):
-            self._said[thing] = pose, velocity
+        batch = ObjectStates(time, ids, *published.columns(), self._pose[rows], self._velocity[rows])
+        payloads, received = messages.encode_objects(batch, cell)
+        for object_id, pose, velocity in zip(ids.tolist(), received.pose, received.velocity, strict=True):
+            self._published[object_id] = pose, velocity
         return payloads
 
     def receive(self, update: ObjectUpdate, cell: Cell) -> None:
-        """Take a record that is to be believed; its time is the network's."""
-        self._heard[update.object] = update
-        self._said[update.object] = update.pose, update.velocity
+        """Take an accepted state; its time is network time."""
+        self._received[update.object] = update
+        self._published[update.object] = update.pose, update.velocity
         self._cell[update.object] = cell
 
-    def remove(self, thing: int) -> None:
-        """It rests, or its owner is gone."""
-        self._heard.pop(thing, None)
+    def remove(self, object_id: int) -> None:
+        """Forget the received state of an object that is at rest or has lost its owner."""
+        self._received.pop(object_id, None)
 
-    def extrapolated(self, theirs: set[int], now: float, time: float) -> list[ObjectUpdate]:
-        """Everything that others move, where it is now; after 150 ms without a word it stands still."""
-        heard = [self._heard[thing] for thing in sorted(self._heard.keys() & theirs)]
-        if not heard:
+    def extrapolated(self, remote: set[int], now: float, time: float) -> list[ObjectUpdate]:
+        """All objects that peers move, extrapolated to now; after 150 ms without a message they stand still."""
+        received = [self._received[object_id] for object_id in sorted(self._received.keys() & remote)]
+        if not received:
             return []
-        age = time - np.array([update.time for update in heard])[:, None]
-        velocity = np.array([update.velocity for update in heard])
-        poses = _extrapolate_pose(np.array([update.pose for update in heard]), velocity, dead_reckoning.clamp_age(age))
-        going = velocity * (age <= dead_reckoning.MAX_EXTRAPOLATION)
+        age = time - np.array([update.time for update in received])[:, None]
+        velocity = np.array([update.velocity for update in received])
+        poses = _extrapolate_pose(
+            np.array([update.pose for update in received]), velocity, dead_reckoning.clamp_age(age)
+        )
+        velocity_shown = velocity * (age <= dead_reckoning.MAX_EXTRAPOLATION)
         return [
             dataclasses.replace(update, time=now, pose=pose, velocity=rate)
-            for update, pose, rate in zip(heard, poses, going, strict=True)
+            for update, pose, rate in zip(received, poses, velocity_shown, strict=True)
         ]
 
 
 def with_roots(trees: TreeStates, roots: list[DetachedRoots]) -> TreeStates:
-    """A batch of trees with what was cut off each."""
+    """A batch of trees with their detached bodies."""
     if not any(len(numbers) for numbers, _, _ in roots):
         return trees
     counts = np.array([len(numbers) for numbers, _, _ in roots])
@@ -233,12 +238,12 @@ def with_roots(trees: TreeStates, roots: list[DetachedRoots]) -> TreeStates:
 
 
 def object_counts(model: Model) -> tuple[int, ...]:
-    """How many things of each kind a vineyard has: trees, bunches, boxes."""
+    """Number of objects of each kind in a scene: trees, bunches, boxes."""
     return len(model.tree_first), len(model.bunch_body), len(model.box_mass)
 
 
 def _extrapolate_pose(pose: np.ndarray, velocity: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
-    """Poses [..., 7] after ``dt`` s at velocities [..., 6]."""
+    """Poses [..., 7] after ``dt`` [s] at velocities [..., 6]."""
     turned = dead_reckoning.extrapolate(
         pose[..., 3:], dead_reckoning.quaternion_rate(pose[..., 3:], velocity[..., 3:]), dt
     )
@@ -246,7 +251,7 @@ def _extrapolate_pose(pose: np.ndarray, velocity: np.ndarray, dt: float | np.nda
 
 
 def _tree_centres(model: Model) -> np.ndarray:
-    """Where each tree is [tree, 3] m: the mean of its settled bodies."""
+    """Centre of each tree [tree, 3] m: the mean of its settled bodies."""
     origins = model.forward_kinematics(model.joint_settled)[:, :3]
     middles = np.zeros((len(model.tree_first), 3))
     np.add.at(middles, model.body_tree, origins)
@@ -254,7 +259,7 @@ def _tree_centres(model: Model) -> np.ndarray:
 
 
 def _lever_arms(model: Model) -> np.ndarray:
-    """How far from each body's joint the wood it carries ends, along the longest way [body] m."""
+    """Longest distance from each body's joint to the end of the wood that it carries [body] m."""
     reach = model.body_length.astype(float).copy()
     for body in range(len(reach) - 1, -1, -1):
         parent = model.body_parent[body]

@@ -21,8 +21,10 @@ from tests.support.waiting import TIMEOUT
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import encode_human
 from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
-from vinesim.net.recording import mcap_file
-from vinesim.net.recording.mcap_file import InvalidRecording, RecordingStopped, RecordingWriter, free_path, read
+from vinesim.net.recording import mcap_reader
+from vinesim.net.recording.mcap_reader import InvalidRecording, read_recording
+from vinesim.net.recording.mcap_writer import RecordingStopped, RecordingWriter, free_path
+from vinesim.net.recording.message_json import describe_message
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
@@ -42,7 +44,7 @@ KEYS = st.sampled_from(["a/ada", "a/ada/far", "c/-1/2/ada", "own/0/0/bob", "fact
 @given(st.lists(st.tuples(st.integers(0, 2**62), KEYS, st.binary(max_size=200)), max_size=30))
 def test_whatever_was_put_in_comes_out_to_the_bit(tmp_path_factory, entries):
     path = write(tmp_path_factory.mktemp("r") / "run.mcap", entries, scene="x")
-    tape = read(path)
+    tape = read_recording(path)
     expected = sorted(entries, key=lambda entry: entry[0] * 1e-9)
     assert [(e.key, e.payload) for e in tape.messages] == [(key, payload) for _, key, payload in expected]
     assert [e.time for e in tape.messages] == pytest.approx([at * 1e-9 for at, _, _ in expected])
@@ -67,7 +69,7 @@ def test_what_a_message_says():
         np.array([[0.5, 0.0, 0.0, 0.0, 0.0, 1.0]]),
     )  # fmt: skip
     (payload,), heard = messages.encode_objects(things, (2, -1))
-    said = mcap_file.describe_message("c/2/-1/ada", payload)
+    said = describe_message("c/2/-1/ada", payload)
     assert base64.b64decode(said["raw"]) == payload
     assert said["actor"] == "ada"
     assert said["timestamp"] == {"sec": 10**9, "nsec": 500_000_000}
@@ -80,26 +82,24 @@ def test_what_a_message_says():
     assert messages.shift_time(payload, 2.0)[14:] == payload[14:]
 
     fact = messages.RetainedRecord(box, 1, 2, "ada", pose=tuple(pose.tolist()), parent="bob/arm", moving=True)
-    (told,) = mcap_file.describe_message("fact/2/-1/ada", messages.encode_records([fact]))["facts"]
+    (told,) = describe_message("fact/2/-1/ada", messages.encode_records([fact]))["facts"]
     assert (told["kind"], told["index"], told["parent"], told["moving"]) == ("box", 2, "bob/arm", True)
     assert told["pose"]["position"]["x"] == 13.0
     assert messages.time_of(messages.encode_records([fact])) is None
 
     person = standing_pose(pose, 1.8)
-    said = mcap_file.describe_message("a/eva", encode_human(HumanUpdate("eva", 5.0, person, np.zeros((7, 6)))))
+    said = describe_message("a/eva", encode_human(HumanUpdate("eva", 5.0, person, np.zeros((7, 6)))))
     assert said["points"].keys() == set(POINT_NAMES)
     assert list(said["points"]["head"]["position"].values()) == pytest.approx(person.head[:3], abs=2e-4)
     assert said["pose"] == said["points"]["hips"]
     pushed = encode_wrenches(WrenchMessage(6.0, {"hand": np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.5])}))
-    assert mcap_file.describe_message("force/bob/eva", pushed)["links"] == [
-        {"link": "hand", "wrench": [1, 2, 3, 0, 0, 0.5]}
-    ]
+    assert describe_message("force/bob/eva", pushed)["links"] == [{"link": "hand", "wrench": [1, 2, 3, 0, 0, 0.5]}]
     assert messages.time_of(messages.shift_time(pushed, 1.5)) == 7.5
 
-    assert mcap_file.describe_message("live/ada", b"\x01")["live"] is True
-    assert mcap_file.describe_message("live/ada", b"")["live"] is False
-    assert "error" in mcap_file.describe_message("c/nowhere/ada", payload)
-    assert "cut off" in mcap_file.describe_message("a/ada", b"VS")["error"]
+    assert describe_message("live/ada", b"\x01")["live"] is True
+    assert describe_message("live/ada", b"")["live"] is False
+    assert "error" in describe_message("c/nowhere/ada", payload)
+    assert "cut off" in describe_message("a/ada", b"VS")["error"]
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def whole(tmp_path_factory) -> bytes:
         for second in range(5):
             for number in range(20):
                 file.put(int(1e9 * (second + number / 20)), "live/ada", bytes([1, second, number]))
-            until(lambda count=20 * (second + 1): file.size and len(read(path).messages) == count)
+            until(lambda count=20 * (second + 1): file.size and len(read_recording(path).messages) == count)
     return path.read_bytes()
 
 
@@ -130,9 +130,9 @@ def test_cut_off_anywhere_what_lies_before_can_be_read(whole, tmp_path):
     assert len({0, 20, 40, 60, 80, 100} & set(lengths)) >= 5  # in steps of a chunk
 
 
-def read_bytes(path: pathlib.Path, data: bytes) -> mcap_file.Recording:
+def read_bytes(path: pathlib.Path, data: bytes) -> mcap_reader.Recording:
     path.write_bytes(data)
-    return read(path)
+    return read_recording(path)
 
 
 def test_the_official_reader_reads_a_cut_file_as_far(whole, tmp_path):
@@ -170,21 +170,21 @@ def test_other_files_are_refused(tmp_path, content):
 
 def test_missing_files_folders_and_mcaps_of_others_are_refused(tmp_path):
     with pytest.raises(InvalidRecording, match=r"nowhere\.mcap.*No such file"):
-        read(tmp_path / "nowhere.mcap")
+        read_recording(tmp_path / "nowhere.mcap")
     with pytest.raises(InvalidRecording, match="cannot read"):
-        read(tmp_path)
+        read_recording(tmp_path)
     with (tmp_path / "other.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
         writer.finish()
     with pytest.raises(InvalidRecording, match="another program"):
-        read(tmp_path / "other.mcap")
+        read_recording(tmp_path / "other.mcap")
 
 
 def test_another_protocol_is_refused_by_its_number(tmp_path):
     path = write(tmp_path / "old.mcap", [(1, "live/ada", b"\x01")], protocol="0", release="0.0.9")
     with pytest.raises(InvalidRecording, match=rf"version 0.*version {messages.PROTOCOL}.*0\.0\.9"):
-        read(path)
+        read_recording(path)
 
 
 def test_nothing_is_overwritten(tmp_path):
@@ -237,7 +237,7 @@ def test_a_full_disk_ends_the_recording_and_what_was_written_stays(tmp_path):
     with pytest.raises(RecordingStopped):
         file.close()
     assert path.stat().st_size == file.size <= 3000
-    tape = read(path)
+    tape = read_recording(path)
     assert [int.from_bytes(e.payload, "little") for e in tape.messages] == list(range(len(tape.messages)))
 
 
@@ -246,7 +246,7 @@ def test_what_was_recorded_is_readable_while_the_recorder_runs(tmp_path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path) as file:
         file.put(1, "live/ada", b"\x01")
-        until(lambda: file.size and len(read(path).messages) == 1)
+        until(lambda: file.size and len(read_recording(path).messages) == 1)
         with path.open("rb") as half, pytest.raises(Exception):  # noqa: B017 PT011 - its index comes at the end
             make_reader(half).get_summary()
     with path.open("rb") as full:

@@ -1,0 +1,128 @@
+"""Recordings are read: all messages of an MCAP file in memory, as far as the file is undamaged."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import dataclasses
+import pathlib
+from typing import NamedTuple
+
+import msgspec
+from mcap.exceptions import EndOfFile, InvalidMagic
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+
+from vinesim.net.codec import messages
+from vinesim.net.keys import sender_of
+
+METADATA_NAME = "vinesim"
+"""Name of the MCAP metadata record with the metadata of the world; the last one holds."""
+
+MAX_RECORD_LENGTH = 1 << 26
+"""Largest MCAP record that is read [B]."""
+
+
+class InvalidRecording(ValueError):
+    """The file cannot be replayed; the text says why."""
+
+
+class RecordedMessage(NamedTuple):
+    """One message of a recording."""
+
+    time: float
+    """Network time [s] at which the recorder received it."""
+    key: str
+    payload: bytes
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A recording in memory."""
+
+    path: pathlib.Path
+    metadata: dict[str, str]
+    """What the recorder knew of the world: release, protocol, world, scene, seed, digest."""
+    messages: list[RecordedMessage]
+    """All messages in order of time."""
+    damage: str
+    """Empty, or in one line why the file ends early; everything before the damage was read."""
+
+    @property
+    def start(self) -> float:
+        """Network time of the first message [s]."""
+        return self.messages[0].time
+
+    @property
+    def length(self) -> float:
+        """Time from the first message to the last [s]."""
+        return self.messages[-1].time - self.start
+
+    @property
+    def actors(self) -> list[str]:
+        """Names of all actors that were present at any time, sorted."""
+        return sorted({sender_of(entry.key) for entry in self.messages if entry.key.startswith("live/")})
+
+
+def read_recording(path: pathlib.Path) -> Recording:
+    """Read a recording as far as it is undamaged.
+
+    Raises :class:`InvalidRecording` if the file cannot be opened, is no recording of vinesim or has another protocol
+    version.
+    """
+    metadata: dict[str, str] = {}
+    recorded: list[RecordedMessage] = []
+    channels: dict[int, str] = {}
+    damage = ""
+    try:
+        with path.open("rb") as file:
+            try:
+                for record in StreamReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_LENGTH).records:
+                    if isinstance(record, Metadata) and record.name == METADATA_NAME:
+                        metadata |= record.metadata
+                    elif isinstance(record, Channel):
+                        channels[record.id] = record.topic
+                    elif isinstance(record, Message):
+                        recorded.append(
+                            RecordedMessage(record.log_time * 1e-9, channels[record.channel_id], _raw(record.data))
+                        )
+            except InvalidMagic:
+                if file.tell() <= 8:
+                    raise InvalidRecording(f"{path} is no MCAP file: give one that 'vinesim record' wrote") from None
+                damage = "it is not whole"
+            except EndOfFile:
+                damage = "it ends in the middle"
+            except OSError:
+                raise
+            except Exception as error:  # a damaged byte can break anything that reads it
+                damage = f"it is damaged: {error}" if str(error) else "it is damaged"
+    except OSError as error:
+        raise InvalidRecording(
+            f"cannot read {path}: {error.strerror}; give a file that 'vinesim record' wrote"
+        ) from error
+    if "protocol" not in metadata:
+        raise InvalidRecording(f"{path} holds no recording of vinesim: {damage or 'another program wrote it'}")
+    if metadata["protocol"] != str(messages.PROTOCOL):
+        raise InvalidRecording(
+            f"{path} speaks protocol version {metadata['protocol']}, this program version {messages.PROTOCOL}: "
+            f"replay it with release {metadata.get('release', '?')} of vinesim, which recorded it"
+        )
+    recorded.sort(key=lambda message: message.time)
+    if damage:
+        until = f"the {recorded[-1].time - recorded[0].time:.1f} s before" if recorded else "nothing"
+        damage = f"{path}: {damage} (was the recorder killed?); {until} can be read"
+    return Recording(path, metadata, recorded, damage)
+
+
+def _raw(data: bytes) -> bytes:
+    try:
+        return base64.b64decode(_body.decode(data).raw, validate=True)
+    except (msgspec.MsgspecError, binascii.Error) as error:
+        raise ValueError(f"a message without its bytes ({error})") from error
+
+
+class _Body(msgspec.Struct):
+    raw: str
+
+
+_body = msgspec.json.Decoder(_Body)
