@@ -6,12 +6,12 @@ import sys
 
 import pytest
 
-from vinesim.cli import bench
+from vinesim.cli.bench import NoSuchBench, run
 
 
 def test_a_bench_that_needs_a_checkout_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "vinesim.bench.support", None)
     for module in ("vinesim.bench.message_fuzz", "vinesim.bench.fuzz"):
         monkeypatch.delitem(sys.modules, module, raising=False)
-    with pytest.raises(bench.NoSuchBench, match="in a checkout"):
-        bench.run(["fuzz"], as_json=True)
+    with pytest.raises(NoSuchBench, match="in a checkout"):
+        run(["fuzz"], as_json=True)
