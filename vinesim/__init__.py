@@ -53,7 +53,7 @@ _MODULES = {
     "PhysicsParameters": "scene.physics_parameters",
     "RecordedMessage": "api.recording",
     "Recording": "api.recording",
-    "Robot": "robot.drives.robot",
+    "Robot": "robot.drives.controlled_robot",
     "Scene": "scene.spec",
     "Server": "net.server.server",
     "Simulation": "api.simulation",

@@ -10,8 +10,9 @@ from vinesim.cli.bench import NoSuchBench, run
 
 
 def test_a_bench_that_needs_a_checkout_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "vinesim.bench.support", None)
-    for module in ("vinesim.bench.message_fuzz", "vinesim.bench.fuzz"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
+    loaded = [name for name in sys.modules if name.startswith("vinesim.bench.support")]
+    for module in ("vinesim.bench.support", *loaded):
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, "vinesim.bench.message_fuzz", raising=False)
     with pytest.raises(NoSuchBench, match="in a checkout"):
         run(["fuzz"], as_json=True)

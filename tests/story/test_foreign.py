@@ -70,7 +70,7 @@ def test_it_drives_a_circle_and_stops_when_nobody_commands(tiago):
 
 def test_its_fingers_close_with_their_mimics(tiago):
     world = Vineyard(tiago)
-    finger = tiago.indices("gripper_left")
+    finger = tiago.joint_indices("gripper_left")
     drive = tiago.drives[finger[0]]
     for share in (0.2, 0.8):
         goal = drive.lower + share * (drive.upper - drive.lower)
