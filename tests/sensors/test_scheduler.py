@@ -8,6 +8,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim.scene.ids import Organ, label
+from vinesim.scene.values import CameraOutput
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import rest_snapshot
@@ -81,7 +82,9 @@ def test_nothing_is_rendered_without_demand(view) -> None:
     wanted, unwanted, taken, listening = Inbox(), Inbox(), Inbox(), threading.Event()
     lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
     mounts = [
-        ScheduledSensor(_camera(), unwanted, is_wanted=listening.is_set, rate=10.0),
+        ScheduledSensor(
+            _camera(), unwanted, wanted=lambda: CameraOutput.ALL if listening.is_set() else CameraOutput.NONE, rate=10.0
+        ),
         ScheduledSensor(lidar, wanted, rate=10.0),
     ]
     mounts.append(
@@ -186,17 +189,18 @@ def test_eyes_open_once_and_close_twice() -> None:
 
 
 def test_depth_is_measured_only_for_those_who_look_at_it(view) -> None:
-    inbox, looked_at = Inbox(), threading.Event()
+    inbox, wanted = Inbox(), [CameraOutput.RGB | CameraOutput.EXACT_DEPTH]
     spec = CameraSpec.load("d435")
     camera = Camera(spec, spec.info("optical", 0.1), "head")
     with SensorScheduler(
-        sensor_scenes.empty(), [ScheduledSensor(camera, inbox, is_depth_wanted=looked_at.is_set, rate=10.0)]
+        sensor_scenes.empty(), [ScheduledSensor(camera, inbox, wanted=lambda: wanted[-1], rate=10.0)]
     ) as eyes:
         for k in range(2):
             eyes.submit(dataclasses.replace(view, time=0.1 * k), {"head": sensor_scenes.AHEAD})
             inbox.wait(k + 1)
-            looked_at.set()
-    exact, measured = (f.depth[np.isfinite(f.exact_depth) & (f.exact_depth < 5.0)] for f in inbox.frames)
-    truth = inbox.frames[0].exact_depth
-    assert np.array_equal(exact, truth[truth < 5.0])
-    assert not np.array_equal(measured, exact)
+            wanted.append(CameraOutput.ALL)
+    without, complete = inbox.frames
+    assert without.depth.size == without.labels.size == 0
+    assert without.rgb.shape[:2] == without.exact_depth.shape == complete.depth.shape == complete.labels.shape
+    near = np.isfinite(complete.exact_depth) & (complete.exact_depth < 5.0)
+    assert not np.array_equal(complete.depth[near], complete.exact_depth[near])

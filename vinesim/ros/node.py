@@ -1,12 +1,14 @@
 """A robot's ROS 2 node: publishes in threads of its own, so that the simulation never waits.
 
-The simulation passes values and goes on; the node's threads build and publish the messages. A value that is replaced
-by a newer one before its turn is dropped and counted: a slow network or subscriber costs messages, not steps. Messages
-without subscribers are not built, and :meth:`Node.has_subscribers` lets sensors skip their rendering as well.
+The simulation passes values and goes on; the node's threads build and publish the messages. Small messages of every
+step wait in short queues, of a picture only the newest waits. What finds no place is dropped and counted: a slow
+network or subscriber costs messages, not steps. Messages without subscribers are not built, and
+:meth:`Node.has_subscribers` lets sensors skip their rendering as well.
 """
 
 from __future__ import annotations
 
+import collections
 import logging
 import threading
 import time as wall
@@ -36,7 +38,7 @@ from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
 from vinesim.ros.publishers.lidar import LidarPublisher
 from vinesim.ros.publishers.robot import RobotPublisher
 from vinesim.ros.topic import RELIABLE, Build, PendingMessage, Topic
-from vinesim.scene.values import CameraFrame, LidarScan, RobotSample
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, RobotSample
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +46,12 @@ SensorPublisher = TypeVar("SensorPublisher", CameraPublisher, LidarPublisher)
 
 SUBSCRIPTION_COUNT_PERIOD = 0.1
 """Wall time between two counts of subscribers [s]: a new one waits at most that long for its first picture."""
+
+MAX_QUEUED = 50
+"""Messages of one topic of every step that may wait, half a second's worth; of a picture only the newest waits."""
+
+PendingMessages = dict[Topic, collections.deque[Build]]
+"""Messages that wait to be built and sent, by topic; the topic that comes next is the first."""
 
 TRAJECTORY_CONTROLLERS = ("arm_left_controller", "arm_right_controller", "torso_controller", "head_controller")
 """Names of the controllers that take joint trajectories, as vinebot has them."""
@@ -87,8 +95,8 @@ class Node:
 
         self._topics: dict[str, Topic] = {}
         # The messages of every step have a thread of their own, so that no picture delays the clock.
-        self._high_priority: dict[Topic, Build] = {}
-        self._low_priority: dict[Topic, Build] = {}
+        self._high_priority: PendingMessages = {}
+        self._low_priority: PendingMessages = {}
         self._changed = threading.Condition()
         self._closing = False
 
@@ -166,6 +174,10 @@ class Node:
             raise ValueError(f"no topic {family!r}; there are: {', '.join(sorted(self._topics))}")
         return any(topic.subscription_count for topic in topics)
 
+    def camera_outputs_wanted(self, camera: str) -> CameraOutput:
+        """What subscribers need of the frames of one of ``cameras``; :class:`ValueError` if there is no such camera."""
+        return self._publisher(self._cameras, "camera", camera).wanted()
+
     @property
     def sent(self) -> dict[str, int]:
         """Messages sent so far, by topic."""
@@ -173,7 +185,7 @@ class Node:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Messages with subscribers that were replaced before their turn, by topic."""
+        """Messages with subscribers that found no place in the queue of their topic, by topic."""
         return {name: topic.dropped for name, topic in self._topics.items()}
 
     @property
@@ -217,20 +229,25 @@ class Node:
                 if not topic.subscription_count and not always:
                     continue
                 waiting = self._high_priority if topic.high_priority else self._low_priority
-                if topic in waiting:
+                queue = waiting.setdefault(topic, collections.deque())
+                queue.append(build)
+                if len(queue) > (MAX_QUEUED if topic.high_priority else 1):
+                    queue.popleft()
                     topic.dropped += 1
-                waiting[topic] = build
             self._changed.notify_all()
 
-    def _send(self, waiting: dict[Topic, Build]) -> None:
-        """A publishing thread: builds and sends pending messages, the oldest first."""
+    def _send(self, waiting: PendingMessages) -> None:
+        """A publishing thread: builds and sends pending messages, of each topic the oldest, topic after topic."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: waiting or self._closing)
                 if self._closing:
                     return
                 topic = next(iter(waiting))
-                build = waiting.pop(topic)
+                queue = waiting.pop(topic)
+                build = queue.popleft()
+                if queue:
+                    waiting[topic] = queue
             try:
                 topic.send(build())
             except Exception:

@@ -1,9 +1,8 @@
 """The sensing thread: it takes the latest snapshot, renders the sensors that are due, and drops what is late.
 
 Physics calls :meth:`SensorScheduler.submit` every step and never waits. Warp's launches release the interpreter lock,
-so
-rendering costs the physics thread the other core, not its step. A camera renders a whole frame at once. A lidar fires
-at every snapshot the shots that are due, and delivers a revolution after its last shot.
+so that rendering costs the physics thread the other core, not its step. A camera renders a whole frame at once. A lidar
+fires at every snapshot the shots that are due, and delivers a revolution after its last shot.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from vinesim.kernels.raster import camera_raster, camera_raster_plants, lidar_ra
 from vinesim.kernels.sensing import lidar_echoes, stereo_depth
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, LidarScan, Snapshot
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
@@ -49,20 +48,18 @@ def load_kernels() -> None:
         wp.load_module(module, device="cpu")
 
 
-DemandQuery = Callable[[], bool]
-"""Whether a sensor's output is wanted now."""
+DemandQuery = Callable[[], CameraOutput]
+"""The outputs of a sensor that are wanted now; a lidar scans if there is any."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ScheduledSensor:
-    """One sensor, the callback for its output, and whether that is wanted."""
+    """One sensor, the callback for its output, and what is wanted of it."""
 
     sensor: Camera | Lidar
     deliver: Callable[[CameraFrame | LidarScan], None]
     """Called in the sensing thread with every frame or scan."""
-    is_wanted: DemandQuery = lambda: True
-    is_depth_wanted: DemandQuery = lambda: True
-    """Of a camera: whether its measured depth is wanted."""
+    wanted: DemandQuery = lambda: CameraOutput.ALL
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
 
@@ -193,7 +190,7 @@ class SensorScheduler:
     def _results(self, scheduled: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
         """Render what a sensor has to deliver at simulation time ``now`` [s]."""
         if isinstance(scheduled.sensor, Camera):
-            yield scheduled.sensor.render(self.primitives, pose, now, measure_depth=scheduled.is_depth_wanted())
+            yield scheduled.sensor.render(self.primitives, pose, now, outputs=scheduled.wanted())
             return
         scan = self._scans[scheduled.name]
         missed = scan.dropped
@@ -203,7 +200,7 @@ class SensorScheduler:
     def _is_due(self, scheduled: ScheduledSensor, now: float, poses: Mapping[str, np.ndarray]) -> bool:
         """Whether a sensor has something to render at simulation time ``now`` [s]; counts the frames it has missed."""
         name = scheduled.name
-        if name not in poses or not scheduled.is_wanted():
+        if name not in poses or not scheduled.wanted():
             self._next_time[name] = -np.inf  # a subscriber that returns gets a frame at once, and missed none
             if name in self._scans:
                 self._scans[name].cancel(now)

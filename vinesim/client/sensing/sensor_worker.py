@@ -24,7 +24,7 @@ from vinesim.ros.names import ros_name
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, LidarScan, RigidVisual, RobotSample, Snapshot
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, RigidVisual, RobotSample, Snapshot
 from vinesim.sensors.camera.sunlight import SunPath
 
 if TYPE_CHECKING:
@@ -176,21 +176,29 @@ class SensorWorker:
             spec = CameraSpec.load(mount.type)
             camera = Camera(spec, spec.info(mount.frame), mount.name, config.sun, quality="fast", seed=seed)
             always = config.keep_pictures and i == 0
-            is_wanted = self._demand(mount.name, always)
-            is_depth_wanted = self._demand(f"{mount.name}/depth", always)
-            sensors.append(ScheduledSensor(camera, self._deliver_camera, is_wanted, is_depth_wanted, config.sensor_hz))
+            wanted = self._camera_demand(mount.name, always)
+            sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, config.sensor_hz))
         for mount in config.description.lidars:
             lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed)
-            is_wanted = self._demand(mount.name)
-            sensors.append(ScheduledSensor(lidar, self._deliver_lidar, is_wanted, rate=config.sensor_hz))
+            wanted = self._lidar_demand(mount.name)
+            sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz))
         primitives = Primitives(config.model, renderer=config.renderer)
         return stack.enter_context(
             SensorScheduler(config.model, sensors, primitives=primitives, nice=RENDER_NICE)
         )  # fmt: skip
 
-    def _demand(self, topics: str, always: bool = False) -> Callable[[], bool]:
-        """Whether a family of topics has subscribers now."""
-        return lambda: always or (self.node is not None and self.node.has_subscribers(topics))
+    def _camera_demand(self, name: str, always: bool) -> Callable[[], CameraOutput]:
+        """The outputs of a camera that its subscribers need now; all but the exact depth if ``always``."""
+        if always:
+            return lambda: CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
+        node = self.node
+        return lambda: CameraOutput.NONE if node is None else node.camera_outputs_wanted(name)
+
+    def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
+        """Whether a lidar has subscribers now."""
+        return lambda: (
+            CameraOutput.DEPTH if self.node is not None and self.node.has_subscribers(name) else CameraOutput.NONE
+        )
 
     # ------------------------------------------------------------------ loop
 
@@ -258,7 +266,7 @@ class SensorWorker:
         """What is subscribed to, and what was rendered, sent and dropped."""
         statistics = {
             "sent": {},
-            "renders": any(sensor.is_wanted() for sensor in self.scheduler.sensors),
+            "renders": any(sensor.wanted() for sensor in self.scheduler.sensors),
             "frames": dict(self.scheduler.frames),
             "frames_dropped": dict(self.scheduler.dropped),
         }

@@ -9,7 +9,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from vinesim.ros.messages import convert
 from vinesim.ros.topic import SENSOR_DATA, Advertise, PendingMessage
-from vinesim.scene.values import CameraFrame
+from vinesim.scene.values import CameraFrame, CameraOutput
 
 
 class CameraPublisher:
@@ -17,17 +17,33 @@ class CameraPublisher:
 
     def __init__(self, advertise: Advertise, name: str) -> None:
         self._infos = [advertise(CameraInfo, f"{name}/{kind}/camera_info", SENSOR_DATA) for kind in ("rgb", "depth")]
+        rgb, depth, labels = CameraOutput.RGB, CameraOutput.DEPTH, CameraOutput.LABELS
         self._built = (
-            (advertise(Image, f"{name}/rgb/image_raw", SENSOR_DATA), convert.rgb_image),
-            (advertise(Image, f"{name}/depth/image_raw", SENSOR_DATA), convert.depth_image),
-            (advertise(Image, f"{name}/labels", SENSOR_DATA), convert.label_image),
-            (advertise(CompressedImage, f"{name}/rgb/image_raw/compressed", SENSOR_DATA), convert.compressed_image),
-            (advertise(PointCloud2, f"{name}/depth/points", SENSOR_DATA), convert.depth_cloud),
-        )
+            (advertise(Image, f"{name}/rgb/image_raw", SENSOR_DATA), rgb, convert.rgb_image),
+            (advertise(Image, f"{name}/depth/image_raw", SENSOR_DATA), depth, convert.depth_image),
+            (advertise(Image, f"{name}/labels", SENSOR_DATA), labels, convert.label_image),
+            (
+                advertise(CompressedImage, f"{name}/rgb/image_raw/compressed", SENSOR_DATA), rgb,
+                convert.compressed_image,
+            ),
+            (advertise(PointCloud2, f"{name}/depth/points", SENSOR_DATA), rgb | depth, convert.depth_cloud),
+        )  # fmt: skip
+
+    def wanted(self) -> CameraOutput:
+        """The outputs that the present subscribers need; a picture if there are none but of camera_info."""
+        outputs = CameraOutput.NONE
+        for topic, needs, _ in self._built:
+            if topic.subscription_count:
+                outputs |= needs
+        if not outputs and any(topic.subscription_count for topic in self._infos):
+            return CameraOutput.RGB
+        return outputs
 
     def pending(self, frame: CameraFrame) -> Iterator[PendingMessage]:
-        """All messages of one picture, the cheap ones first."""
+        """All messages that can be made of one picture, the cheap ones first."""
+        made = frame.outputs
         for topic in self._infos:
             yield topic, partial(convert.camera_info, frame.info, frame.time)
-        for topic, build in self._built:
-            yield topic, partial(build, frame)
+        for topic, needs, build in self._built:
+            if needs in made:
+                yield topic, partial(build, frame)

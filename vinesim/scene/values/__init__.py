@@ -9,13 +9,14 @@ from vinesim.scene.values.measurement import Measurement
 from vinesim.scene.values.network import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
 from vinesim.scene.values.robot import Drive, ElasticSample, Imu, JointSample, RobotSample, RobotSpec, Wrench
-from vinesim.scene.values.sensors import CameraFrame, CameraInfo, LidarScan
+from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
 from vinesim.scene.values.world import Contact, Detachment, Snapshot
 
 __all__ = [
     "POINT_NAMES",
     "CameraFrame",
     "CameraInfo",
+    "CameraOutput",
     "Contact",
     "Detachment",
     "Drive",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 
 import numpy as np
 
@@ -23,9 +24,21 @@ class CameraInfo:
     """Optical frame: z forward, x right, y down."""
 
 
+class CameraOutput(enum.Flag):
+    """Parts of a :class:`CameraFrame`: a camera makes only those that are asked for."""
+
+    RGB = enum.auto()
+    DEPTH = enum.auto()
+    """Depth as the sensor measures it."""
+    EXACT_DEPTH = enum.auto()
+    LABELS = enum.auto()
+    NONE = 0
+    ALL = RGB | DEPTH | EXACT_DEPTH | LABELS
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class CameraFrame:
-    """One RGB-D picture."""
+    """One RGB-D picture. Arrays that were not asked for (:class:`CameraOutput`) have the size 0."""
 
     time: float
     name: str
@@ -40,6 +53,18 @@ class CameraFrame:
     """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
     exact_depth: np.ndarray | None = None
     """[height, width] float32 m along z, whatever the sensor can measure: no noise, no gaps; +Inf for the sky."""
+
+    @property
+    def outputs(self) -> CameraOutput:
+        """The arrays that were made."""
+        made = CameraOutput.NONE
+        for output, array in (
+            (CameraOutput.RGB, self.rgb), (CameraOutput.DEPTH, self.depth), (CameraOutput.LABELS, self.labels),
+            (CameraOutput.EXACT_DEPTH, self.exact_depth),
+        ):  # fmt: skip
+            if array is not None and array.size:
+                made |= output
+        return made
 
     @property
     def organs(self) -> np.ndarray:

@@ -17,7 +17,7 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels.shading import deferred
 from vinesim.scene.plant_parameters import Number
-from vinesim.scene.values import CameraFrame, CameraInfo
+from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput
 from vinesim.sensors import spec_file
 from vinesim.sensors.camera.exposure import Exposure
 from vinesim.sensors.camera.stereo import Stereo, StereoSpec
@@ -141,18 +141,20 @@ class Camera:
         return self.spec.rate.value
 
     def render(
-        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, measure_depth: bool = True
+        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, outputs: CameraOutput = CameraOutput.ALL
     ) -> CameraFrame:
         """The frame seen from ``pose`` [7], the optical frame in the world.
 
-        ``measure_depth=False`` saves the second imager's view: depth is then exact, where in range.
+        Only ``outputs`` are made; the other arrays of the frame have the size 0.
         """
         pose = np.array(pose, float)
         picture = self.render_on_device(primitives, pose, time)
         shape = (self.info.height, self.info.width)
         rgb, exact, labels = self._download(picture, self.rasterizer.depth, self.rasterizer.labels)
         rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
-        if self._stereo and measure_depth:
+        if CameraOutput.DEPTH not in outputs:
+            depth = np.zeros((0, 0), np.float32)
+        elif self._stereo:
             lens, dice = pinhole(self.info, pose), spec_file.noise_rng(self.seed, self.name, self.image_index)
             depth = self._stereo.measure(primitives, lens, exact, rgb, dice)
         else:
@@ -164,10 +166,10 @@ class Camera:
             name=self.name,
             info=self.info,
             pose=pose,
-            rgb=rgb,
+            rgb=rgb if CameraOutput.RGB in outputs else np.zeros((0, 0, 3), np.uint8),
             depth=depth,
-            labels=labels.reshape(shape),
-            exact_depth=exact,
+            labels=labels.reshape(shape) if CameraOutput.LABELS in outputs else np.zeros((0, 0), np.int32),
+            exact_depth=exact if CameraOutput.EXACT_DEPTH in outputs else np.zeros((0, 0), np.float32),
         )
 
     def _download(self, *arrays: wp.array) -> list[np.ndarray]:
