@@ -99,7 +99,7 @@ class Journal:
             reason = str(error)
         if head is None:
             raise JournalError(
-                f"{path}: {reason}, so nobody knows whose facts these are: move it away, or give another --state-dir"
+                f"{path}: {reason}, so its world is unknown: move it away, or give another --state-dir"
             )
         if valid_end < len(content):
             backup = _free_name(path)
