@@ -8,7 +8,9 @@ def rows(clock, x, force, is_remote=True):
     x, force = np.asarray(x, float), np.asarray(force, float)
     zero = np.zeros_like(x)
     clock = np.asarray(clock, float)
-    return Rows(clock, clock, np.stack([x, zero, zero], -1), np.stack([zero, force, zero], -1), np.full(len(x), is_remote))
+    return Rows(
+        clock, clock, np.stack([x, zero, zero], -1), np.stack([zero, force, zero], -1), np.full(len(x), is_remote)
+    )
 
 
 def test_motion_in_the_tick_of_the_touch_counts_zero():

@@ -62,7 +62,9 @@ class Trace:
     def rows(self) -> Rows:
         """All rows so far."""
         n = self.length
-        return Rows(self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._is_remote[:n])
+        return Rows(
+            self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._is_remote[:n]
+        )
 
 
 @dataclasses.dataclass(frozen=True)
