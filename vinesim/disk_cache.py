@@ -2,8 +2,8 @@
 
     arrays = load_or_make("soil", digest, make)
 
-The folder is ``$VINESIM_CACHE`` if that is set, else ``vinesim`` in the user's folder for caches: ``$XDG_CACHE_HOME`` or
-``~/.cache``, ``~/Library/Caches`` on macOS, ``%LOCALAPPDATA%`` on Windows. It may be deleted at any time.
+The folder is ``$VINESIM_CACHE`` if that is set, else ``vinesim`` in the user's folder for caches: ``$XDG_CACHE_HOME``
+or ``~/.cache``, ``~/Library/Caches`` on macOS, ``%LOCALAPPDATA%`` on Windows. It may be deleted at any time.
 
 Of several processes that miss an entry one makes it and the others wait. A file that is broken, truncated or of another
 version is made anew. Where the folder cannot be written, everything is computed as without a cache, after one warning.

@@ -57,7 +57,7 @@ def generate_uncached(scene: Scene) -> Model:
 def _code_digest() -> str:
     """Of the code that generates models, and of the varieties of grapes."""
     package = pathlib.Path(builder.__file__).parent
-    others = (pathlib.Path(m.__file__) for m in (frames, array_fields))
+    others = pathlib.Path(frames.__file__), pathlib.Path(array_fields.__file__)
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
 
 
