@@ -132,8 +132,8 @@ def test_once_all_have_let_go_everything_lies_where_everybody_says_within_a_roun
     for thing in THINGS:
         owners = {client.replicator.owner(thing) for client in clients.values()}
         assert owners == {None}, [client.replicator.claim(thing) for client in clients.values()]
-        facts = {client.replicator.record(thing) for client in clients.values()}
-        assert facts == {server.facts.get(thing)}
+        records = {client.replicator.record(thing) for client in clients.values()}
+        assert records == {server.records.get(thing)}
     for client in clients.values():
         # nothing picked hangs again, nothing is picked for some only
         assert client.picked - {BOX(0)} == picked - {BOX(0)}

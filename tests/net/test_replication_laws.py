@@ -128,7 +128,7 @@ def test_after_any_actions_all_agree_and_picked_bunches_stay_picked(scenario, se
         world.run(1.5)
     for number in picked:
         known = [fake_client.replicator.record(number) is not None for fake_client in world.clients.values()]
-        stored = world.server.facts.get(number) is not None
+        stored = world.server.records.get(number) is not None
         # the record is lost if its only author left before any other received it
         assert all(known) == any(known) == stored
 
