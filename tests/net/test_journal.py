@@ -132,7 +132,7 @@ def test_reading_stops_at_a_flipped_bit_with_one_line(tmp_path, caplog):
         (b"PNG something else", "no journal"),
         (b"vsfacts\x09rest", "version 09"),
         (b"vsfacts\x01", "head is torn"),
-        (b"vsfacts\x01" + journal_module._packed(b"nonsense"), "whose facts"),
+        (b"vsfacts\x01" + journal_module._packed(b"nonsense"), "its world is unknown"),
         (
             b"vsfacts\x01"
             + journal_module._packed(journal_module._encoder.encode(journal_module._Header("w", "s", "d", 9))),

@@ -195,7 +195,7 @@ def test_a_truncated_recording_is_replayed_to_a_viewer(killed_recording, listen)
     assert replay.returncode == 0, output
     output_lines = output.splitlines()
     assert "it ends in the middle" in output_lines[0]
-    received = next(int(match[1]) for line in output_lines if (match := re.match(r"(\d+) messages were heard", line)))
+    received = next(int(match[1]) for line in output_lines if (match := re.match(r"(\d+) messages were sent", line)))
     assert received > 100
     assert sorted(viewer.joined) == ["ada", "bob"]
     assert viewer.replicator.counters.malformed == 0
