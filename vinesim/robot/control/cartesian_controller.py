@@ -26,6 +26,7 @@ from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import clip
 
 POSITION_GAIN = 5.0
 """[1/s] Feedback gain of position and orientation; well below the servos' bandwidth. GUESSED"""
@@ -138,8 +139,8 @@ class CartesianController:
         if self._lifts:
             raised = working_height - SHOULDER_DROP - self.shoulder_position[2]
             home[: self._lifts] = now[: self._lifts] + raised / self._lifts
-        fastest, home = self._fastest, np.minimum(np.maximum(home, self._lower), self._upper)
-        ik.posture_rates[:] = np.minimum(np.maximum(POSTURE_GAIN * (home - now), -0.8 * fastest), 0.8 * fastest)
+        fastest, home = self._fastest, clip(home, self._lower, self._upper)
+        ik.posture_rates[:] = clip(POSTURE_GAIN * (home - now), -0.8 * fastest, 0.8 * fastest)
         ik.min_rates[:], ik.max_rates[:] = (self._lower - now) / dt, (self._upper - now) / dt
         rates = ik.solve()
         # all joints are slowed down by the same factor: the tip stays on its line
