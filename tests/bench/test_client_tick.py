@@ -1,4 +1,4 @@
-"""What ``vinesim bench tick`` reports of whole clients: the parts of a tick beside their budgets, while a robot pushes."""
+"""What ``vinesim bench tick`` reports of whole clients: parts of a tick beside budgets, while a robot pushes."""
 
 from __future__ import annotations
 
