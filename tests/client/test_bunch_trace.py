@@ -4,11 +4,13 @@ import pytest
 from vinesim.client.recording.bunch_trace import Rows, remote_error, touch_to_motion
 
 
-def rows(clock, x, force, told=True):
+def rows(clock, x, force, is_remote=True):
     x, force = np.asarray(x, float), np.asarray(force, float)
     zero = np.zeros_like(x)
     clock = np.asarray(clock, float)
-    return Rows(clock, clock, np.stack([x, zero, zero], -1), np.stack([zero, force, zero], -1), np.full(len(x), told))
+    return Rows(
+        clock, clock, np.stack([x, zero, zero], -1), np.stack([zero, force, zero], -1), np.full(len(x), is_remote)
+    )
 
 
 def test_motion_in_the_tick_of_the_touch_counts_zero():
@@ -50,10 +52,10 @@ def test_rows_survive_a_file(tmp_path):
     assert np.array_equal(after.clock, before.clock)
 
 
-def test_remote_error_is_judged_only_while_the_copy_was_told():
+def test_remote_error_is_judged_only_while_the_copy_follows_the_owner():
     t = np.arange(0, 4, 0.01)
     owner = rows(t, 0.1 * t, np.ones_like(t))
-    assert remote_error(owner, rows(t, 0 * t, 0 * t, told=False)) is None
+    assert remote_error(owner, rows(t, 0 * t, 0 * t, is_remote=False)) is None
     half = rows(t, np.where(t < 2, 0.0, 0.1 * t), 0 * t)
-    half.told[t < 2] = False
+    half.is_remote[t < 2] = False
     assert remote_error(owner, half)["max"] < 0.01

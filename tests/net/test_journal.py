@@ -132,7 +132,7 @@ def test_a_flipped_bit_ends_what_is_believed_in_one_line(tmp_path, caplog):
         (b"PNG something else", "no journal"),
         (b"vsfacts\x09rest", "version 09"),
         (b"vsfacts\x01", "head is torn"),
-        (b"vsfacts\x01" + keep._packed(b"nonsense"), "whose facts"),
+        (b"vsfacts\x01" + keep._packed(b"nonsense"), "its world is unknown"),
         (b"vsfacts\x01" + keep._packed(keep._encoder.encode(keep._Header("w", "s", "d", 9))), "protocol version 9"),
     ],
 )

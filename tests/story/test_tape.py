@@ -193,7 +193,7 @@ def test_what_was_left_is_replayed_to_a_viewer(story, listen):
     assert replay.returncode == 0, said
     lines = said.splitlines()
     assert "it ends in the middle" in lines[0]
-    heard = next(int(found[1]) for line in lines if (found := re.match(r"(\d+) messages were heard", line)))
+    heard = next(int(found[1]) for line in lines if (found := re.match(r"(\d+) messages were sent", line)))
     assert heard > 100
     assert sorted(viewer.joined) == ["ada", "bob"]
     assert viewer.replicator.counters.malformed == 0

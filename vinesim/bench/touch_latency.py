@@ -137,10 +137,10 @@ def link() -> Iterator[Measurement]:
     for case, line in LINES.items():
         took = 1e3 * np.array(measure_notification(line))
         for share in (50, 95):
-            yield Measurement("link", f"{case}: touch to told, p{share}", float(np.percentile(took, share)), "ms")
+            yield Measurement("link", f"{case}: touch to received, p{share}", float(np.percentile(took, share)), "ms")
     for case, line in LINES.items():
         picker, visitor = run_clients(line)
-        known = [picker.clock[row] for row in touches(picker) if visitor.told.any()]
+        known = [picker.clock[row] for row in touches(picker) if visitor.is_remote.any()]
         both = [(moves(picker, start), moves(visitor, start)) for start in known]
         both = [(1e3 * here, 1e3 * there) for here, there in both if np.isfinite(here) and np.isfinite(there)]
         yield Measurement("link", f"{case}: touches of a still bunch", float(len(both)), "")

@@ -101,13 +101,14 @@ def traffic() -> Iterator[Measurement]:
         def line(what: str, value: float, size: str = size, all_: float = everything) -> Measurement:
             return Measurement("traffic", f"{size}: {what}", value / 1e3, "kB/s", "broadcast", all_ / 1e3, all_ / value)
 
-        heard, said, count = rates[..., 0], rates[..., 1], rates[..., 2]
-        mean = heard.mean(0)
-        yield line("heard by a client, mean of all", float(mean.mean()))
-        yield line("heard by the client that hears most, mean", float(mean.max()))
-        yield line("heard by a client, peak of a tenth of a second", float(heard.max()))
-        yield line("heard with framing, the client that hears most", float((heard + OVERHEAD * count).mean(0).max()))
-        yield line("said by a client, mean of all", float(said.mean()))
+        received, sent, count = rates[..., 0], rates[..., 1], rates[..., 2]
+        mean = received.mean(0)
+        yield line("received by a client, mean of all", float(mean.mean()))
+        yield line("received by the client that receives most, mean", float(mean.max()))
+        yield line("received by a client, peak of a tenth of a second", float(received.max()))
+        framed = received + OVERHEAD * count
+        yield line("received with framing, the client that receives most", float(framed.mean(0).max()))
+        yield line("sent by a client, mean of all", float(sent.mean()))
         poses = np.mean([p.replicator.counters.actor.bytes_in for p in fake_clients]) / hub.time
         trees = np.mean([p.replicator.counters.environment.bytes_in for p in fake_clients]) / hub.time
         yield Measurement("traffic", f"{size}: of that, poses", float(poses) / 1e3, "kB/s")

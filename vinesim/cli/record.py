@@ -25,7 +25,7 @@ def run(
     scene: str | None, seed: int | None,
     area: tuple[float, float, float, float] | None, only: str | None, seconds: float | None,
 ) -> int:  # fmt: skip
-    """Record until told to stop; 0 if the file is complete."""
+    """Record until asked to stop; 0 if the file is complete."""
     families = FAMILIES if only is None else tuple(filter(None, only.split(",")))
     if unknown := [family for family in families if family not in FAMILIES] or ([] if families else [only]):
         raise UsageError(f"--only {','.join(map(str, unknown))}: give some of {','.join(FAMILIES)}")

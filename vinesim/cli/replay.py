@@ -74,7 +74,7 @@ def _tell(
         stack.callback(play.close)
         while not (play.ended or stop.wait(POLL)):
             play.step(time.monotonic())
-    print(f"{play.sent} messages were heard", file=sys.stderr)
+    print(f"{play.sent} messages were sent", file=sys.stderr)
     return 0
 
 

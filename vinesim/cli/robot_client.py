@@ -19,7 +19,7 @@ from vinesim.ros.names import ros_name
 
 
 def run(options: ClientOptions) -> int:
-    """Build the client from its options, step until told to stop, then write what was asked for; the exit code."""
+    """Build the client from its options, step until asked to stop, then write what was asked for; the exit code."""
     validate_task_name(options.job)
     descriptions = [load_description(robot) for robot in options.robot or ["vinebot"]]
     with ClientSession(options) as session:

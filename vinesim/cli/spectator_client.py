@@ -11,7 +11,7 @@ from vinesim.client.tasks.start_poses import spawn_pose
 
 
 def run(options: ClientOptions) -> int:
-    """Watch until told to stop; pictures go to ``--out``; the exit code."""
+    """Watch until asked to stop; pictures go to ``--out``; the exit code."""
     with ClientSession(options) as session:
         pose = options.pose
         if pose is None:

@@ -1,1 +1,1 @@
-"""A client: receive, control, step, sense, send. The only place where neighbouring rooms meet."""
+"""A client: receive, control, step, sense, send. It composes the packages that do not import each other."""

@@ -1,1 +1,1 @@
-"""ROS 2 in process: the only room that imports rclpy or message packages."""
+"""ROS 2: the only package that imports rclpy or message packages."""

@@ -239,7 +239,7 @@ def _device(space: str, name: str, mine: str, other: str) -> int:
 
 
 def _forward(answers: IO[str]) -> None:
-    """Make what the first request names, carry packets, answer requests; until nobody asks any more."""
+    """Make what the first request names, carry packets, answer requests; until standard input is closed."""
     asking = b""
     while not asking.endswith(b"\n"):  # by the byte: nothing of what select is to see may wait in a buffer
         if not (more := os.read(0, 1)):
@@ -292,7 +292,7 @@ def _loop(answers: IO[str], lines: dict[str, tuple[_Direction, _Direction]], rng
                     packet = os.read(source, _MAX_PACKET)
                 except BlockingIOError:
                     break
-                if packet[0] >> 4 != 4:  # IPv6 looks for neighbours on every new device; nobody asked it to
+                if packet[0] >> 4 != 4:  # IPv6 looks for neighbours on every new device; unasked
                     continue
                 direction.packets += 1
                 direction.bytes += len(packet)

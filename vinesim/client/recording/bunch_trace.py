@@ -27,7 +27,7 @@ class Trace:
         self._time = np.zeros(capacity)
         self._force = np.zeros((capacity, 3))
         self._position = np.zeros((capacity, 3))
-        self._told = np.zeros(capacity, bool)
+        self._is_remote = np.zeros(capacity, bool)
         self.length = 0
 
     def _centre(self, pose: np.ndarray) -> np.ndarray:
@@ -36,9 +36,9 @@ class Trace:
         axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
         return pose[:3] + axis * self._com[0]
 
-    def add(self, sim_time: float, pose: np.ndarray, force: np.ndarray, told: bool = False) -> None:
+    def add(self, sim_time: float, pose: np.ndarray, force: np.ndarray, is_remote: bool = False) -> None:
         """Note the pose [7] after a tick, the force [3] N that acted on the bunch during it, and whether another
-        client owned it and told of it.
+        client owned it, and its states were applied.
         """
         if self.length == len(self._clock):
             return
@@ -47,7 +47,7 @@ class Trace:
         self._time[row] = sim_time
         self._position[row] = self._centre(pose)
         self._force[row] = force
-        self._told[row] = told
+        self._is_remote[row] = is_remote
         self.length += 1
 
     def centre(self) -> np.ndarray:
@@ -62,7 +62,9 @@ class Trace:
     def rows(self) -> Rows:
         """All rows so far."""
         n = self.length
-        return Rows(self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._told[:n])
+        return Rows(
+            self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._is_remote[:n]
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,8 +79,8 @@ class Rows:
     """[tick, 3] m from rest, of the bunch's centre."""
     force: np.ndarray
     """[tick, 3] N on the bunch."""
-    told: np.ndarray
-    """[tick] bool: another client owned the bunch and told of it."""
+    is_remote: np.ndarray
+    """[tick] bool: another client owned the bunch, and its states were applied."""
 
     def save(self, path: pathlib.Path) -> None:
         """Write as .npz."""
@@ -98,7 +100,7 @@ MOVED = 1e-6
 def touch_to_motion(rows: Rows) -> int | None:
     """Ticks from the first tick with a force to the first in which the bunch moved; 0 is the same tick.
 
-    None if nobody touched it, or it never moved (D6.4 section 2.1 asks for a direct response; F03).
+    None if it was not touched, or it never moved (D6.4 section 2.1 asks for a direct response; F03).
     """
     touched = np.flatnonzero(np.linalg.norm(rows.force, axis=1) > 0.0)
     if not len(touched):
@@ -112,14 +114,14 @@ def touch_to_motion(rows: Rows) -> int | None:
 def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[str, float] | None:
     """How far the remote copy of the bunch was from the owner's, at the same instant of the host's clock [mm].
 
-    Judged while the owner's bunch was displaced by more than ``threshold`` [m] and the other client was told of it.
+    Judged while the owner's bunch was displaced by more than ``threshold`` [m] and the other client received it.
     The network's delay is in it. None if there is no such time.
     """
     if len(remote.clock) < 2:
         return None
     after = np.clip(np.searchsorted(remote.clock, local.clock), 1, len(remote.clock) - 1)
     common = (local.clock >= remote.clock[0]) & (local.clock <= remote.clock[-1])
-    common &= remote.told[after] & remote.told[after - 1]
+    common &= remote.is_remote[after] & remote.is_remote[after - 1]
     common &= np.linalg.norm(local.displacement, axis=1) > threshold
     if not common.any():
         return None

@@ -101,7 +101,7 @@ class StepSnapshot:
 
 
 def run_sensor_worker(config: SensorConfig, snapshots: LatestValue, pipe: Connection) -> None:
-    """Entry of the process: render and publish until told to stop, or until the client's process has ended."""
+    """Entry of the process: render and publish until asked to stop, or until the client's process has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.setswitchinterval(SWITCH_INTERVAL)

@@ -118,7 +118,7 @@ class AdmissionControl:
             )
         others = self._admitted.keys() - {(world, name)}
         if self._max_actors is not None and len(others) >= self._max_actors:
-            return f"the server has room for {self._max_actors} actors and {len(others)} are there: come back later"
+            return f"the server admits {self._max_actors} actors and {len(others)} are in it: try again later"
         return ""
 
     def _forget(self, world: str) -> None:

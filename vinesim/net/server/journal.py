@@ -98,9 +98,7 @@ class Journal:
         except (msgspec.DecodeError, MessageError, struct.error) as error:
             reason = str(error)
         if head is None:
-            raise JournalError(
-                f"{path}: {reason}, so nobody knows whose facts these are: move it away, or give another --state-dir"
-            )
+            raise JournalError(f"{path}: {reason}, so its world is unknown: move it away, or give another --state-dir")
         if valid_end < len(content):
             backup = _free_name(path)
             _write(backup, content)
