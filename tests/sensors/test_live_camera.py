@@ -1,4 +1,4 @@
-"""What makes a live picture cheap changes nothing that is seen: threads, outputs left out, a second view from the first."""
+"""What makes a live picture cheap changes nothing: threads, outputs left out, a second view out of the first."""
 
 import numpy as np
 import pytest

@@ -92,7 +92,7 @@ class Quality:
     shadow_texel_divisor: int
     """Divides the texels of the shadow map nearby."""
     second_from_first: bool
-    """Whether the second imager of a stereo camera sees what the first one sees from elsewhere, or a view of its own."""
+    """Whether the second view of a stereo camera is moved out of the first one, or rendered."""
 
 
 MAX_THREADS = 4

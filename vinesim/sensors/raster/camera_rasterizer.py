@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 import warp as wp
@@ -69,7 +70,7 @@ def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
     """``count`` lenses or fewer that draw the rows of one picture between them, an even number of rows each."""
     rows = [2 * round(0.5 * lens.height * i / count) for i in range(count)] + [lens.height]
     bands = []
-    for first, end in zip(rows, rows[1:], strict=False):
+    for first, end in itertools.pairwise(rows):
         if first < end:
             band = Pinhole()
             for name in Pinhole.vars:
