@@ -51,6 +51,11 @@ def configure_logging(
     """Log level for every command."""
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    progress = logging.getLogger("vinesim.progress")
+    lines = logging.StreamHandler(sys.stderr)
+    lines.setFormatter(logging.Formatter("vinesim: %(message)s"))
+    progress.handlers, progress.propagate = [lines], False
+    progress.setLevel(logging.INFO)
 
 
 def main() -> None:
