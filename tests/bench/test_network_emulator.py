@@ -54,7 +54,7 @@ def _links():
 def probe(net: NetworkEmulator, end: str, count: int, *flood: str) -> tuple[list[float], int]:
     command = [sys.executable, "-c", PROBE, net.hub(end), str(count), *flood]
     process = net.start(end, command, stdout=subprocess.PIPE, text=True)
-    trips, answered = json.loads(process.communicate(timeout=20)[0])
+    trips, answered = json.loads(process.communicate(timeout=120)[0])
     return trips, answered
 
 

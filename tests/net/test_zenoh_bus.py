@@ -227,7 +227,7 @@ def test_a_session_left_open_does_not_hang_at_exit(server):
         "from vinesim.net.transport.zenoh_bus import ZenohBus\n"
         f"bus = ZenohBus('ada', connect={server.endpoint!r})\nprint('in')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stdout) == (0, "in\n"), done.stderr
 
 

@@ -33,7 +33,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from tests.support.stock_node import TIMEOUT, StockNode, wait_until
 from vinesim.ros.commands.types import BaseVelocity, JointPositions
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
-from vinesim.ros.node import Node
+from vinesim.ros.node import MAX_QUEUED, Node
 from vinesim.ros.tools.topic_monitor import TopicStats
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
@@ -357,24 +357,26 @@ def test_contacts_are_wrenches_of_the_touching_link():
         assert (by_frame["map"].force.z, by_frame["map"].torque.y) == pytest.approx((5.0, -5.0))
 
 
-def test_the_newest_replaces_what_waits_and_is_counted():
+@pytest.mark.parametrize(("name", "kept"), [("diagnostics", 1), ("joint_states", MAX_QUEUED)])
+def test_messages_beyond_the_queue_are_dropped_oldest_first_and_counted(name: str, kept: int):
+    """Of pictures and other low-priority messages the newest waits, of every step's messages half a second's worth."""
     with Node("vinebot", URDF) as node:
-        topic = node._topics["joint_states"]
+        topic = node._topics[name]
         busy, go = threading.Event(), threading.Event()
 
-        def slow() -> JointState:
+        def slow() -> object:
             busy.set()
             go.wait(TIMEOUT)
-            return JointState()
+            return []
 
         node._enqueue([(topic, slow)], always=True)
         assert busy.wait(TIMEOUT)
-        built = []
-        for i in range(5):  # the simulation does not wait while the first is in the making
-            node._enqueue([(topic, lambda i=i: built.append(i) or JointState())], always=True)
+        built, count = [], kept + 4
+        for i in range(count):  # the simulation does not wait while the first is being built
+            node._enqueue([(topic, lambda i=i: built.append(i) or [])], always=True)
         go.set()
-        wait_until(lambda: topic.sent == 2)
-        assert built == [4]
+        wait_until(lambda: not node.has_pending and len(built) == kept)
+        assert built == list(range(4, count))
         assert topic.dropped == 4
 
 
