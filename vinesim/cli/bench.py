@@ -23,6 +23,7 @@ def _contact() -> Iterator[Measurement]:
 
 
 def _tick() -> Iterator[Measurement]:
+    from vinesim.bench.client_tick import client_measurements
     from vinesim.bench.contact import step_measurements
     from vinesim.robot.description.loader import load_description
 
@@ -30,7 +31,8 @@ def _tick() -> Iterator[Measurement]:
     raised = robot.home.copy()
     for joint, position in RAISED.items():
         raised[robot.joints.index(joint)] = position
-    return step_measurements(robot.to_spec("robot"), raised)
+    yield from client_measurements()
+    yield from step_measurements(robot.to_spec("robot"), raised)
 
 
 def _asleep() -> Iterator[Measurement]:
