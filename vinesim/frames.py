@@ -26,8 +26,17 @@ _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 _W_FIRST, _W_LAST = np.array([3, 0, 1, 2]), np.array([1, 2, 3, 0])
 
 
+_MANY = 512
+"""Numbers from which it is quicker to compute each component of all vectors by itself."""
+
+
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross product of vectors [..., 3]; takes a tenth of the time of ``np.cross``, which matters in every step."""
+    if a.size + b.size > _MANY:
+        result = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            np.subtract(a[..., j] * b[..., k], a[..., k] * b[..., j], out=result[..., i])
+        return result
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
@@ -63,17 +72,27 @@ def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return v + q[..., 3:] * t + cross(q[..., :3], t)
 
 
+def _length(v: np.ndarray) -> np.ndarray:
+    """Euclidean norm [..., 1] of vectors [..., n]; of many short ones in a fraction of the time of numpy's."""
+    if v.size <= _MANY or v.shape[-1] not in (3, 4) or v.dtype.kind != "f":
+        return np.linalg.norm(v, axis=-1, keepdims=True)
+    total = v[..., 0] * v[..., 0]
+    for i in range(1, v.shape[-1]):  # in the order in which numpy adds them
+        total += v[..., i] * v[..., i]
+    return np.sqrt(total)[..., None]
+
+
 def normalize(q: np.ndarray) -> np.ndarray:
     """Unit quaternion or vector; a zero one stays zero."""
     q = np.asarray(q)
-    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    length = _length(q)
     return q / np.where(length > 0.0, length, 1.0)
 
 
 def exp(v: np.ndarray) -> np.ndarray:
     """Rotation vector [..., 3] rad to quaternion [..., 4]."""
     v = np.asarray(v, dtype=np.result_type(v, np.float32))
-    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    angle = _length(v)
     scale = np.where(angle > 1e-6, np.sin(0.5 * angle) / np.where(angle > 1e-6, angle, 1.0), 0.5)
     return np.concatenate([v * scale, np.cos(0.5 * angle)], axis=-1)
 
@@ -96,13 +115,14 @@ def to_matrix(q: np.ndarray) -> np.ndarray:
 def from_matrix(r: np.ndarray) -> np.ndarray:
     """Quaternions [..., 4] of rotation matrices [..., 3, 3] (the largest component has a positive sign)."""
     r = np.asarray(r, float)
-    m = [[r[..., i, j] for j in range(3)] for i in range(3)]
-    x = np.stack([1 + m[0][0] - m[1][1] - m[2][2], m[1][0] + m[0][1], m[2][0] + m[0][2], m[2][1] - m[1][2]], -1)
-    y = np.stack([m[1][0] + m[0][1], 1 - m[0][0] + m[1][1] - m[2][2], m[2][1] + m[1][2], m[0][2] - m[2][0]], -1)
-    z = np.stack([m[2][0] + m[0][2], m[2][1] + m[1][2], 1 - m[0][0] - m[1][1] + m[2][2], m[1][0] - m[0][1]], -1)
-    w = np.stack([m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1], 1 + m[0][0] + m[1][1] + m[2][2]], -1)
-    rows = np.stack([x, y, z, w], -2)
-    best = np.argmax(np.stack([x[..., 0], y[..., 1], z[..., 2], w[..., 3]], -1), -1)
+    xx, yy, zz = (r[..., i, i] for i in range(3))
+    rows = np.empty((*r.shape[:-2], 4, 4))
+    rows[..., 0, 0], rows[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
+    rows[..., 2, 2], rows[..., 3, 3] = 1 - xx - yy + zz, 1 + xx + yy + zz
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rows[..., i, j] = rows[..., j, i] = r[..., j, i] + r[..., i, j]
+        rows[..., k, 3] = rows[..., 3, k] = r[..., j, i] - r[..., i, j]
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), -1)
     return normalize(np.take_along_axis(rows, best[..., None, None], -2)[..., 0, :])
 
 
@@ -125,11 +145,11 @@ def from_x_axis(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np
     Where ``x`` and ``up`` are parallel, the z axis leans towards world y.
     """
     ex = normalize(np.asarray(x, float))
-    side = np.cross(np.broadcast_to(up, ex.shape), ex)
-    degenerate = np.linalg.norm(side, axis=-1, keepdims=True) < 1e-6
-    side = np.where(degenerate, np.cross(np.broadcast_to([0.0, 1.0, 0.0], ex.shape), ex), side)
+    side = cross(np.broadcast_to(up, ex.shape), ex)
+    degenerate = _length(side) < 1e-6
+    side = np.where(degenerate, cross(np.broadcast_to([0.0, 1.0, 0.0], ex.shape), ex), side)
     ey = normalize(side)
-    return from_matrix(np.stack([ex, ey, np.cross(ex, ey)], -1))
+    return from_matrix(np.stack([ex, ey, cross(ex, ey)], -1))
 
 
 def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.ndarray:

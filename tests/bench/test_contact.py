@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vinesim.bench import client_tick
 from vinesim.bench import contact as bench
 from vinesim.cli.bench import BENCHES
 
@@ -14,6 +15,7 @@ def test_every_tick_is_shared_out_to_mujoco_us_and_the_rest(monkeypatch: pytest.
     monkeypatch.setattr(bench, "MEASURED_STEPS", 20)
     monkeypatch.setattr(bench, "WARM_UP_STEPS", 2)
     monkeypatch.setattr(bench, "_compare_with_mujoco", lambda *_: iter(()))
+    monkeypatch.setattr(client_tick, "CASES", ())
     found = list(BENCHES["tick"]())
     assert {m.unit for m in found} == {"ms/tick"}
     for robots in ("1 robot,", "10 robots,"):

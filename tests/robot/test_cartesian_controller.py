@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.support.prioritized_ik import solve_prioritized_ik as reference
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose, solve_prioritized_ik
+from vinesim.robot.control.cartesian_controller import CartesianController, InverseKinematics, axes_of_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
@@ -59,21 +60,58 @@ def test_a_hand_goes_straight_and_not_too_fast():
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() / 0.01 < 1.2 * 0.3
 
 
+def solve(
+    tasks: list[tuple[np.ndarray, np.ndarray]],
+    posture: np.ndarray,
+    least: np.ndarray,
+    most: np.ndarray,
+    weights: np.ndarray,
+) -> np.ndarray:
+    """Rates for (Jacobian, velocity) of tasks in order, by the compiled inverse kinematics."""
+    ik = InverseKinematics(weights, [len(velocity) for _, velocity in tasks])
+    ik.jacobian[:] = np.concatenate([jacobian for jacobian, _ in tasks])
+    ik.velocity[:] = np.concatenate([velocity for _, velocity in tasks])
+    ik.posture_rates[:], ik.min_rates[:], ik.max_rates[:] = posture, least, most
+    return ik.solve().copy()
+
+
+def test_inverse_kinematics_is_that_of_singular_value_decompositions() -> None:
+    """Random tasks, with joints at their bounds, nearly singular rows and rows that contradict each other."""
+    rng = np.random.default_rng(1)
+    at_bounds = 0
+    for trial in range(300):
+        rows, joints = (3, int(rng.integers(1, 6))), int(rng.integers(5, 10))
+        jacobian, velocity = rng.normal(size=(sum(rows), joints)), rng.normal(size=sum(rows))
+        if trial % 3 == 0:
+            jacobian[2] *= 10.0 ** rng.uniform(-6.0, -1.0)
+        if trial % 5 == 0:
+            jacobian[1] = jacobian[0] + 1e-3 * jacobian[1]
+        if trial % 7 == 0:
+            jacobian[3] = jacobian[0]
+        tasks = [(jacobian[:3], velocity[:3]), (jacobian[3:], velocity[3:])]
+        weights, bound = rng.uniform(0.1, 1.0, joints), rng.uniform(0.1, 3.0, joints)
+        given = (tasks, rng.normal(size=joints), -bound, bound, weights)
+        wanted = reference(*given)
+        np.testing.assert_allclose(solve(*given), wanted, atol=1e-8)
+        at_bounds += np.count_nonzero(np.abs(np.abs(wanted) - bound) < 1e-9)
+    assert at_bounds > 300
+
+
 def test_priorities_hold() -> None:
     """First task exact, second as far as it is free, bounds kept: against least squares on the null space."""
     rng = np.random.default_rng(5)
     first, second = rng.normal(size=(3, 7)), rng.normal(size=(5, 7))
     one, two, posture = rng.normal(size=3), rng.normal(size=5), rng.normal(size=7)
     far = np.full(7, 1e3)
-    rates = solve_prioritized_ik([(first, one), (second, two)], posture, -far, far, np.ones(7))
+    rates = solve([(first, one), (second, two)], posture, -far, far, np.ones(7))
     np.testing.assert_allclose(first @ rates, one, atol=1e-9)
     particular = np.linalg.pinv(first) @ one
     null = np.eye(7) - np.linalg.pinv(first) @ first
     best = particular + null @ (np.linalg.pinv(second @ null, rcond=1e-9) @ (two - second @ particular))
     np.testing.assert_allclose(rates, best, atol=1e-9)
-    alone = solve_prioritized_ik([(first, one)], posture, -far, far, np.ones(7))
+    alone = solve([(first, one)], posture, -far, far, np.ones(7))
     np.testing.assert_allclose(alone, particular + null @ posture, atol=1e-9)
     bound = np.full(7, 0.9 * np.abs(alone).max())
-    kept = solve_prioritized_ik([(first, one)], posture, -bound, bound, np.ones(7))
+    kept = solve([(first, one)], posture, -bound, bound, np.ones(7))
     assert (np.abs(kept) <= bound + 1e-9).all()
     np.testing.assert_allclose(first @ kept, one, atol=1e-9)

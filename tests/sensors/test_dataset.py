@@ -87,7 +87,7 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
             _until(lambda: (out / "dataset.json").exists() and len(_records(out)) >= images)  # noqa: B023
             run.send_signal(end)
-            said = run.communicate(timeout=30)[0]
+            said = run.communicate(timeout=120)[0]
         assert run.returncode == (130 if end == signal.SIGINT else -signal.SIGKILL)
         if end == signal.SIGINT:
             assert f"0 of {IMAGES} images" in said
@@ -238,7 +238,7 @@ def test_a_full_disk_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.
 def test_what_stops_a_worker_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     bare = tmp_path / "bare.toml"
     bare.write_text(scene.read_text().replace("[6, 8]", "[0, 0]"))
-    done = subprocess.run(_command(bare, tmp_path / "set", 1), capture_output=True, text=True, timeout=60)
+    done = subprocess.run(_command(bare, tmp_path / "set", 1), capture_output=True, text=True, timeout=300)
     assert done.returncode == 2
     assert [line for line in done.stderr.splitlines() if line.strip()] == [
         "vinesim: scene 'one vine' bears no bunch to look at; raise fruit.bunches"

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import pathlib
 
 import numpy as np
 
+from vinesim import disk_cache, frames
 from vinesim.frames import normalize
 from vinesim.scene import plant_parameters
 
@@ -167,6 +169,18 @@ def _scaled(which: int, count: int, length: float, radius: float, variety: int) 
 @functools.cache
 def prototypes() -> tuple[BerryLayout, ...]:
     """The packed library, berries of unit volume radius sorted from the top of the bunch to its tip."""
+    digest = disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(frames.__file__))
+    names = [field.name for field in dataclasses.fields(BerryLayout)]
+
+    def make() -> disk_cache.Arrays:
+        return {f"{i} {name}": getattr(one, name) for i, one in enumerate(_pack()) for name in names}
+
+    arrays = disk_cache.load_or_make("berry-packings", digest, make)
+    count = len(PROTOTYPE_BERRIES) * len(_SHAPES)
+    return tuple(BerryLayout(**{name: arrays[f"{i} {name}"] for name in names}) for i in range(count))
+
+
+def _pack() -> list[BerryLayout]:
     drafts = [
         _draft(count, *shape, i * len(_SHAPES) + j)
         for i, count in enumerate(PROTOTYPE_BERRIES)
@@ -187,7 +201,7 @@ def prototypes() -> tuple[BerryLayout, ...]:
         near = np.argsort(distance, axis=1, kind="stable")[:, :8].astype(np.int32)
         axis = normalize(normalize(p - foot) + np.array([0.35, 0.0, 0.0]))
         library.append(BerryLayout(p, radius, axis, foot, rachis, near))
-    return tuple(library)
+    return library
 
 
 def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray, ...]:

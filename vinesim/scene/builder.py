@@ -360,19 +360,23 @@ def solve_rest_pose(model: Model) -> Model:
     mass[model.bunch_body[fine]] = model.bunch_head_mass[fine]
     com[model.bunch_body[fine]] = model.bunch_head_com[fine]
     force = mass[:, None] * GRAVITY
-    moment = np.cross(frames.rotate(world[:, 3:], com), force)
+    moment = frames.cross(frames.rotate(world[:, 3:], com), force)
     for level in range(int(depth.max(initial=0)), 0, -1):
         here = np.flatnonzero(depth == level)
         above = parent[here]
         np.add.at(force, above, force[here])
-        np.add.at(moment, above, moment[here] + np.cross(world[here, :3] - world[above, :3], force[here]))
-    settled = np.broadcast_to(frames.IDENTITY, drawn.shape)
+        np.add.at(moment, above, moment[here] + frames.cross(world[here, :3] - world[above, :3], force[here]))
+    settled = np.broadcast_to(frames.IDENTITY, drawn.shape).copy()
     local = frames.rotate(frames.conjugate(world[:, 3:]), moment)
+    open_joints = np.arange(len(settled))
     for _ in range(60):  # the joint's axes depend on the answer; the map contracts for theta below ~1 rad
-        before = settled
-        settled = frames.exp(frames.rotate(settled, local) / model.joint_stiffness)
-        if np.abs(settled - before).max(initial=0.0) < 1e-12:
+        before = settled[open_joints]
+        torque = frames.rotate(before, local[open_joints])
+        settled[open_joints] = after = frames.exp(torque / model.joint_stiffness[open_joints])
+        change = np.abs(after - before).max(1, initial=0.0)
+        if change.max(initial=0.0) < 1e-12:
             break
+        open_joints = open_joints[change > 0.0]  # the others have reached a fixed point, to the last bit
     model.body_rest[:] = frames.multiply(drawn, frames.conjugate(settled))
     model.joint_settled[:] = settled
     return model

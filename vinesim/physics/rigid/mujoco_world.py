@@ -21,6 +21,7 @@ from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS
+from vinesim.physics.rigid.link_sensors import LinkSensors
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual
@@ -59,6 +60,7 @@ class WorldCore:
         """Counts changes of MuJoCo's model: views of its arrays must be renewed when this changes."""
         self.owners: dict[int, tuple[str, str]] = {}
         """Actor and link of every MuJoCo body that can be added, removed or moved, as in :class:`RigidGeoms`."""
+        self._link_sensors = LinkSensors()
         self._recompile()
 
     # ------------------------------------------------------------------ actors
@@ -197,6 +199,7 @@ class WorldCore:
         self._kinematics_current = False
         for actor in (*self._robots.values(), *self._humans.values()):
             actor.find_indices(m)
+        self._link_sensors.find_indices(m, self._robots)
         for human in self._humans.values():
             for hand in human.hands:
                 self._restore_grasp(hand)

@@ -195,7 +195,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         if force is not None:
             np.add(force, 0.0, out=d.qfrc_applied)  # turns -0 into +0: -0 would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
-        self._read_link_sensors()
+        self._link_sensors.measure(m, d)
         if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
             self._stop_faulty_trees()
             force = None
@@ -218,16 +218,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         self._kinematics_current = False
         for robot in self._robots.values():
             robot.find_indices(mj_model)
-
-    def _read_link_sensors(self) -> None:
-        """Measure at links in the step that ends, while MuJoCo's poses are still those of its start."""
-        m, d = self.mj_model, self.mj_data
-        if not any(robot.link_sensors for robot in self._robots.values()):
-            return
-        mujoco.mj_rnePostConstraint(m, d)
-        for robot in self._robots.values():
-            for link, sensor in robot.link_sensors.items():
-                sensor.measure(m, d, robot.bodies[link])
+        self._link_sensors.find_indices(mj_model, self._robots)
 
     def _stop_faulty_trees(self) -> None:
         """Stop the kinematic trees with a number that is not finite where the step began; the others go on."""

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
 from vinesim.physics.rigid.mujoco_world import WorldCore
-from vinesim.physics.rigid.robot_body import LinkSensor
 
 
 class RobotAccess(WorldCore):
@@ -105,10 +106,10 @@ class RobotAccess(WorldCore):
     def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (world axes) of the base link."""
         robot, d = self.robot(name), self.mj_data
-        x, y, yaw = d.qpos[robot.base_q]
-        vx, vy, wz = d.qvel[robot.base_v]
+        x, y, yaw = d.qpos[robot.base_q].tolist()
+        vx, vy, wz = d.qvel[robot.base_v].tolist()
         half = 0.5 * yaw
-        pose = np.array([x, y, robot.spec.pose[2], 0.0, 0.0, np.sin(half), np.cos(half)])
+        pose = np.array([x, y, robot.base_height, 0.0, 0.0, math.sin(half), math.cos(half)])
         return pose, np.array([vx, vy, 0.0, 0.0, 0.0, wz])
 
     # ------------------------------------------------------------------ links
@@ -124,7 +125,9 @@ class RobotAccess(WorldCore):
     def add_link_sensor(self, name: str, link: str) -> None:
         """From the next step on, measure :meth:`link_wrench` and :meth:`link_acceleration` at a link."""
         self._link_body(name, link)
-        self.robot(name).link_sensors[link] = LinkSensor()
+        if link not in self.robot(name).sensor_links:
+            self.robot(name).sensor_links.append(link)
+            self._link_sensors.find_indices(self.mj_model, self._robots)
 
     def link_wrench(self, name: str, link: str) -> np.ndarray:
         """[6] N, N m about the link's origin: wrench of the link, and all beyond it, on its parent.
@@ -132,11 +135,11 @@ class RobotAccess(WorldCore):
         In the link's axes, mean of the last step. Weight, inertia, pushes and contacts with rigid bodies are included;
         contacts with plants are not: they are in ``Physics.contacts``.
         """
-        return self._link_sensor(name, link).wrench
+        return self._link_sensors.wrench(name, link)
 
     def link_acceleration(self, name: str, link: str) -> np.ndarray:
         """[6] rad/s^2, m/s^2: angular and proper acceleration of a link's origin in its axes; at rest 9.81 upwards."""
-        return self._link_sensor(name, link).acceleration.copy()
+        return self._link_sensors.acceleration(name, link)
 
     def link_angular_velocity(self, name: str, link: str) -> np.ndarray:
         """[3] rad/s of a link, in its axes."""
@@ -145,9 +148,3 @@ class RobotAccess(WorldCore):
         jacobian = np.zeros((3, self.mj_model.nv))
         mujoco.mj_jacBody(self.mj_model, self.mj_data, None, jacobian, body)
         return jacobian @ self.mj_data.qvel @ self.mj_data.xmat[body].reshape(3, 3)
-
-    def _link_sensor(self, name: str, link: str) -> LinkSensor:
-        try:
-            return self.robot(name).link_sensors[link]
-        except KeyError:
-            raise ValueError(f"link {link!r} of robot {name!r} has no sensor; call add_link_sensor() first") from None

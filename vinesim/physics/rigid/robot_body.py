@@ -6,7 +6,6 @@ compliant joint must swing with its own damping: for these :func:`split_damping`
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import mujoco
@@ -20,34 +19,6 @@ from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, shapes
 from vinesim.scene.values import RobotSpec
 
 _PLANAR = ("x", "y", "yaw")
-
-
-@dataclasses.dataclass
-class LinkSensor:
-    """Wrench and acceleration of a link in the last step, with the link's pose at the start of that step."""
-
-    parent_wrench: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
-    """[6] N m, N: moment about the robot's centre of mass and force of the parent on the link, world axes."""
-    com_offset: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
-    """[3] m from the link's origin to that centre, world axes."""
-    rotation: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
-    """[3, 3] of the link."""
-    acceleration: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
-    """[6] rad/s^2, m/s^2: angular and proper linear acceleration of the link's origin, link axes."""
-
-    @property
-    def wrench(self) -> np.ndarray:
-        """Force [N] and moment about the link's origin [N m] of the link on its parent [6], in the link's axes."""
-        (x, y, z), (u, v, w) = self.com_offset.tolist(), self.parent_wrench[3:].tolist()
-        moment = self.parent_wrench[:3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
-        return -np.concatenate([self.parent_wrench[3:] @ self.rotation, moment @ self.rotation])
-
-    def measure(self, m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
-        """Read the sensor at MuJoCo's ``body``, while MuJoCo's poses are still those of the step's start."""
-        self.parent_wrench[:] = d.cfrc_int[body]
-        np.subtract(d.subtree_com[m.body_rootid[body]], d.xpos[body], out=self.com_offset)
-        self.rotation[:] = d.xmat[body].reshape(3, 3)
-        mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, self.acceleration, 1)
 
 
 class RobotBody:
@@ -78,6 +49,8 @@ class RobotBody:
         """[joint] N m or N: MuJoCo's control in the last step; less K q and D v it is the effort of the servo."""
         self.base_target = np.array([pose[0], pose[1], frames.to_yaw(pose[3:])])
         """[3] x, y, yaw (m, m, rad) to which the base's servos pull; moves with ``base_velocity``."""
+        self.base_height = float(pose[2])
+        """[m] z of the base; it moves in a plane."""
         self.base_velocity = np.zeros(3)
         """[3] vx, vy, wz (m/s, m/s, rad/s) in the base's own axes."""
         self.base_gains = _base_gains(spec, parameters)
@@ -97,8 +70,8 @@ class RobotBody:
         self.base_q = self.base_v = self.base_actuator = np.zeros(0, int)
         """[3] The same of the base's x, y and yaw."""
         self.bodies: dict[str, int] = {}
-        self.link_sensors: dict[str, LinkSensor] = {}
-        """By link: the sensors of :meth:`RigidWorld.add_link_sensor`."""
+        self.sensor_links: list[str] = []
+        """Links with a sensor, see :meth:`RigidWorld.add_link_sensor`."""
         self.remote_wrenches: dict[str, np.ndarray] = {}
         """By link: wrenches [6] of remote people; see :meth:`RigidWorld.set_remote_wrenches`."""
 
@@ -152,13 +125,13 @@ class RobotBody:
         pull = self.stiffness * self.target + (self.damping_at_end + self.damping_at_start) * self.target_velocity
         self.control[:] = pull - self.damping_at_start * d.qvel[self.v] + self.feedforward
         d.ctrl[self.actuator] = self.control
-        q = d.qpos[self.base_q]
+        q = d.qpos[self.base_q].tolist()
         c, s = math.cos(q[2]), math.sin(q[2])
         vx, vy, wz = self.base_velocity.tolist()
         velocity = np.array([c * vx - s * vy, s * vx + c * vy, wz])
         # held back too far, the base slips: its target comes along
-        held = np.minimum(self.base_target + dt * velocity, q + self.base_slip)
-        np.maximum(held, q - self.base_slip, out=self.base_target)
+        ahead, slip = (self.base_target + dt * velocity).tolist(), self.base_slip
+        self.base_target[:] = [max(min(a, b + slip), b - slip) for a, b in zip(ahead, q, strict=True)]
         stiffness, damping = self.base_gains
         d.ctrl[self.base_actuator] = stiffness * self.base_target + damping * velocity
 

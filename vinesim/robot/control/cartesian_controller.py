@@ -14,11 +14,19 @@ with seven joints on a lift first turn the tool, then approach a posture (Sicili
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
+import warp as wp
 
 from vinesim import frames
+from vinesim.kernels import inverse_kinematics
+from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import clip
 
 POSITION_GAIN = 5.0
 """[1/s] Feedback gain of position and orientation; well below the servos' bandwidth. GUESSED"""
@@ -57,9 +65,15 @@ class CartesianController:
         self._tip_offset = tip_offset
         self._joints = robot.joint_indices([*lifts, *arm.joints])
         self._lifts = len(lifts)
-        speed_of = robot.max_velocity[self._joints]
-        self._joint_weights = speed_of / speed_of.max()
-        """[joint] Weights in the inverse kinematics: the slow lift moves less than the arm."""
+        self._lower, self._upper = robot.lower_limit[self._joints], robot.upper_limit[self._joints]
+        self._fastest = robot.max_velocity[self._joints]
+        self._largest_change = self._fastest * robot.rigid.dt / RATE_RAMP_TIME
+        """[joint] Largest change of a rate in one step [rad/s or m/s]."""
+        weights = self._fastest / self._fastest.max()  # the slow lift moves less than the arm
+        self._pointing = InverseKinematics(weights, (3, 2))
+        """Inverse kinematics of a tip on a line, and of the tool's x axis."""
+        self._orienting = InverseKinematics(weights, (3, 3))
+        """The same, and of the tool's whole orientation."""
         self._home = description.home[self._joints]
         moving = description.moving_joints
         self._shoulder = moving.frames[moving.names.index(arm.joints[0])][1]
@@ -88,7 +102,7 @@ class CartesianController:
 
     def distance_to(self, goal: np.ndarray) -> float:
         """Distance [m] of the tip from ``goal`` [3] m in the world."""
-        return float(np.linalg.norm(goal - self.tip_position))
+        return _length(goal - self.tip_position)
 
     def move_towards(
         self,
@@ -111,37 +125,29 @@ class CartesianController:
         tip = pose[:3] + self._tip_offset * axes[0]
         jacobian = robot.rigid.jacobian(robot.name, self.tool, tip)[:, self._joints]
         move = self._advance_reference(goal, speed, dt) + _clip_norm(POSITION_GAIN * (self._reference - tip), speed)
+        ik = self._pointing if z_axis is None else self._orienting
+        ik.jacobian[:3], ik.velocity[:3] = jacobian[:3], move
         if z_axis is None:
-            turning = axes[1:] @ jacobian[3:], _clip_norm(POSITION_GAIN * _pointing_error(axes @ x_axis), MAX_TOOL_RATE)
+            ik.jacobian[3:] = axes[1:] @ jacobian[3:]
+            ik.velocity[3:] = _clip_norm(POSITION_GAIN * _pointing_error(axes @ x_axis), MAX_TOOL_RATE)
         else:
             wanted = np.array([x_axis, frames.cross(z_axis, x_axis), z_axis])
-            turning = (
-                jacobian[3:],
-                _clip_norm(POSITION_GAIN * frames.log(frames.from_matrix(wanted.T @ axes)), MAX_TOOL_RATE),
-            )
+            ik.jacobian[3:] = jacobian[3:]
+            ik.velocity[3:] = _clip_norm(POSITION_GAIN * frames.log(frames.from_matrix(wanted.T @ axes)), MAX_TOOL_RATE)
 
         now, home = robot.setpoint[self._joints], self._home.copy()
         if self._lifts:
             raised = working_height - SHOULDER_DROP - self.shoulder_position[2]
             home[: self._lifts] = now[: self._lifts] + raised / self._lifts
-        lower, upper, fastest = (
-            robot.lower_limit[self._joints],
-            robot.upper_limit[self._joints],
-            robot.max_velocity[self._joints],
-        )
-        rates = solve_prioritized_ik(
-            [(jacobian[:3], move), turning],
-            np.clip(POSTURE_GAIN * (np.clip(home, lower, upper) - now), -0.8 * fastest, 0.8 * fastest),
-            (lower - now) / dt,
-            (upper - now) / dt,
-            self._joint_weights,
-        )
+        fastest, home = self._fastest, clip(home, self._lower, self._upper)
+        ik.posture_rates[:] = clip(POSTURE_GAIN * (home - now), -0.8 * fastest, 0.8 * fastest)
+        ik.min_rates[:], ik.max_rates[:] = (self._lower - now) / dt, (self._upper - now) / dt
+        rates = ik.solve()
         # all joints are slowed down by the same factor: the tip stays on its line
-        rates /= max(1.0, float(np.max(np.abs(rates) / fastest)))
+        rates = rates / max(1.0, float((np.abs(rates) / fastest).max()))
         change = rates - self._rates
-        rates = self._rates + change / max(1.0, float(np.max(np.abs(change) / (fastest * dt / RATE_RAMP_TIME))))
-        self._rates = rates
-        robot.command_position(now + dt * rates, self._joints)
+        self._rates = self._rates + change / max(1.0, float((np.abs(change) / self._largest_change).max()))
+        robot.command_position(now + dt * self._rates, self._joints)
 
     def hold_position(self) -> None:
         """Command the joints to their present set-points, for one step in which the arm does not move."""
@@ -151,12 +157,12 @@ class CartesianController:
     def _advance_reference(self, goal: np.ndarray, speed: float, dt: float) -> np.ndarray:
         """Advance the reference by a step of a trapezoidal velocity profile; its velocity [3] m/s."""
         offset = goal - self._reference
-        left = float(np.linalg.norm(offset))
+        left = _length(offset)
         if left < 1e-9:
             self._reference_speed = 0.0
             return np.zeros(3)
         # the largest speed from which it can stop at the goal
-        braking = np.sqrt(2.0 * self.acceleration * left)
+        braking = math.sqrt(2.0 * self.acceleration * left)
         self._reference_speed = min(self._reference_speed + self.acceleration * dt, speed, braking)
         step = min(self._reference_speed * dt, left)
         self._reference = self._reference + offset * (step / left)
@@ -174,7 +180,12 @@ def _pointing_error(axis: np.ndarray) -> np.ndarray:
 
 def _clip_norm(vector: np.ndarray, length: float) -> np.ndarray:
     """The vector, scaled down to ``length`` if it is longer."""
-    return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-12))
+    return vector * min(1.0, length / max(_length(vector), 1e-12))
+
+
+def _length(vector: np.ndarray) -> float:
+    """Length of a vector; takes a quarter of the time of ``np.linalg.norm``."""
+    return math.sqrt(vector.dot(vector))
 
 
 def axes_of_pose(pose: np.ndarray) -> np.ndarray:
@@ -189,54 +200,38 @@ def axes_of_pose(pose: np.ndarray) -> np.ndarray:
     )
 
 
-def solve_prioritized_ik(
-    tasks: list[tuple[np.ndarray, np.ndarray]],
-    posture_rates: np.ndarray,
-    min_rates: np.ndarray,
-    max_rates: np.ndarray,
-    joint_weights: np.ndarray,
-) -> np.ndarray:
-    """Joint rates [joint] that fulfil ``tasks`` (Jacobian [k, joint], velocity [k]) in order, then ``posture_rates``.
+class InverseKinematics:
+    """Joint rates of one arm that fulfil tasks in order of priority, within bounds; one compiled call.
 
-    Strict priority: a task uses only the null space of those before it (Siciliano and Slotine 1991). All rates are
-    [joint] rad/s or m/s. ``joint_weights`` [joint]: relative use of the joints. Joints that would exceed ``min_rates``
-    or ``max_rates`` are fixed at that bound, one at a time, and the others do the tasks.
+    A task uses only the null space of those before it (Siciliano and Slotine 1991). See
+    :mod:`vinesim.kernels.inverse_kinematics`.
     """
-    held = np.zeros(len(posture_rates), bool)
-    fixed = np.zeros(len(posture_rates))
-    while True:
-        rates = _solve_task_stack(tasks, posture_rates, np.where(held, 0.0, joint_weights), fixed)
-        beyond = np.where(held, 0.0, np.maximum(rates - max_rates, min_rates - rates))
-        worst = int(np.argmax(beyond))
-        if beyond[worst] <= 1e-9:
-            return rates
-        held[worst] = True
-        fixed[worst] = np.clip(rates[worst], min_rates[worst], max_rates[worst])
 
+    def __init__(self, joint_weights: np.ndarray, task_rows: Sequence[int]) -> None:
+        """``joint_weights`` [joint]: relative use of the joints; ``task_rows``: number of rows of each task."""
+        joints, rows = len(joint_weights), sum(task_rows)
+        self.jacobian, self.velocity = np.zeros((rows, joints)), np.zeros(rows)
+        """[row, joint] and [row]: rows of all tasks, in order; velocities along them that are asked for."""
+        self.posture_rates, self.rates = np.zeros(joints), np.zeros(joints)
+        """[joint] rates towards a posture for what the tasks leave free, and the result; rad/s or m/s."""
+        self.min_rates, self.max_rates = np.zeros(joints), np.zeros(joints)
+        """[joint] bounds of the rates [rad/s or m/s]."""
+        scratch = SharedArrays(
+            inverse_kinematics.IkScratch, weights=np.zeros(joints), fixed=np.zeros(joints), solution=np.zeros(joints),
+            basis=np.zeros((rows + 1, joints)), residual=np.zeros(rows), is_used=np.zeros(rows, np.int32),
+        )  # fmt: skip
+        inputs = (self.jacobian, self.velocity, self.posture_rates, self.min_rates, self.max_rates, joint_weights)
+        self._launch = bind_launch(
+            inverse_kinematics.solve_prioritized_ik,
+            [share(np.cumsum(task_rows, dtype=np.int32), wp.int32), *(share(array, wp.float64) for array in inputs),
+             MIN_SINGULAR_VALUE],
+            [scratch.struct, share(self.rates, wp.float64)],
+        )  # fmt: skip
 
-def _solve_task_stack(
-    tasks: list[tuple[np.ndarray, np.ndarray]], posture: np.ndarray, share: np.ndarray, fixed: np.ndarray
-) -> np.ndarray:
-    """Rates [joint] ``fixed`` + ``share`` y, where y does each task in the null space of the ones before it."""
-    y = np.zeros(len(posture))
-    free = np.eye(len(posture))
-    for jacobian, wanted in tasks:
-        scaled = jacobian * share
-        inverse, used = _damped_inverse(scaled @ free)
-        y = y + inverse @ (wanted - jacobian @ fixed - scaled @ y)
-        free = free - used
-    movable = share > 0.0
-    wanted = np.where(movable, (posture - fixed) / np.where(movable, share, 1.0), 0.0)
-    return fixed + share * (y + free @ (wanted - y))
+    def solve(self) -> np.ndarray:
+        """Joint rates [joint] for the present inputs; the array is used again by the next call.
 
-
-def _damped_inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pseudo-inverse [joint, k] with small singular values damped, and the projector [joint, joint] on its row
-    space."""
-    u, s, vt = np.linalg.svd(matrix, full_matrices=False)
-    damping = np.where(
-        s < MIN_SINGULAR_VALUE, (1.0 - (s / MIN_SINGULAR_VALUE) ** 2) * (0.5 * MIN_SINGULAR_VALUE) ** 2, 0.0
-    )
-    inverse = (vt.T * (s / np.maximum(s * s + damping, 1e-12))) @ u.T
-    used = vt[s > 1e-3 * MIN_SINGULAR_VALUE]
-    return inverse, used.T @ used
+        Joints that would exceed their bounds are fixed there, one at a time, and the others do the tasks.
+        """
+        self._launch(1)
+        return self.rates

@@ -87,8 +87,7 @@ class Robot(RobotInstance):
         self._stop_base()
 
     def _stop_base(self) -> None:
-        self._base_goal = np.zeros(2)
-        self._base_velocity = np.zeros(2)
+        self._base_goal = self._base_velocity = 0.0, 0.0
         self._base_time = -np.inf
 
     # ------------------------------------------------------------------ commands
@@ -167,10 +166,7 @@ class Robot(RobotInstance):
         if not np.isfinite([linear, angular]).all():
             raise CommandError(f"{self.name}: base velocity ({linear}, {angular}) is not finite")
         limits = self.description.base_limits
-        self._base_goal[:] = (
-            np.clip(linear, -limits.linear, limits.linear),
-            np.clip(angular, -limits.angular, limits.angular),
-        )
+        self._base_goal = _clamp(linear, limits.linear), _clamp(angular, limits.angular)
         self._base_time = time
 
     def _validated(self, values: Values, joints: Joints) -> tuple[np.ndarray, np.ndarray]:
@@ -189,15 +185,18 @@ class Robot(RobotInstance):
         """Pass the set-points of the step that starts at ``time`` [s] to the physics; call it before the step."""
         self._servos.update()
         self._drive_base(time)
-        self._odometry(self.rigid.base_state(self.name)[0])
+        if self._tracks_slip:
+            self._odometry(self.rigid.base_state(self.name)[0])
 
     def _drive_base(self, time: float) -> None:
         """Accelerate the base towards its commanded velocity, or towards standing once the command has lapsed."""
         limits = self.description.base_limits
-        goal = self._base_goal if time - self._base_time <= limits.timeout else np.zeros(2)
-        change = self.rigid.dt * np.array([limits.linear_acceleration, limits.angular_acceleration])
-        self._base_velocity += np.clip(goal - self._base_velocity, -change, change)
-        self.rigid.command_base(self.name, (self._base_velocity[0], 0.0, self._base_velocity[1]))
+        linear_goal, angular_goal = self._base_goal if time - self._base_time <= limits.timeout else (0.0, 0.0)
+        linear, angular = self._base_velocity
+        linear += _clamp(linear_goal - linear, self.rigid.dt * limits.linear_acceleration)
+        angular += _clamp(angular_goal - angular, self.rigid.dt * limits.angular_acceleration)
+        self._base_velocity = linear, angular
+        self.rigid.command_base(self.name, (linear, 0.0, angular))
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """State of the robot at ``time`` [s], wrenches, IMUs and series elastic elements included."""
@@ -211,6 +210,11 @@ class Robot(RobotInstance):
 
     def update(self, time: float) -> RobotUpdate:
         """What other clients receive: actual joint states, never commands."""
-        position, velocity, _, _ = self.rigid.joint_measurements(self.name)
+        position, velocity = self.rigid.joint_state(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)
+
+
+def _clamp(value: float, bound: float) -> float:
+    """The value within -``bound`` to ``bound``."""
+    return float(min(max(value, -bound), bound))

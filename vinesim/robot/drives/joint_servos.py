@@ -72,11 +72,11 @@ class JointServos:
     def command(self, joints: np.ndarray, values: np.ndarray, interface: CommandInterface) -> None:
         """Command ``joints`` [k] (indices) by ``values`` [k] in the units of ``interface``, clipped to the limits."""
         if interface == CommandInterface.POSITION:
-            values = np.clip(values, self.lower_limit[joints], self.upper_limit[joints])
+            values = clip(values, self.lower_limit[joints], self.upper_limit[joints])
         elif interface == CommandInterface.VELOCITY:
-            values = np.clip(values, -self.max_velocity[joints], self.max_velocity[joints])
+            values = clip(values, -self.max_velocity[joints], self.max_velocity[joints])
         elif interface == CommandInterface.EFFORT:
-            values = np.clip(values, -self.max_effort[joints], self.max_effort[joints])
+            values = clip(values, -self.max_effort[joints], self.max_effort[joints])
         self._command[joints] = values
         self._switch_interface(joints, interface)
 
@@ -103,6 +103,8 @@ class JointServos:
 
     def _switch_interface(self, joints: np.ndarray, interface: CommandInterface) -> None:
         """Carry the set-points over from links to motors or back, so that nothing jumps."""
+        if (self.interface[joints] == interface).all():
+            return
         before = self.interface[joints] == CommandInterface.MOTOR_POSITION
         if before.any() or interface == CommandInterface.MOTOR_POSITION:
             position, _, effort, _ = self._rigid.joint_measurements(self._name)
@@ -152,19 +154,19 @@ class JointServos:
             middle = position.copy()
             for fingers in self._finger_groups.values():
                 middle[fingers] = position[fingers].mean()
-        start = np.clip(self.setpoint, middle - self._max_tracking_error, middle + self._max_tracking_error)
+        start = clip(self.setpoint, middle - self._max_tracking_error, middle + self._max_tracking_error)
         wanted = (self._command - start) / dt
         wanted[self._velocity_joints] = self._command[self._velocity_joints]
         # Nor may the set-point accelerate faster than the drive can: a saturated servo would exceed the velocity.
         gain = self._max_impulse / np.maximum(self._rigid.joint_inertia(self._name), MIN_DIVISOR)
         slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.max_velocity)
         fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.max_velocity)
-        rate = np.clip(wanted, slowest, fastest)
+        rate = clip(wanted, slowest, fastest)
         if self._gains_vary:
             start, rate = np.where(self._in_effort, position, start), np.where(self._in_effort, 0.0, rate)
-        self.setpoint = np.clip(start + dt * rate, self.lower_limit, self.upper_limit)
+        self.setpoint = clip(start + dt * rate, self.lower_limit, self.upper_limit)
         rate = (self.setpoint - start) / dt
-        self._rate = np.where(self._in_effort, velocity, rate)
+        self._rate = np.where(self._in_effort, velocity, rate) if self._gains_vary else rate
         return rate
 
     def _speed_limiters(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -199,3 +201,8 @@ class JointServos:
             exact=in_motor_position | (self._is_compliant & ~in_effort),
         )
         self._gains_changed = False
+
+
+def clip(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """``np.clip`` of finite numbers, in half its time."""
+    return np.minimum(np.maximum(values, lower), upper)

@@ -43,6 +43,7 @@ class RobotInstance:
         self._start_turn = frames.to_matrix(back)
         self._start_left = frames.multiply(back, np.eye(4)).T
         """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
+        self._tracks_slip = any(description.base_limits.slip)
         self._track_odometry = TrackOdometry(*description.base_limits.slip, spec.pose)
 
     def remove(self) -> None:
@@ -70,6 +71,6 @@ class RobotInstance:
 
     def _odometry(self, base_q: np.ndarray) -> np.ndarray:
         """Pose [7] since the start as odometry measures it: exact, unless the tracks slip."""
-        if any(self.description.base_limits.slip):
+        if self._tracks_slip:
             return self._track_odometry.update(base_q)
         return np.concatenate([self._start_turn @ (base_q[:3] - self._start), self._start_left @ base_q[3:]])

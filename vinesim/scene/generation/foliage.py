@@ -35,7 +35,7 @@ def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodie
     tendone = scene.training == "tendone"
     axis = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))
     up = np.array([0.0, 0.0, 1.0])
-    sideways = frames.normalize(np.cross(shoots.up[:, None], axis))
+    sideways = frames.normalize(frames.cross(shoots.up[:, None], axis))
     hand = np.where((rank + shoots.lateral_at[:, None]) % 2, 1.0, -1.0)[..., None]
     climb = (0.55 + 0.3 * rise) * (1.0 if tendone else 0.35)
     out = frames.normalize(hand * sideways + 0.35 * forward * axis + climb * up)

@@ -91,7 +91,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
         up = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
     else:
         lean = normal(2) * [0.12, 0.05]
-        across = np.cross([0.0, 0.0, 1.0], along)
+        across = frames.cross(np.array([0.0, 0.0, 1.0]), along)
         heading = along * lean[:, :1] + across * lean[:, 1:] + [0.0, 0.0, 1.0]
         up = along
     owner = np.repeat(np.arange(vines), per_vine)
@@ -152,7 +152,7 @@ def _grow_lateral(
     """Points of the side shoots: 45 degrees off the main axis, then on with a little wander."""
     rows = np.arange(len(points))
     start, axis = points[rows, at + 1], frames.normalize(points[rows, at + 1] - points[rows, at])
-    heading = axis + sign[:, None] * frames.normalize(np.cross(up, axis)) + 0.25 * up
+    heading = axis + sign[:, None] * frames.normalize(frames.cross(up, axis)) + 0.25 * up
     result = np.empty((len(points), LATERAL_SEGMENTS + 1, 3))
     result[:, 0] = start
     for i in range(LATERAL_SEGMENTS):

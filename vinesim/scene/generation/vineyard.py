@@ -8,10 +8,14 @@ stream, named by (seed, row, place): the numbers of a vine do not depend on how 
 
 from __future__ import annotations
 
+import functools
+import pathlib
+
+import msgspec
 import numpy as np
 
-from vinesim import frames
-from vinesim.scene import builder, leaves, plant_parameters
+from vinesim import array_fields, disk_cache, frames
+from vinesim.scene import berries, builder, leaves, plant_parameters
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
 from vinesim.scene.generation.foliage import place_leaves
 from vinesim.scene.generation.plant_bodies import Bodies, build_bodies
@@ -19,16 +23,45 @@ from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluste
 from vinesim.scene.generation.shoots import Shoots, sample_shoots
 from vinesim.scene.generation.ties import find_ties
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_parameters import VineParameters
-from vinesim.scene.spec import Scene
+from vinesim.scene.spec import Scene, Sun, Wind
 
 
 def generate(scene: Scene) -> Model:
-    """The model of a scene; the same scene gives the same bits on every machine.
+    """The model of a scene, from :mod:`vinesim.disk_cache` if it is there; the same scene gives the same bits on every
+    machine.
 
     Raises :class:`~vinesim.scene.toml_loader.DataError` if its plant parameters cannot be read.
     """
     parameters = plant_parameters.load_plant(scene.plants)
+
+    def make() -> disk_cache.Arrays:
+        model = _generate(scene, parameters)
+        return {name: getattr(model, name) for name in Model.array_fields()}
+
+    # what no plant depends on does not name another model
+    plants = msgspec.structs.replace(
+        scene, name="", sun=Sun(), wind=Wind(), spawns=(), physics=PhysicsParameters(), plants=""
+    )
+    digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters)))
+    return Model(**disk_cache.load_or_make("vineyard", digest, make)).check()
+
+
+def generate_uncached(scene: Scene) -> Model:
+    """As :func:`generate`, for a scene that is needed once."""
+    return _generate(scene, plant_parameters.load_plant(scene.plants))
+
+
+@functools.cache
+def _code_digest() -> str:
+    """Of the code that generates models, and of the varieties of grapes."""
+    package = pathlib.Path(builder.__file__).parent
+    others = pathlib.Path(frames.__file__), pathlib.Path(array_fields.__file__)
+    return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
+
+
+def _generate(scene: Scene, parameters: VineParameters) -> Model:
     structure = build_fixed_structure(scene, parameters)
     shoots = sample_shoots(scene, parameters, structure)
     bodies = build_bodies(parameters, shoots)

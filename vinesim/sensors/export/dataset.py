@@ -20,7 +20,7 @@ import vinesim
 from vinesim import frames
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import depth_millimetres
-from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.generation.vineyard import generate_uncached
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
@@ -129,7 +129,7 @@ class VineyardRenderer:
 
     def __init__(self, plan: DatasetPlan, number: int) -> None:
         self.plan, self.scene = plan, plan.vineyard(number)
-        self.model = generate(self.scene)
+        self.model = generate_uncached(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
         self.rest: Snapshot = rest_snapshot(self.model)

@@ -1,15 +1,19 @@
 """Baked tables that make analytic primitives look like plants: leaf outlines and veins, noise, soil, sky.
 
-All are computed once per process from fixed seeds, tile without seams where they repeat, and hold linear values.
+All are computed from fixed seeds, tile without seams where they repeat, and hold linear values. They are kept in
+:mod:`vinesim.disk_cache`: computing them takes seconds.
 """
 
 from __future__ import annotations
 
 import functools
+import pathlib
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 
+from vinesim import disk_cache
 from vinesim.scene import leaves
 
 GRASS_OUTLINE, HERB_OUTLINE = leaves.SHAPE_COUNT, leaves.SHAPE_COUNT + 1
@@ -18,7 +22,20 @@ OUTLINE_COUNT = leaves.SHAPE_COUNT + 2
 TEXTURE_SIZE = 256
 """Texels along each side of the tables."""
 _DISTANCE_STEPS = 400.0
+SKY_ROWS, SKY_COLUMNS = 512, 1024
 _SUPERSAMPLING = 4
+
+
+@functools.cache
+def _digest() -> str:
+    """Of the code that makes the tables."""
+    return disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(leaves.__file__), cv2.__version__)
+
+
+def _cached(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
+    """``make``, which computes tables, with what it returns kept on disk and in this process."""
+    name = make.__name__.strip("_").replace("_", "-")
+    return functools.cache(lambda: disk_cache.load_or_make(name, _digest(), make))
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -61,9 +78,14 @@ def _grass_mask() -> np.ndarray:
     return mask
 
 
-@functools.cache
 def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
     """Signed distances [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and octagons around them [outline, 8, 2]."""
+    baked = _leaf_outlines()
+    return baked["distance"], baked["hull"]
+
+
+@_cached
+def _leaf_outlines() -> disk_cache.Arrays:
     u, v = _grid(TEXTURE_SIZE * _SUPERSAMPLING)
     theta, radius = np.arctan2(u, v), np.hypot(u, v)
     table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE))
@@ -84,7 +106,7 @@ def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
         for k in range(8):
             sides = [k, (k + 1) % 8]
             hull[shape, k] = np.linalg.solve(normal[sides], reach[sides])
-    return table, hull
+    return {"distance": table, "hull": hull}
 
 
 def _smooth_noise(rng: np.random.Generator, sigma: float) -> np.ndarray:
@@ -93,9 +115,13 @@ def _smooth_noise(rng: np.random.Generator, sigma: float) -> np.ndarray:
     return noise / noise.std()
 
 
-@functools.cache
 def leaf_texture() -> np.ndarray:
     """Vein strength, relief slope along u and v, tone: [outline, SIDE/2, SIDE/2, 4] float32."""
+    return _leaf_texture()["table"]
+
+
+@_cached
+def _leaf_texture() -> disk_cache.Arrays:
     u, v = _grid(TEXTURE_SIZE)
     table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE, 4), np.float32)
     for shape in range(leaves.SHAPE_COUNT):
@@ -123,7 +149,7 @@ def leaf_texture() -> np.ndarray:
     table[HERB_OUTLINE, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
     table[HERB_OUTLINE, ..., 3] = 0.5
     half = table.reshape(OUTLINE_COUNT, TEXTURE_SIZE // 2, 2, TEXTURE_SIZE // 2, 2, 4).mean((2, 4))
-    return np.ascontiguousarray(half, np.float32)
+    return {"table": np.ascontiguousarray(half, np.float32)}
 
 
 def _segment(u: np.ndarray, v: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,17 +168,25 @@ def _periodic_noise(rng: np.random.Generator, lowest: float, power: float) -> np
     return field / field.std()
 
 
-@functools.cache
 def noise_texture() -> np.ndarray:
     """Four octaves of periodic noise around 0.5, coarse to fine: [SIDE, SIDE, 4] float32 in 0..1."""
+    return _noise_texture()["table"]
+
+
+@_cached
+def _noise_texture() -> disk_cache.Arrays:
     rng = np.random.default_rng(17)
     bands = [_periodic_noise(rng, low, power) for low, power in ((1, 1.6), (3, 1.4), (10, 1.1), (30, 0.4))]
-    return np.clip(0.5 + 0.2 * np.stack(bands, -1), 0.0, 1.0).astype(np.float32)
+    return {"table": np.clip(0.5 + 0.2 * np.stack(bands, -1), 0.0, 1.0).astype(np.float32)}
 
 
-@functools.cache
 def soil_texture() -> np.ndarray:
     """Clods, sod, slope along x and y of 1.25 m of ground: [SIDE, SIDE, 4] float32."""
+    return _soil_texture()["table"]
+
+
+@_cached
+def _soil_texture() -> disk_cache.Arrays:
     rng = np.random.default_rng(43)
     clods = (
         0.55 * _periodic_noise(rng, 3, 1.5)
@@ -170,35 +204,41 @@ def soil_texture() -> np.ndarray:
     slope_y, slope_x = (0.5 * (np.roll(height, -1, axis) - np.roll(height, 1, axis)) for axis in (0, 1))
     tone = np.clip(0.45 + 0.17 * clods + 0.5 * straw, 0.0, 1.0)
     green = np.clip(0.5 + 0.22 * sod + 0.3 * straw, 0.0, 1.0)
-    return np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)
+    return {"table": np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)}
 
 
-SKY_ROWS, SKY_COLUMNS = 512, 1024
-
-
-@functools.cache
-def _sky_layers() -> tuple[np.ndarray, tuple[tuple[np.ndarray, np.ndarray], ...]]:
-    """What of the sky no sun changes: the share of cloud, and layers in front of it, each a colour and a share."""
+@_cached
+def _sky_layers() -> disk_cache.Arrays:
+    """What of the sky no sun changes: ``cloud``, its share; and of ``ridges`` and ``trees`` in front of it, which reach
+    up to some row, the shares and the colour of the trees. float64, as they are mixed."""
     height, azimuth = _sky_directions()
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
     cover = sample_noise(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
     cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55
+    height, azimuth = height[:_RIDGE_ROWS], azimuth[:_RIDGE_ROWS]
     turns = azimuth / (2.0 * np.pi)
-    layers = []
-    for tone, base, rise, count in (
-        (np.array([0.36, 0.47, 0.62]), 0.045, 0.085, 2.0),
-        (np.array([0.22, 0.32, 0.36]), 0.020, 0.050, 3.0),
-    ):
+    shares = []
+    for base, rise, count in ((0.045, 0.085, 2.0), (0.020, 0.050, 3.0)):
         ridge = base + rise * (
             sample_noise(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35
         )
-        layers.append((tone, smoothstep(0.004, -0.004, height - ridge)))
+        shares.append(smoothstep(0.004, -0.004, height - ridge))
     crowns = 0.014 + 0.020 * sample_noise(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
     leafy = sample_noise(turns * 20.0, height * 8.0, slice(2, 3))
     trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
-    layers.append((trees, smoothstep(0.004, -0.004, height - crowns)))
-    return cloud, tuple(layers)
+    return {
+        "cloud": cloud,
+        "ridges": np.stack(shares),
+        "trees": trees,
+        "tree_share": smoothstep(0.004, -0.004, height - crowns),
+    }
+
+
+_RIDGE_ROWS = 180
+"""Rows of the sky's table that ridges and trees can reach, up to 0.12 in the sine of elevation."""
+_RIDGE_TONES = np.array([0.36, 0.47, 0.62]), np.array([0.22, 0.32, 0.36])
+"""Linear RGB of the far and the near ridge."""
 
 
 def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
@@ -214,7 +254,7 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
     Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
     hills in the haze.
     """
-    (height, azimuth), (cloud, layers) = _sky_directions(), _sky_layers()
+    (height, azimuth), layers = _sky_directions(), _sky_layers()
     flat = np.sqrt(1.0 - height**2)
     x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
     horizon = np.exp(-5.5 * height)[..., None]
@@ -222,19 +262,23 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
     colour = colour + halo[..., None] * np.array(colour_of_sun)
-    colour = _mix(colour, np.array([1.35, 1.33, 1.30]), cloud)
-    for tone, share in layers:
-        colour = _mix(colour, tone, share)
+    colour = _mix(colour, np.array([1.35, 1.33, 1.30]), layers["cloud"])
+    low = colour[:_RIDGE_ROWS]
+    for tone, share in zip(_RIDGE_TONES, layers["ridges"], strict=True):
+        low = _mix(low, tone, share)
+    colour[:_RIDGE_ROWS] = _mix(low, layers["trees"], layers["tree_share"])
     return colour.astype(np.float32)
 
 
 def sample_noise(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
     """Noise at positions of period 1, bilinear [..., 4], or some octaves of it."""
-    table, fx, fy = noise_texture()[..., octaves], (x % 1.0) * TEXTURE_SIZE, (y % 1.0) * TEXTURE_SIZE
+    table = np.ascontiguousarray(noise_texture()[..., octaves]).reshape(TEXTURE_SIZE**2, -1)
+    fx, fy = (x % 1.0) * TEXTURE_SIZE, (y % 1.0) * TEXTURE_SIZE
     i, j = fx.astype(int) % TEXTURE_SIZE, fy.astype(int) % TEXTURE_SIZE
     ax, ay = (fx % 1.0)[..., None], (fy % 1.0)[..., None]
-    upper = table[j, i] * (1.0 - ax) + table[j, (i + 1) % TEXTURE_SIZE] * ax
-    lower = table[(j + 1) % TEXTURE_SIZE, i] * (1.0 - ax) + table[(j + 1) % TEXTURE_SIZE, (i + 1) % TEXTURE_SIZE] * ax
+    right, here, above = (i + 1) % TEXTURE_SIZE, j * TEXTURE_SIZE, (j + 1) % TEXTURE_SIZE * TEXTURE_SIZE
+    upper = table.take(here + i, 0) * (1.0 - ax) + table.take(here + right, 0) * ax
+    lower = table.take(above + i, 0) * (1.0 - ax) + table.take(above + right, 0) * ax
     return upper * (1.0 - ay) + lower * ay
 
 
