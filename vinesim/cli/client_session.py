@@ -20,6 +20,7 @@ from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
+from vinesim.kernels.compilation import compile_kernels
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.tasks.task import Task
@@ -52,6 +53,7 @@ class ClientSession:
         """Index of the start pose in the scene."""
         if options.pose is not None:
             self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
+        compile_kernels()
         self.model = generate(self.scene)
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()
