@@ -1,4 +1,4 @@
-"""Visual shapes of humans and crates: size against collision shapes, closed meshes, symmetry, labels, and files."""
+"""Visual shapes of humans and crates: size against collision shapes, closed meshes, symmetry, labels, files."""
 
 from __future__ import annotations
 

@@ -228,7 +228,11 @@ def test_every_bunch_hangs_clear_of_wood_ground_and_other_bunches(vineyard):
     solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
     start, end, radius = (getattr(model, f"fixed_{k}")[solid].astype(float) for k in ("start", "end", "radius"))
     for fraction in (0.0, 0.5, 1.0):
-        gap = to_segment((top + fraction * (tip - top))[:, None], start, end) - radius.max(1) - model.bunch_radius[:, None]
+        gap = (
+            to_segment((top + fraction * (tip - top))[:, None], start, end)
+            - radius.max(1)
+            - model.bunch_radius[:, None]
+        )
         assert gap.min() > 0.0
     level = (
         np.linalg.norm(top[:, None, :2] - top[None, :, :2], axis=-1) - model.bunch_radius[:, None] - model.bunch_radius
@@ -342,7 +346,9 @@ def test_shoots_are_stable_and_bunches_swing_in_the_chosen_band(vineyard):
             if count == 1:
                 stalk = slice(3 * int(model.tree_core[tree] - 3), None)  # two pieces of stalk and the bunch
                 bunch_share = np.array([abs(v[stalk] @ (inertia @ v)[stalk]) / abs(v @ inertia @ v) for v in shape.T])
-                swings.append(math.sqrt(square[np.argmax(np.where(square < 200.0, bunch_share, 0.0))]) / (2.0 * math.pi))
+                swings.append(
+                    math.sqrt(square[np.argmax(np.where(square < 200.0, bunch_share, 0.0))]) / (2.0 * math.pi)
+                )
     assert 0.9 < np.median(swings) < 1.6, swings
 
 
