@@ -32,6 +32,8 @@ SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
+FIRST_STATUS = 0.1
+"""Wall time from the first step to the first status line [s]: whoever waits for a client learns that it runs."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -116,6 +118,8 @@ class ClientSession:
         self._stack.callback(self._stop.set)
         is_done = (lambda: False) if task is None else (lambda: task.is_done)
         run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
+        if self.options.tick_log is not None:
+            loop.log().save(self.options.tick_log)
         return status
 
 
@@ -151,8 +155,10 @@ def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
 
 def report_status(status: Status, publish: Callable[[dict[str, Any]], None], form: str, stop: threading.Event) -> None:
     """Every second hand the status to ``publish`` and print it as text or JSON; runs until ``stop``."""
+    period = FIRST_STATUS
     try:
-        while not stop.wait(STATUS_PERIOD):
+        while not stop.wait(period):
+            period = STATUS_PERIOD
             values = status.current()
             publish(values)
             if form == "json":
