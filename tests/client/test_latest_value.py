@@ -1,4 +1,4 @@
-"""The newest value only, across a real process boundary."""
+"""A shared value that keeps only the newest, across a process boundary."""
 
 import multiprocessing
 
@@ -8,7 +8,7 @@ from vinesim.client.sensing.latest_value import LatestValue, make_poll
 
 
 def forward_values(latest, pipe):
-    """The reader's process: says that it is there, then what it takes, until an empty value."""
+    """The reader's process: sends "ready", then the values that it takes, until b"end"."""
     pipe.send("ready")
     while True:
         value = latest.take(5.0)
@@ -23,7 +23,7 @@ def context():
     return multiprocessing.get_context("spawn")
 
 
-def test_the_newest_letter_replaces_what_was_not_read(context):
+def test_the_newest_value_replaces_an_unread_one(context):
     latest = LatestValue(100, context)
     try:
         assert latest.take(0.0) is None
@@ -37,7 +37,7 @@ def test_the_newest_letter_replaces_what_was_not_read(context):
         latest.close()
 
 
-def test_a_letter_that_is_too_large_is_refused(context):
+def test_a_value_that_is_too_large_is_refused(context):
     latest = LatestValue(10, context)
     try:
         with pytest.raises(ValueError, match="11 bytes for a capacity of 10"):
@@ -58,14 +58,14 @@ def test_the_writer_never_waits_for_the_reader(context):
         latest.close()
 
 
-def test_values_cross_to_another_process_in_order_and_the_last_arrives(context):
+def test_values_arrive_in_another_process_in_order_and_the_last_one_always(context):
     latest = LatestValue(100, context)
-    ours, theirs = context.Pipe()
-    process = context.Process(target=forward_values, args=(latest, theirs))
+    receiver, sender = context.Pipe()
+    process = context.Process(target=forward_values, args=(latest, sender))
     process.start()
     try:
-        assert ours.poll(60)
-        assert ours.recv() == "ready"
+        assert receiver.poll(60)
+        assert receiver.recv() == "ready"
         for i in range(1000):
             while not latest.put(b"%05d" % i):
                 pass
@@ -73,11 +73,11 @@ def test_values_cross_to_another_process_in_order_and_the_last_arrives(context):
             pass
         process.join(60)
         assert process.exitcode == 0
-        has_news, taken = make_poll(ours), []
-        while has_news():
-            taken.append(ours.recv())
-        assert taken[-1] == b"end"
-        assert taken == sorted(taken)
+        poll, received = make_poll(receiver), []
+        while poll():
+            received.append(receiver.recv())
+        assert received[-1] == b"end"
+        assert received == sorted(received)
     finally:
         process.kill()
         process.join()
