@@ -9,6 +9,7 @@ import sys
 import threading
 
 import pytest
+import warp as wp
 
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_writer import RecordingWriter
@@ -101,8 +102,6 @@ def test_no_such_device():
 
 
 def threads_or_no_gpu():
-    import warp as wp
-
     return (2, "--threads 2") if wp.get_cuda_device_count() else (3, "'cuda:0'", "no NVIDIA GPU", "use cpu")
 
 

@@ -34,8 +34,8 @@ def demo(
     """A robot pushes a bunch, another client sees it move, ROS topics carry it; or a robot does a job.
 
     Starts a server, two robot clients (one for a job) and a plain rclpy subscriber, each a process of its own, on free
-    ports. The seconds of a push begin when server, clients, sensors and subscriber are all ready. summary.json holds the
-    measurements; of a job whether it was done ("picked", "exchanged") and if not, why.
+    ports. The seconds of a push begin when server, clients, sensors and subscriber are all ready. summary.json holds
+    the measurements; of a job whether it was done ("picked", "exchanged") and if not, why.
 
     \b
     Examples:
