@@ -9,6 +9,7 @@ import sys
 import threading
 
 import pytest
+import warp as wp
 
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_writer import RecordingWriter
@@ -81,14 +82,28 @@ def test_an_invalid_urdf_is_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("demo",),
+        ("demo", "--job", "pick"),
+        ("render", "demo", "--at", "0.4,1.2,1.3", "--look", "3,1,1.7"),
+        ("dataset", "--images", "1"),
+    ],
+)
+def test_no_gpu_is_one_line_before_anything_is_written(command, tmp_path):
+    out = tmp_path / "out"
+    device = "cuda:0" if wp.get_cuda_device_count() == 0 else f"cuda:{wp.get_cuda_device_count()}"
+    assert_refused(vinesim(*command, "--device", device, "--out", str(out)), 3, f"'{device}'")
+    assert not out.exists()
+
+
 def test_an_unavailable_device_is_refused():
     assert_refused(vinesim("client", "--device", "abacus"), 3, "abacus", "cpu, cuda")
     assert_refused(vinesim("client", "--device", "cuda:0", "--threads", "2"), *threads_or_no_gpu())
 
 
 def threads_or_no_gpu():
-    import warp as wp
-
     return (2, "--threads 2") if wp.get_cuda_device_count() else (3, "'cuda:0'", "no NVIDIA GPU", "use cpu")
 
 
