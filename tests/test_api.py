@@ -39,7 +39,7 @@ def test_every_public_name_loads_and_is_documented():
         assert inspect.getdoc(getattr(vinesim, name)), name
 
 
-def test_type_checkers_see_the_same_names():
+def test_type_checkers_find_the_same_names():
     tree = ast.parse(pathlib.Path(vinesim.__file__).read_text())
     block = next(node for node in tree.body if isinstance(node, ast.If))
     samples = {}
