@@ -23,7 +23,7 @@ def heard(bus) -> list[tuple[str, int]]:
 
 def speak(hub: MemoryHub, telling: RetainedSync, ticks: int = 3) -> None:
     for _ in range(ticks):
-        telling.update_window([HERE], hub.time)
+        telling.update_window([HERE], 0, hub.time)
         telling.flush()
         hub.advance(0.01)
 
@@ -93,8 +93,8 @@ def test_the_server_is_asked_once_for_each_cell_and_again_only_if_it_is_silent()
     speak(hub, ada, 500)
     assert len(asked) == 1
     for _ in range(2000):
-        ada.update_window([THERE], hub.time)
+        ada.update_window([THERE], 1, hub.time)
         hub.advance(0.01)
-    ada.update_window([HERE], hub.time)
+    ada.update_window([HERE], 2, hub.time)
     hub.advance(0.01)
     assert len(asked) == 2

@@ -341,7 +341,7 @@ def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
 
         def ticking(condition):
             def check():
-                telling.update_window([(0, 0)], time.monotonic())
+                telling.update_window([(0, 0)], 0, time.monotonic())
                 telling.flush()
                 time.sleep(0.005)
                 return condition()
